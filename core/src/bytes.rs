@@ -41,6 +41,16 @@ pub(crate) fn move_down(bytes: &mut [u8], range: Range<usize>) {
     }
 }
 
+/// Moves the last `count` bytes to the front, behind each other as they were; does nothing if there are fewer.
+pub(crate) fn rotate_up(bytes: &mut [u8], count: usize) {
+    let Some((front, back)) = bytes.len().checked_sub(count).and_then(|at| bytes.split_at_mut_checked(at)) else {
+        return;
+    };
+    front.reverse();
+    back.reverse();
+    bytes.reverse();
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -62,5 +72,16 @@ mod tests {
         assert_eq!(bytes, [1, 2, 3, 4, 5]);
         move_down(&mut bytes, 1..5);
         assert_eq!(bytes, [2, 3, 4, 5, 5]);
+    }
+
+    #[test]
+    fn the_last_bytes_come_to_the_front_and_more_than_all_leave_them_alone() {
+        let mut bytes = [1, 2, 3, 4, 5];
+        rotate_up(&mut bytes, 6);
+        rotate_up(&mut bytes, 0);
+        rotate_up(&mut bytes, 5);
+        assert_eq!(bytes, [1, 2, 3, 4, 5]);
+        rotate_up(&mut bytes, 2);
+        assert_eq!(bytes, [4, 5, 1, 2, 3]);
     }
 }

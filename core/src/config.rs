@@ -25,8 +25,17 @@ pub const NODE_NAME_BYTES: usize = 32;
 pub const NAME_BYTES: usize = 32;
 /// Most variables in one `Parameters`, and in the arguments or results of one function. Costs 16 bytes each per `Parameters`.
 pub const VARIABLES: usize = 16;
-/// Longest encoded signature (name, arguments and results of one function), in bytes. Stored as long as it is.
-pub const SIGNATURE_BYTES: usize = 384;
+/// Longest text of a failure, in bytes; a longer one is cut. Costs so many bytes for each failure that is made or taken.
+pub const FAILURE_TEXT_BYTES: usize = 96;
+/// Names and values of one failure, in bytes; what does not fit is refused as [`ParametersBytes`](crate::error::Limit::ParametersBytes).
+pub const FAILURE_VALUES_BYTES: usize = 256;
+/// Progress of the calls of one peer is sent at most this often, so that a handler that publishes all the time fills no network.
+pub const PROGRESS_INTERVAL: Duration = Duration::from_millis(10);
+/// Longest encoded signature (name, arguments and results of one function), in bytes: 384, or 1,024 for units that have
+/// lists and records. Stored as long as it is.
+pub const SIGNATURE_BYTES: usize = if cfg!(feature = "nested") { 1024 } else { 384 };
+/// Most lists and records inside each other, the outermost included. Costs 32 bytes of stack each while a block is checked.
+pub const DEPTH: usize = 4;
 /// Bytes of the values and names in a `Parameters` whose size is not given.
 pub const PARAMETERS_BYTES: usize = 512;
 

@@ -69,6 +69,9 @@ pub enum Limit {
     #[cfg(feature = "streams")]
     #[error("the peer lets this unit subscribe to no more streams: end one, or raise subscriptions_per_peer there")]
     Subscriptions = 13,
+    /// Lists and records inside each other.
+    #[error("lists and records are at most 4 deep in each other: make the inner ones arguments of their own")]
+    Depth = 14,
 }
 
 /// A constraint for which a unit may have too little memory.
@@ -229,7 +232,7 @@ pub enum CloseReason {
     StoppedHere = 13,
 }
 
-/// What a handler answers instead of results.
+/// What a handler answers instead of results. Text and values of a failure go beside it: `Failure`, with the feature `details`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum ServiceError {
@@ -360,6 +363,9 @@ pub enum Error {
         "no answer came in time, and the service may have run: ask for its state, or wait longer (request_timeout)"
     )]
     TimedOut,
+    /// The call was given up here; the service may have run.
+    #[error("the call was given up here, and the service may have run: ask for its state")]
+    Cancelled,
     /// The link ended while the call was in flight; the service may have run.
     #[error("the link ended during the call, and the service may have run: ask for its state when the peer is back")]
     Interrupted,
@@ -471,6 +477,7 @@ impl Error {
             | Self::EmergencyWaits => Cause::Configuration,
             Self::NotConnected
             | Self::TimedOut
+            | Self::Cancelled
             | Self::Interrupted
             | Self::Expired
             | Self::Stale

@@ -82,6 +82,8 @@ pub use host::mailman::Mailman;
 pub use services::hub::Hub;
 pub use services::session::{Event, Session};
 pub use services::typed;
+#[cfg(feature = "details")]
+pub use services::typed::TypedCall;
 pub use services::typed::{AnyCall, Variables};
 
 #[cfg(feature = "derive")]

@@ -9,6 +9,11 @@ use core::ops::DerefMut;
 pub trait Storage: 'static {
     /// A slice of `T` that its holder owns for good.
     type Slice<T: 'static>: DerefMut<Target = [T]>;
+
+    /// Makes a slice as long as that, with `value`s behind what it holds; changes nothing where there is no allocator.
+    fn lengthen<T: 'static>(slice: &mut Self::Slice<T>, length: usize, value: impl FnMut() -> T) {
+        let _ = (slice, length, value);
+    }
 }
 
 /// Slices lent for ever, as from a `static` on a board.
@@ -27,6 +32,12 @@ pub(crate) enum Boxed {}
 #[cfg(test)]
 impl Storage for Boxed {
     type Slice<T: 'static> = std::boxed::Box<[T]>;
+
+    fn lengthen<T: 'static>(slice: &mut Self::Slice<T>, length: usize, value: impl FnMut() -> T) {
+        let mut values = core::mem::take(slice).into_vec();
+        values.resize_with(length.max(values.len()), value);
+        *slice = values.into();
+    }
 }
 
 /// Takes an element out of a list, the last one into its place. The list's own method panics for an index that is not inside.

@@ -62,7 +62,7 @@ impl<T> Peer<T> {
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline.
-    async fn begin(
+    pub(crate) async fn begin(
         &self,
         function: &str,
         parameters: &ParametersView,
@@ -108,9 +108,9 @@ impl<T> Peer<T> {
 #[must_use = "dropped, it is released at once"]
 pub struct Hold<T: 'static> {
     unit: Handle<T>,
-    call: InFlight,
+    pub(crate) call: InFlight,
     /// Also behind the end of this.
-    is_wanted: bool,
+    pub(crate) is_wanted: bool,
 }
 
 impl<T> fmt::Debug for Hold<T> {

@@ -23,6 +23,8 @@ use crate::event::{Name, UnitEvent};
 use crate::line::{Progress, address_of};
 use crate::machine::{LinkSession, Machine};
 use crate::replies::ended;
+#[cfg(feature = "streams")]
+use crate::subscriptions::came;
 use crate::time::now;
 
 /// How long a dialling peer may take for its hello, and for its proof, while no other one could dial, or while another
@@ -75,6 +77,8 @@ impl<T> Machine<T> {
         }
         let event = session.poll(&mut cx)?;
         ended(link, reply, &event, &[]);
+        #[cfg(feature = "streams")]
+        came(&self.readings, link, now(), &event, &[]);
         Some(event)
     }
 
@@ -99,6 +103,8 @@ impl<T> Machine<T> {
         let receipt = session.receive(&mut cx, lent, arguments);
         if let Some(event) = &receipt.event {
             ended(link, reply, event, lent);
+            #[cfg(feature = "streams")]
+            came(&self.readings, link, now(), event, lent);
         }
         mail.lines.get_mut(usize::from(index))?.take(receipt.consumed);
         (receipt.consumed > 0 || receipt.event.is_some()).then_some(receipt.event)
@@ -268,6 +274,8 @@ impl<T> Machine<T> {
 
     /// Does what an event asks for, or leaves it to the runner.
     pub(crate) fn noted(&mut self, index: u16, event: Event) -> Option<Job> {
+        #[cfg(feature = "streams")]
+        self.note_subscriptions(index, &event);
         match event {
             // No handle here pings.
             Event::Reply(..) | Event::Answered => {}
@@ -279,6 +287,9 @@ impl<T> Machine<T> {
                 self.wakers.leases.wake();
                 return Some(Job::Safe(slot));
             }
+            // A task that waits for the end of its call looks again.
+            #[cfg(feature = "details")]
+            Event::Cancelled(_) => self.wakers.leases.wake(),
             event => self.tell_of(index, event),
         }
         None
@@ -335,6 +346,8 @@ impl<T> Machine<T> {
         let had_joined = self.end(index)?;
         // Calls that no task has taken yet must not begin for a caller that is gone.
         self.forget_calls_of(index);
+        #[cfg(feature = "details")]
+        self.wakers.leases.wake();
         self.hang_up(index);
         self.hub.node.left(now(), LinkId(index), reason);
         self.look_at_terms();

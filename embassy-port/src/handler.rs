@@ -29,6 +29,9 @@ pub struct Call<T: 'static> {
     pub lease: Option<LeaseWatch>,
     /// The unit that serves, which can request from any other, the caller among them.
     pub unit: Handle<T>,
+    /// What the handler has said of its failure.
+    #[cfg(feature = "details")]
+    pub(crate) failure: core::cell::Cell<Option<cara_core::distribution::failure::Failure>>,
 }
 
 impl<T> fmt::Debug for Call<T> {

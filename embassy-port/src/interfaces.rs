@@ -1,8 +1,12 @@
 //! Typed services on boards: how a unit's list takes the functions of an interface, and how its clients call a peer.
 
 use core::fmt;
+#[cfg(feature = "details")]
+use core::ops::ControlFlow;
 
 use cara_core::config::Priority;
+#[cfg(feature = "details")]
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::Identity;
@@ -16,6 +20,7 @@ use cara_core::typed::{AnyCall, AwaitedCaller, Caller, Free, Functions, Interfac
 
 use crate::functions::MyFunctionList;
 use crate::handler::{Call, Handler, Hook, Safe, ServiceOptions};
+use crate::lease::LeaseWatch;
 use crate::peer::Peer;
 
 /// What functions of an interface move, stop or reset: see [`ServiceOptions::lease`].
@@ -52,6 +57,17 @@ impl<T> Actuator<T> {
 }
 
 impl<T> AnyCall for Call<T> {
+    type Order = LeaseWatch;
+
+    fn order(&self) -> Option<LeaseWatch> {
+        self.lease
+    }
+
+    #[cfg(feature = "details")]
+    fn fail(&self, failure: Failure) -> cara_core::error::ServiceError {
+        Self::fail(self, failure)
+    }
+
     fn caller(&self) -> &Identity {
         &self.caller
     }
@@ -144,5 +160,20 @@ impl<T> AwaitedCaller for Peer<T> {
         options: &RequestOptions,
     ) -> Result<(), Error> {
         self.block_request_with(function, parameters, options).await
+    }
+}
+
+/// A board hears nothing of a call while it runs; it hears why it has failed.
+#[cfg(feature = "details")]
+impl<T> cara_core::typed::AwaitedWatcher for Peer<T> {
+    async fn call_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        _: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error> {
+        self.block_request_explained(function, parameters, options, why).await
     }
 }

@@ -83,6 +83,8 @@ macro_rules! warning {
 
 mod calls;
 mod config;
+#[cfg(feature = "details")]
+mod details;
 mod driving;
 mod event;
 mod functions;
@@ -102,11 +104,17 @@ mod runner;
 mod security;
 #[cfg(feature = "streams")]
 mod streams;
+#[cfg(feature = "streams")]
+mod subscriptions;
 mod taken;
 mod time;
 
 pub use calls::Hold;
+#[cfg(feature = "details")]
+pub use cara_core::distribution::failure::Failure;
 pub use cara_core::typed::{self, AnyCall, CallError, Variables};
+#[cfg(feature = "details")]
+pub use cara_core::typed::{Failed, TypedCall};
 #[cfg(feature = "derive")]
 pub use cara_derive::{VariablesEmbassy as Variables, interface_embassy as interface};
 pub use config::Config;
@@ -122,6 +130,8 @@ pub use resources::{Memory, Resources, new};
 pub use runner::Runner;
 pub use security::Security;
 #[cfg(feature = "streams")]
-pub use streams::{Stream, StreamCell};
+pub use streams::{Publisher, Stream, StreamCell};
+#[cfg(feature = "streams")]
+pub use subscriptions::{Subscription, SubscriptionCell, SubscriptionInner};
 pub use taken::TakenCall;
 pub use time::now;

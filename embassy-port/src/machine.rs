@@ -95,6 +95,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) links: &'static mut [Link],
     pub(crate) mail: EmbassyMailman,
     pub(crate) reply: ReplyBox,
+    #[cfg(feature = "streams")]
+    pub(crate) readings: crate::subscriptions::Readings,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
     pub(crate) begun: Begun,
@@ -133,7 +135,7 @@ pub(crate) struct Wakers {
     pub(crate) news: MultiWakerRegistration<TASKS_WAITING>,
     /// A call waits for a task.
     pub(crate) calls: MultiWakerRegistration<TASKS_WAITING>,
-    /// A lease of one of this unit's services has ended, or gone over to a newer call.
+    /// A lease of one of this unit's services has ended, or gone over to a newer call; or a call that runs was given up.
     pub(crate) leases: MultiWakerRegistration<TASKS_WAITING>,
 }
 

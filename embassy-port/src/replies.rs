@@ -6,6 +6,8 @@
 use core::task::Waker;
 
 use cara_core::distribution::block;
+#[cfg(feature = "details")]
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -40,11 +42,19 @@ pub(crate) struct InFlight {
 pub(crate) struct ReplyBox {
     bytes: &'static mut [u8],
     held: Option<(InFlight, usize)>,
+    /// What the service has said of the failure that came last.
+    #[cfg(feature = "details")]
+    failure: Option<(InFlight, Failure)>,
 }
 
 impl ReplyBox {
     pub(crate) fn new(bytes: &'static mut [u8]) -> Self {
-        Self { bytes, held: None }
+        Self {
+            bytes,
+            held: None,
+            #[cfg(feature = "details")]
+            failure: None,
+        }
     }
 
     pub(crate) fn is_taken(&self) -> bool {
@@ -58,6 +68,11 @@ impl ReplyBox {
         }
         self.held = Some((call, copy(block, self.bytes)));
         Ok(())
+    }
+
+    #[cfg(feature = "details")]
+    pub(crate) fn take_failure(&mut self, call: &InFlight) -> Option<Failure> {
+        self.failure.take_if(|(failed, _)| failed == call).map(|(_, failure)| failure)
     }
 
     fn take(&mut self, call: &InFlight) -> Option<&[u8]> {
@@ -95,11 +110,18 @@ impl Waiter {
 /// Stores the outcome of a call for the task that waits for it, if that is what happened and there is one.
 pub(crate) fn ended(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: &[u8]) {
     let Event::Reply(id, outcome) = event else { return };
+    // Before anything else: it lies in what was lent.
+    #[cfg(feature = "details")]
+    let failure = outcome.is_err().then(|| link.session.as_mut()?.failure(lent)).flatten();
     let (serial, session) = (link.serial, &link.session);
     let mut waiting = link.waiters.iter_mut().flatten();
     if let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == *id) {
         let session = session.as_ref().ok_or(Error::ResultLost);
         let results = outcome.and_then(|results| session?.results(&results, lent));
+        #[cfg(feature = "details")]
+        if let Some(failure) = failure {
+            reply.failure = Some((waiter.call, failure));
+        }
         waiter.end(results.and_then(|block| reply.put(waiter.call, block.bytes())));
     }
 }

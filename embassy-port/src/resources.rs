@@ -280,6 +280,8 @@ impl<
                     stack,
                 },
                 reply: ReplyBox::new(self.reply.write([0; REPLY])),
+                #[cfg(feature = "streams")]
+                readings: crate::subscriptions::Readings::NONE,
                 tasks: self.tasks.write(
                     self.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized()))),
                 ),

@@ -201,7 +201,7 @@ impl<T> Runner<T> {
         }
     }
 
-    /// Runs a call; `None` when a task is left to answer it.
+    /// Runs a call; `None` when it is answered, or a task is left to do so.
     fn begin(&mut self, running: Running, call: &CoreCall) -> Option<Result<(), Error>> {
         let (told, handler) = {
             let machine = &mut *self.shared.machine.borrow_mut();
@@ -226,10 +226,21 @@ impl<T> Runner<T> {
                 wants_reply: call.wants_reply,
                 lease: LeaseWatch::new(lease, call),
                 unit: Handle { shared: self.shared },
+                #[cfg(feature = "details")]
+                failure: Default::default(),
             };
             (told, handler)
         };
-        Some(handler.run(&self.shared.state, &told, self.arguments))
+        let result = handler.run(&self.shared.state, &told, self.arguments);
+        // Where it cannot be kept now, its code waits alone.
+        #[cfg(feature = "details")]
+        if let Some(failure) = told.failure.take()
+            && result == Err((&failure).into())
+            && self.shared.machine.borrow_mut().answer_failed(&running, &failure)
+        {
+            return None;
+        }
+        Some(result)
     }
 
     fn answer_again(&mut self, machine: &mut Machine<T>) {

@@ -1,8 +1,8 @@
-//! Streams of a board: named values that change, which any task publishes without allocation. A board publishes; it does
-//! not subscribe.
+//! Streams of a board: named values that change, which any task publishes without allocation.
 
 use core::cell::RefCell;
 use core::fmt;
+use core::marker::PhantomData;
 
 use cara_core::config::Priority;
 use cara_core::distribution::block;
@@ -12,6 +12,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::stream::{Newest, Source, Value};
 use cara_core::time::Duration;
+use cara_core::typed::{self, Variables};
 
 use crate::functions::MyFunctionList;
 use crate::handle::Handle;
@@ -106,6 +107,33 @@ impl<T> Stream<T> {
     }
 }
 
+/// A stream of this unit whose values are those of a struct.
+pub struct Publisher<V, T: 'static> {
+    stream: Stream<T>,
+    values: PhantomData<fn(&V)>,
+}
+
+impl<V, T> Clone for Publisher<V, T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<V, T> Copy for Publisher<V, T> {}
+
+impl<V, T> fmt::Debug for Publisher<V, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.stream.fmt(f)
+    }
+}
+
+impl<V: Variables, T> Publisher<V, T> {
+    /// As [`Stream::publish`].
+    pub fn publish(&self, value: &V) -> Result<(), Error> {
+        value.with_parameters(|values| self.stream.publish(values))?
+    }
+}
+
 impl<T> MyFunctionList<T> {
     /// Adds a stream in its text form, as in `pose(position: float[2])`. A subscriber gets its values at least
     /// `least_interval` apart, in whole milliseconds, up to 65 s. Like a function it is seen by those to which the list is
@@ -119,7 +147,42 @@ impl<T> MyFunctionList<T> {
         least_interval: Duration,
         cell: &'static StreamCell<BYTES>,
     ) -> Result<Stream<T>, Error> {
-        let definition = Definition::stream(stream).map_err(|_| Error::BadName)?;
+        self.add_defined(&Definition::stream(stream).map_err(|_| Error::BadName)?, least_interval, cell)
+    }
+
+    /// The same for a stream of a struct that derives [`Variables`].
+    ///
+    /// ```
+    /// use cara_core::time::Duration;
+    /// use cara_embassy::{Handle, StreamCell, Variables};
+    ///
+    /// #[derive(Variables)]
+    /// struct Pose {
+    ///     position: [f64; 2],
+    /// }
+    ///
+    /// fn tell<T>(agv: Handle<T>, cell: &'static StreamCell<16>) -> Result<(), cara_core::error::Error> {
+    ///     let pose = agv.my_function_list().add_stream_of::<Pose, _>("pose", Duration::from_millis(20), cell)?;
+    ///     agv.publish_my_function_list()?;
+    ///     pose.publish(&Pose { position: [3.0, 4.0] })
+    /// }
+    /// ```
+    pub fn add_stream_of<V: Variables, const BYTES: usize>(
+        &self,
+        name: &str,
+        least_interval: Duration,
+        cell: &'static StreamCell<BYTES>,
+    ) -> Result<Publisher<V, T>, Error> {
+        let stream = self.add_defined(&typed::stream_of::<V>(name)?, least_interval, cell)?;
+        Ok(Publisher { stream, values: PhantomData })
+    }
+
+    fn add_defined<const BYTES: usize>(
+        &self,
+        definition: &Definition,
+        least_interval: Duration,
+        cell: &'static StreamCell<BYTES>,
+    ) -> Result<Stream<T>, Error> {
         if block::longest(definition.signature().results()).is_none_or(|longest| longest > BYTES) {
             return Err(Error::TooLarge { limit: u32::try_from(BYTES).unwrap_or(u32::MAX) });
         }
@@ -128,7 +191,7 @@ impl<T> MyFunctionList<T> {
         // Never run: a call of a stream is refused before.
         let handler = Handler::free(&|_, _| Err(ServiceError::NotReady));
         let listed = Listed { handler, lease: None, safe: None, then: None, stream: Some(cell) };
-        let slot = self.unit.act(|machine| machine.functions.add_function(&definition, attributes, listed))?;
+        let slot = self.unit.act(|machine| machine.functions.add_function(definition, attributes, listed))?;
         Ok(Stream { unit: self.unit, slot, cell })
     }
 }

@@ -16,7 +16,7 @@ use crate::machine::{LinkContext, LinkSession, Machine};
 use crate::time::{now, timer};
 
 /// How long an answer waits for room at a time.
-const PAUSE: Duration = Duration::from_millis(5);
+pub(crate) const PAUSE: Duration = Duration::from_millis(5);
 
 /// Names a call of a peer that runs here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -181,6 +181,8 @@ impl<T> Machine<T> {
             self.wakers.runner.wake();
             let listed = self.functions.function(call.slot)?;
             let ended = LeaseWatch::new(listed.handler.lease, &call).is_some_and(|lease| !lease.is_live());
+            #[cfg(feature = "details")]
+            let ended = ended || self.is_given_up(&running);
             if ended || now() >= running.deadline {
                 self.answer(&running, Err(Error::Expired));
                 continue;
@@ -198,8 +200,8 @@ impl<T> Machine<T> {
 /// [`ServiceError::NotReady`].
 #[must_use = "the caller waits for the reply"]
 pub struct TakenCall<T: 'static> {
-    unit: Handle<T>,
-    running: Option<Running>,
+    pub(crate) unit: Handle<T>,
+    pub(crate) running: Option<Running>,
     /// The caller.
     pub caller: Identity,
     /// The call's class.

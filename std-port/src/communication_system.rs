@@ -8,7 +8,7 @@ use std::task::{Poll, Wake, Waker};
 
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::identity::{Identity, Role};
-use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 #[cfg(feature = "control")]
 use cara_core::services::access::Verb;
@@ -19,6 +19,7 @@ use core::net::IpAddr;
 
 use crate::builder::{BuildError, Builder};
 use crate::engine::CallsToAll;
+use crate::growing::CallParameters;
 use crate::handle::{Handle, MUnit, WeakHandle};
 #[cfg(feature = "control")]
 use crate::locks::lock;
@@ -296,18 +297,31 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// }
     /// # Ok::<(), cara_std::BuildError>(())
     /// ```
-    pub fn block_request_all<const BYTES: usize>(
+    pub fn block_request_all<P: CallParameters + Clone>(
         &self,
         function: &str,
-        parameters: &Parameters<BYTES>,
+        parameters: &P,
         options: &RequestOptions,
-    ) -> Vec<(Peer<T>, Result<Parameters<BYTES>, Error>)> {
+    ) -> Vec<(Peer<T>, Result<P, Error>)> {
         let peers = self.asked_with_all(function);
-        let mut results = vec![parameters.clone(); peers.len()];
+        let mut results = rooms(&peers, function, parameters);
         let mut calls = CallsToAll::new(self.engine(), peers.iter().map(Peer::link), function, options);
         wait(|cx| calls.poll(cx, &mut results));
         outcomes(peers, calls, results)
     }
+}
+
+/// Parameters for a call of each peer.
+pub(crate) fn rooms<T: Send + 'static, P: CallParameters + Clone>(
+    peers: &[Peer<T>],
+    function: &str,
+    parameters: &P,
+) -> Vec<P> {
+    let mut results = vec![parameters.clone(); peers.len()];
+    for (peer, results) in peers.iter().zip(&mut results) {
+        peer.with_room(function, results);
+    }
+    results
 }
 
 /// With each peer its results, or why there are none.

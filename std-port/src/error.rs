@@ -90,9 +90,13 @@ macro_rules! debug_is_display {
     };
 }
 
-debug_is_display!(crate::BuildError, StartError, crate::keys::KeyError, crate::keys::FleetError);
-#[cfg(feature = "access")]
-debug_is_display!(crate::access::AccessError);
+debug_is_display!(
+    crate::BuildError,
+    StartError,
+    crate::keys::KeyError,
+    crate::keys::FleetError,
+    crate::access::AccessError
+);
 #[cfg(feature = "control")]
 debug_is_display!(crate::control::ControlError);
 

@@ -8,17 +8,20 @@ use std::pin::Pin;
 use std::sync::Arc;
 
 use cara_core::config::Priority;
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
-use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::{ActuatorState, Claim, Ended, Latch, Lease, LeaseEnd, Order, Service};
 use cara_core::services::stream::Source;
 use cara_core::time::{Duration, Instant};
 
 use crate::actuator::Actuator;
+use crate::engine::details::Serving;
 use crate::engine::streams::OwnStream;
 use crate::executor::Executor;
+use crate::growing::HandlerParameters;
 use crate::lease::{LeaseEnded, LeaseWatch};
 
 /// What a handler is told about the call that it serves.
@@ -34,6 +37,7 @@ pub struct Call {
     pub wants_reply: bool,
     /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
     pub lease: Option<LeaseWatch>,
+    pub(crate) serving: Serving,
     /// For a handler that is a future.
     #[cfg(feature = "async")]
     pub(crate) given_up: Option<Arc<crate::engine::GivenUp>>,
@@ -59,6 +63,49 @@ impl Call {
             Some(lease) => lease.commit(change),
             None => Ok(change()),
         }
+    }
+
+    /// What the handler returns for this failure, whose text and values go to the caller.
+    ///
+    /// ```
+    /// # use cara_std::{Call, Failure, ParametersView, ServiceError};
+    /// fn go_to(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    ///     Err(call.fail(Failure::new(7, "the way is blocked")))
+    /// }
+    /// ```
+    pub fn fail(&self, failure: Failure) -> ServiceError {
+        let error = failure.error();
+        self.serving.fail(failure);
+        error
+    }
+
+    /// Tells the caller how far the call is, if it wants to know and the signature says `progress (…)`. It waits for nothing: of
+    /// values that cannot be sent at once the newest ones are, and none behind the answer. An error where they do not fit the
+    /// signature.
+    ///
+    /// ```
+    /// # use cara_std::{Call, Parameters, ParametersView, ServiceError};
+    /// fn go_to(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    ///     let mut left = Parameters::new();
+    ///     left.add_int("left", 1)?;
+    ///     for metres in (0..10).rev() {
+    ///         if call.is_cancelled() {
+    ///             return Err(ServiceError::Failed(1));
+    ///         }
+    ///         left.set_value("left", metres)?;
+    ///         call.progress(&left)?;
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
+    pub fn progress(&self, values: &ParametersView) -> Result<(), Error> {
+        self.serving.tell(values)
+    }
+
+    /// Whether the caller has given the call up, waits no longer, or is gone: what the handler returns then reaches nothing. For
+    /// handlers that are futures there is `given_up`.
+    pub fn is_cancelled(&self) -> bool {
+        self.serving.is_cancelled()
     }
 
     /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
@@ -326,6 +373,8 @@ impl<T> ServiceOptions<T> {
 /// | future | `async fn(Call, Parameters) -> Result<Parameters, ServiceError>` |
 /// | future of any size | `async fn(Call, Box<ParametersView>) -> Result<Box<ParametersView>, ServiceError>` |
 ///
+/// `Parameters` may be of any size (`Parameters<2048>`), or [`GrowingParameters`](crate::GrowingParameters).
+///
 /// Futures need the feature `async`. One holds no thread of the unit while it waits, and not the state: it asks for that with
 /// `with_state_async`. When its call is given up (the caller's deadline has passed, its link has ended, or the order of
 /// the call has) it is dropped at its next `await`, or told: `ServiceOptions::runs_to_its_end`. What it started stops with
@@ -345,18 +394,18 @@ impl<T> fmt::Debug for RunOf<T> {
     }
 }
 
-impl<T, F, const BYTES: usize> IntoHandler<T, fn(Parameters<BYTES>) -> Parameters<BYTES>> for F
+impl<T, F, P: HandlerParameters> IntoHandler<T, fn(P) -> P> for F
 where
-    F: Fn(Parameters<BYTES>) -> Parameters<BYTES> + Send + Sync + 'static,
+    F: Fn(P) -> P + Send + Sync + 'static,
 {
     fn into_run(self) -> RunOf<T> {
         RunOf(Run::Free(Arc::new(move |_, view| by_value(view, &self))))
     }
 }
 
-impl<T, F, const BYTES: usize> IntoHandler<T, fn(&mut T, Parameters<BYTES>) -> Parameters<BYTES>> for F
+impl<T, F, P: HandlerParameters> IntoHandler<T, fn(&mut T, P) -> P> for F
 where
-    F: Fn(&mut T, Parameters<BYTES>) -> Parameters<BYTES> + Send + Sync + 'static,
+    F: Fn(&mut T, P) -> P + Send + Sync + 'static,
 {
     fn into_run(self) -> RunOf<T> {
         RunOf(Run::Method(Arc::new(move |state, _, view| by_value(view, |parameters| self(state, parameters)))))
@@ -382,12 +431,9 @@ where
 }
 
 /// Runs a service of the paper's form on the parameters of a call.
-fn by_value<const BYTES: usize>(
-    view: &mut ParametersView,
-    service: impl FnOnce(Parameters<BYTES>) -> Parameters<BYTES>,
-) -> Result<(), ServiceError> {
-    let mut arguments = Parameters::<BYTES>::sized();
-    arguments.copy_from(view).map_err(|_| ServiceError::BadResults)?;
-    let results = service(arguments);
-    view.copy_from(&results).map_err(|_| ServiceError::BadResults)
+fn by_value<P: HandlerParameters>(view: &mut ParametersView, service: impl FnOnce(P) -> P) -> Result<(), ServiceError> {
+    let mut arguments = P::empty();
+    arguments.fill(view).map_err(|_| ServiceError::BadResults)?;
+    let mut results = service(arguments);
+    view.copy_from(results.view_mut()).map_err(|_| ServiceError::BadResults)
 }

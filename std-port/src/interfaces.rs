@@ -1,6 +1,9 @@
 //! Typed services on Linux: how a unit's list takes the functions of an interface, and how its clients call a peer.
 
+use std::ops::{ControlFlow, DerefMut};
+
 use cara_core::config::Priority;
+use cara_core::distribution::failure::{CallFailure, Failure};
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::Identity;
@@ -10,15 +13,35 @@ use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Instant;
-use cara_core::typed::{AnyCall, BlockingCaller, Caller, Free, Functions, Interface, Method};
+use cara_core::typed::{AnyCall, BlockingCaller, Caller, Free, Functions, Interface, Method, WatchingCaller};
 
 use crate::actuator::Actuator;
+use crate::engine::room;
 use crate::handler::{Call, IntoHandler, ServiceOptions};
 use crate::heart::Hold;
+use crate::lease::LeaseWatch;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
 
 impl AnyCall for Call {
+    type Order = LeaseWatch;
+
+    fn order(&self) -> Option<LeaseWatch> {
+        self.lease.clone()
+    }
+
+    fn fail(&self, failure: Failure) -> ServiceError {
+        Self::fail(self, failure)
+    }
+
+    fn tell(&self, progress: &ParametersView) -> Result<(), Error> {
+        Self::progress(self, progress)
+    }
+
+    fn is_cancelled(&self) -> bool {
+        Self::is_cancelled(self)
+    }
+
     fn caller(&self) -> &Identity {
         &self.caller
     }
@@ -137,6 +160,10 @@ impl<T: Send + 'static> Caller for Peer<T> {
         look(state.session.their_function_list().named(function).map(|function| function.signature))
     }
 
+    fn room(bytes: usize) -> Option<impl DerefMut<Target = ParametersView> + Send> {
+        Some(room(bytes))
+    }
+
     fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {
         self.request_with(function, parameters, options)
     }
@@ -159,6 +186,23 @@ impl<T: Send + 'static> BlockingCaller for Peer<T> {
     }
 }
 
+impl<T: Send + 'static> WatchingCaller for Peer<T> {
+    fn block_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error> {
+        self.block_request_with_progress(function, parameters, options, on_progress).map_err(|failed| {
+            let CallFailure { error, failure } = *failed;
+            *why = failure;
+            error
+        })
+    }
+}
+
 #[cfg(feature = "async")]
 impl<T: Send + 'static> cara_core::typed::AwaitedCaller for Peer<T> {
     async fn call(
@@ -168,5 +212,29 @@ impl<T: Send + 'static> cara_core::typed::AwaitedCaller for Peer<T> {
         options: &RequestOptions,
     ) -> Result<(), Error> {
         self.request_async(function, parameters, options)?.await
+    }
+}
+
+#[cfg(feature = "async")]
+impl<T: Send + 'static> cara_core::typed::AwaitedWatcher for Peer<T> {
+    async fn call_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error> {
+        let options = RequestOptions { progress: true, ..*options };
+        let mut call = self.request_async(function, parameters, &options)?;
+        while let Some(told) = call.progress().await {
+            if on_progress(&told).is_break() {
+                // Dropped here, the call is given up.
+                return Err(Error::Cancelled);
+            }
+        }
+        let outcome = (&mut call).await;
+        *why = call.failure().map(|failure| *failure);
+        outcome
     }
 }

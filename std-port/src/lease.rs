@@ -111,6 +111,12 @@ impl LeaseWatch {
         }
     }
 
+    /// How long it lasts as things are, for measurements and displays; `None` once it is dead. A motor asks
+    /// [`stage`](Self::stage): what is left may be taken back at any time.
+    pub fn left(&self) -> Option<cara_core::time::Duration> {
+        if self.is_live() { self.service.lease.left(self.clock.now()) } else { None }
+    }
+
     /// Does what the order wants, or nothing once it has ended: neither its end nor its safe hook comes in between, and
     /// both wait for it. So `change` must be short, and ask nothing of the unit.
     pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {

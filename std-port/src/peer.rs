@@ -1,9 +1,11 @@
 //! A node as this unit sees it.
 
 use std::fmt;
+use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use cara_core::config::Constraints;
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::Function;
 use cara_core::distribution::hello::Limits;
@@ -18,10 +20,14 @@ use core::net::SocketAddr;
 
 use crate::builder;
 #[cfg(feature = "control")]
+use crate::control::protocol::LinkInfo;
+#[cfg(feature = "control")]
 use crate::engine::CallFuture;
+use crate::engine::details::{Canceller, Watch};
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
 use crate::engine::{Engine, pairs};
+use crate::growing::{CallParameters, bytes_of_results};
 use crate::heart::Hold;
 
 /// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
@@ -197,6 +203,19 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.link().ok_or(Error::NotConnected)
     }
 
+    /// How its link is now, while it is connected.
+    #[cfg(feature = "control")]
+    pub(crate) fn link_info(&self) -> Option<LinkInfo> {
+        let link = self.link().ok()?;
+        let state = link.lock();
+        Some(LinkInfo {
+            silent_ms: state.session.silent_for(self.engine.now()).as_millis(),
+            calls: state.session.calls_in_flight(),
+            calls_here: state.session.calls_held(),
+            queued_bytes: state.session.bytes_queued(),
+        })
+    }
+
     /// What the node has published to this unit; empty while it is not connected.
     ///
     /// ```no_run
@@ -258,7 +277,7 @@ impl<T: Send + 'static> Peer<T> {
     /// # Ok::<(), cara_std::BuildError>(())
     /// ```
     #[doc(alias = "block_request_their_function")]
-    pub fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
+    pub fn block_request(&self, function: &str, parameters: &mut (impl CallParameters + ?Sized)) -> Result<(), Error> {
         self.block_request_with(function, parameters, &RequestOptions::default())
     }
 
@@ -275,10 +294,93 @@ impl<T: Send + 'static> Peer<T> {
     pub fn block_request_with(
         &self,
         function: &str,
-        parameters: &mut ParametersView,
+        parameters: &mut (impl CallParameters + ?Sized),
         options: &RequestOptions,
     ) -> Result<(), Error> {
+        let parameters = self.with_room(function, parameters);
         self.engine.block_request(&self.link()?, function, parameters, options).map(drop)
+    }
+
+    /// As [`block_request_with`](Self::block_request_with), with all that is known of a failure, and with what the call tells
+    /// while it runs: the newest progress that has not been looked at, in this thread, and none after the reply. Where
+    /// `on_progress` returns `Break`, the call is given up and ends with [`Error::Cancelled`]: what it moves stops, and its
+    /// handler is told.
+    ///
+    /// ```no_run
+    /// use cara_std::{Parameters, RequestOptions};
+    /// use std::ops::ControlFlow;
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    ///
+    /// let options = RequestOptions::default();
+    /// let outcome = depot.s_unit("agv")?.block_request_with_progress("go_to", &mut Parameters::new(), &options, |told| {
+    ///     match told.variable::<f64>("left") {
+    ///         Ok(left) if left > 100.0 => ControlFlow::Break(()),
+    ///         _ => ControlFlow::Continue(()),
+    ///     }
+    /// });
+    /// if let Err(failed) = outcome {
+    ///     println!("{failed}");
+    ///     if let Some(failure) = &failed.failure {
+    ///         println!("{:?}", failure.values().variable::<[i64; 2]>("at"));
+    ///     }
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn block_request_with_progress(
+        &self,
+        function: &str,
+        parameters: &mut (impl CallParameters + ?Sized),
+        options: &RequestOptions,
+        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+    ) -> Result<(), Box<CallFailure>> {
+        let parameters = self.with_room(function, parameters);
+        self.block_request_watched(function, parameters, options, &Canceller::new(), &mut on_progress)
+    }
+
+    /// The same for a call that another thread may give up.
+    pub fn block_request_cancellable(
+        &self,
+        function: &str,
+        parameters: &mut (impl CallParameters + ?Sized),
+        options: &RequestOptions,
+        canceller: &Canceller,
+        mut on_progress: impl FnMut(&ParametersView),
+    ) -> Result<(), Box<CallFailure>> {
+        let mut told = |progress: &ParametersView| {
+            on_progress(progress);
+            ControlFlow::Continue(())
+        };
+        let parameters = self.with_room(function, parameters);
+        self.block_request_watched(function, parameters, options, canceller, &mut told)
+    }
+
+    /// The parameters of a call, with room for its results where they grow.
+    pub(crate) fn with_room<'p>(
+        &self,
+        function: &str,
+        parameters: &'p mut (impl CallParameters + ?Sized),
+    ) -> &'p mut ParametersView {
+        parameters.make_room(|| {
+            let link = self.link().ok()?;
+            let state = link.lock();
+            let signature = state.session.their_function_list().named(function)?.signature;
+            Some(bytes_of_results(signature.results(), state.session.constraints().message_size))
+        });
+        parameters.view_mut()
+    }
+
+    fn block_request_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        canceller: &Canceller,
+        on_progress: &mut dyn FnMut(&ParametersView) -> ControlFlow<()>,
+    ) -> Result<(), Box<CallFailure>> {
+        let mut watch = Watch { on_progress, canceller, failure: None };
+        let link = self.link().map_err(|error| Box::new(error.into()))?;
+        let result = self.engine.block_request_watched(&link, function, parameters, options, &mut watch);
+        result.map_err(|error| Box::new(CallFailure { error, failure: watch.failure.map(|failure| *failure) }))
     }
 
     /// As [`block_request_with`](Self::block_request_with); what the call has started goes on until the returned guard is
@@ -298,9 +400,10 @@ impl<T: Send + 'static> Peer<T> {
     pub fn hold(
         &self,
         function: &str,
-        parameters: &mut ParametersView,
+        parameters: &mut (impl CallParameters + ?Sized),
         options: &RequestOptions,
     ) -> Result<Hold<T>, Error> {
+        let parameters = self.with_room(function, parameters);
         self.engine.hold(self.link()?, function, parameters, options).map(Hold::new)
     }
 

@@ -8,6 +8,13 @@ pub(crate) enum Boxed {}
 
 impl Storage for Boxed {
     type Slice<T: 'static> = Box<[T]>;
+
+    fn lengthen<T: 'static>(slice: &mut Box<[T]>, length: usize, value: impl FnMut() -> T) {
+        let mut values = std::mem::take(slice).into_vec();
+        values.reserve_exact(length.saturating_sub(values.len()));
+        values.resize_with(length.max(values.len()), value);
+        *slice = values.into_boxed_slice();
+    }
 }
 
 /// A slice of `length` copies of `value`.

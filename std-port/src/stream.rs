@@ -1,15 +1,21 @@
 //! Streams: named values that change. A unit publishes them, and reads those of its nodes.
 
 use std::fmt;
+use std::marker::PhantomData;
 use std::sync::Arc;
+#[cfg(feature = "async")]
+use std::task::{Poll, Waker};
 
 use cara_core::config::Priority;
 use cara_core::distribution::block;
 use cara_core::distribution::function::{Attributes, Definition, Signature};
-use cara_core::distribution::parameters::{ParametersView, Value};
+use cara_core::distribution::parameters::{FromValue, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::time::{Duration, Instant};
+use cara_core::typed::{self, Variables};
 
+#[cfg(feature = "async")]
+use crate::engine::Alarm;
 use crate::engine::streams::{OwnStream, Received, Watched};
 use crate::engine::{Engine, arena, arena_bytes};
 use crate::handler::{Handler, Run};
@@ -58,6 +64,31 @@ impl<T: Send + 'static> Stream<T> {
     }
 }
 
+/// A stream of this unit whose values are those of a struct.
+pub struct Publisher<V, T: Send + 'static = ()> {
+    stream: Stream<T>,
+    values: PhantomData<fn(&V)>,
+}
+
+impl<V, T: Send + 'static> Clone for Publisher<V, T> {
+    fn clone(&self) -> Self {
+        Self { stream: self.stream.clone(), values: PhantomData }
+    }
+}
+
+impl<V, T: Send + 'static> fmt::Debug for Publisher<V, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.stream.fmt(f)
+    }
+}
+
+impl<V: Variables, T: Send + 'static> Publisher<V, T> {
+    /// As [`Stream::publish`].
+    pub fn publish(&self, value: &V) -> Result<(), Error> {
+        value.with_parameters(|values| self.stream.publish(values))?
+    }
+}
+
 impl<T: Send + 'static> MyFunctionList<'_, T> {
     /// Adds a stream, as made by [`Definition::stream`]. A subscriber gets its values at least `least_interval` apart, in whole
     /// milliseconds, up to 65 s. Like a function it is seen by those to which the list is published.
@@ -98,6 +129,33 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         };
         self.engine.functions_mut().add_function(definition, attributes, handler)?;
         Ok(Stream { engine: self.engine.clone(), definition: definition.clone(), own })
+    }
+
+    /// As [`add_stream`](Self::add_stream), for a stream of a struct that derives [`Variables`].
+    ///
+    /// ```no_run
+    /// # #[cfg(feature = "derive")] {
+    /// use cara_std::{Duration, Unit, Variables};
+    ///
+    /// #[derive(Variables)]
+    /// struct Pose {
+    ///     position: [f64; 2],
+    /// }
+    ///
+    /// # fn run(agv: Unit) -> Result<(), cara_std::Error> {
+    /// let pose = agv.my_function_list().add_stream_of::<Pose>("pose", Duration::from_millis(20))?;
+    /// agv.publish_my_function_list()?;
+    /// pose.publish(&Pose { position: [3.0, 4.0] })
+    /// # }
+    /// # }
+    /// ```
+    pub fn add_stream_of<V: Variables>(
+        &self,
+        name: &str,
+        least_interval: impl Into<Duration>,
+    ) -> Result<Publisher<V, T>, Error> {
+        let stream = self.add_stream(&typed::stream_of::<V>(name)?, least_interval)?;
+        Ok(Publisher { stream, values: PhantomData })
     }
 
     pub(crate) fn stream(&self, name: &str) -> Option<Stream<T>> {
@@ -211,9 +269,25 @@ impl Sample {
         block::read(self.signature().results(), &self.received.block, parameters)
     }
 
+    /// Its values as a struct that derives [`Variables`]; errors as of [`Variables::from_parameters`], where the node's stream
+    /// has other variables.
+    pub fn read<V: Variables>(&self) -> Result<V, Error> {
+        V::from_parameters(&self.values())
+    }
+
     /// One of its values, as of [`ParametersView::variable`].
-    pub fn value<V: for<'a> TryFrom<Value<'a>, Error = Error>>(&self, name: &str) -> Result<V, Error> {
-        self.values().value(name).and_then(V::try_from)
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// # let pose = depot.s_unit("agv-07")?.stream("pose")?.subscribe(cara_std::Duration::from_millis(100));
+    /// if let Some(sample) = pose.latest() {
+    ///     let [x, y]: [f64; 2] = sample.value("position")?;
+    ///     println!("{x} {y}");
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn value<V: for<'a> FromValue<'a>>(&self, name: &str) -> Result<V, Error> {
+        self.values().variable(name)
     }
 }
 
@@ -240,6 +314,12 @@ impl<T: Send + 'static> Subscription<T> {
     pub fn latest(&self) -> Option<Sample> {
         let (newest, _) = self.watched.newest();
         newest.map(|received| self.sample(received))
+    }
+
+    /// The newest value as a struct that derives [`Variables`], and its age; `None` until one has come. Errors as of
+    /// [`Sample::read`].
+    pub fn newest<V: Variables>(&self) -> Option<Result<(V, Duration), Error>> {
+        self.latest().map(|sample| Ok((sample.read()?, sample.age)))
     }
 
     fn sample(&self, received: Received) -> Sample {
@@ -272,6 +352,39 @@ impl<T: Send + 'static> Subscription<T> {
                 Err(error) => return Err(error),
             }
         }
+    }
+
+    /// The next value for a task, which is woken when one has come and the pace lets it through, when the node has refused, and
+    /// when this unit is stopped.
+    #[cfg(feature = "async")]
+    pub(crate) fn poll_next(&mut self, waker: &Waker, alarm: &mut Alarm<T>) -> Poll<Result<Sample, Error>> {
+        let engine = &self.peer.engine;
+        let now = engine.now();
+        let is_early = self.due > now;
+        // What has come waits for its time: by then there may be a newer one.
+        let seen = if is_early { u64::MAX } else { self.seen };
+        match self.watched.poll(self.id, seen, waker) {
+            Some(Ok((received, count))) => {
+                self.seen = count;
+                self.due = self.due.max(now) + self.interval;
+                Poll::Ready(Ok(self.sample(received)))
+            }
+            Some(Err(error)) => Poll::Ready(Err(error)),
+            // Looked at behind the waker, which the end of the unit wakes.
+            None if engine.is_stopping() => Poll::Ready(Err(Error::NotRunning)),
+            None => {
+                if is_early {
+                    alarm.set(self.due, waker);
+                }
+                Poll::Pending
+            }
+        }
+    }
+
+    /// The unit that reads.
+    #[cfg(feature = "async")]
+    pub(crate) const fn engine(&self) -> &Arc<Engine<T>> {
+        &self.peer.engine
     }
 
     /// The values as they come; ends where [`next`](Self::next) fails for another reason than time.

@@ -8,6 +8,7 @@ use cara_core::error::Error;
 use cara_core::services::requests::CallId;
 
 use crate::builder::{BuildError, Builder, manager};
+use crate::growing::CallParameters;
 use crate::handle::{Handle, SUnit, WeakHandle};
 use crate::peer::Peer;
 
@@ -50,7 +51,7 @@ impl<T: Send + 'static> Unit<T> {
 
     /// Calls a function of the manager and waits for its results.
     #[doc(alias = "block_request_their_function")]
-    pub fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
+    pub fn block_request(&self, function: &str, parameters: &mut (impl CallParameters + ?Sized)) -> Result<(), Error> {
         self.manager().ok_or(Error::NotConnected)?.block_request(function, parameters)
     }
 

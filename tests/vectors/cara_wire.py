@@ -13,7 +13,8 @@ VERSIONS = [VERSION, VERSION]
 PORT = 21970
 PRIORITIES = ["emergency", "high", "normal", "low"]
 ROLES = ["m_unit", "s_unit"]
-TYPES = ["int", "float", "string", "bool", "bytes"]
+TYPES = ["int", "float", "string", "bool", "bytes", "list", "record"]
+DEPTH = 4
 FIXED = ("int", "float", "bool")
 NAME_CHARACTERS = frozenset(b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789_-./")
 EMERGENCY_BYTES = 256
@@ -411,6 +412,12 @@ def decode_message(data):
     if kind == 3:
         require(len(data) >= 4)
         return {"control": [read_control(*each) for each in items_of(data[4:])]}
+    if kind == 5:
+        _, _, _, words, number = Reader(data[:8]).fixed("BBBBI")
+        require(words >= 2)
+        reader = Reader(data)
+        reader.take(4 * words)
+        return {"progress": {"id": number, "block": reader.rest().hex()}}
     if kind == 6:
         return {"sample": read_sample(Reader(data))}
     require(kind == 4)
@@ -423,12 +430,14 @@ def encode_message(message):
     (name, value), = message.items()
     if name == "request":
         flags = value["unknown"] | (1 if value["wants_reply"] else 0) | (16 if value.get("takes_over") else 0)
-        flags |= 4 if value.get("operator") else 0
+        flags |= (2 if value.get("wants_progress") else 0) | (4 if value.get("operator") else 0)
         numbers = (value["id"], value["remaining"], value["stamp"], value["since"], 0)
         place = (value["slot"], value["generation"], REQUEST_BYTES // 4, 0)
         return struct.pack("<BBHHBBIIQII", 1, flags, *place, *numbers) + bytes.fromhex(value["block"])
     if name in ("reply", "failure"):
         return write_answer(2 if name == "reply" else 4, value)
+    if name == "progress":
+        return struct.pack("<BBBBI", 5, 0, 0, 2, value["id"]) + bytes.fromhex(value["block"])
     if name == "sample":
         head = struct.pack("<BBHHBBq", 6, 0, value["slot"], value["generation"], SAMPLE_BYTES // 4, 0, value["made"])
         return head + bytes.fromhex(value["block"])
@@ -447,6 +456,7 @@ def read_request(reader):
     _, flags, slot, generation, words, _, number, remaining, stamp, since, _ = reader.fixed(form)
     return {
         "id": number, "slot": slot, "generation": generation, "wants_reply": flags & 1 == 1,
+        "wants_progress": flags & 2 != 0,
         "takes_over": flags & 0x10 != 0, "operator": flags & 4 != 0, "unknown": flags & 0xE0,
         "remaining": remaining, "stamp": stamp, "since": since, "block": behind_header(reader, words, REQUEST_BYTES),
     }
@@ -461,6 +471,8 @@ def read_sample(reader):
 def read_answer(reader):
     kind, code, index, words, number, first, second = reader.fixed("BBBBIII")
     block = behind_header(reader, words, REPLY_BYTES) if kind == 2 else ""
+    if kind == 4 and 4 * words >= REPLY_BYTES:
+        block = reader.rest()[4 * words - REPLY_BYTES:].hex()
     if code == 0:
         return {"id": number, "block": block}
     name, fields = ERRORS.get(code, ("malformed", ()))
@@ -473,7 +485,26 @@ def read_answer(reader):
             values[short] &= 0xFFFF
     if "operator" in values:
         values["operator"] = values["operator"] & 1 == 1
-    return {"id": number, "error": {name: values}}
+    answer = {"id": number, "error": {name: values}}
+    details = read_details(bytes.fromhex(block)) if code == 20 else None
+    return {**answer, "details": details} if details else answer
+
+
+def read_details(data):
+    """Text and values of a service that failed; none where they cannot be read."""
+    length = int.from_bytes(data[:8], "little")
+    end = 8 + (length + 7) // 8 * 8
+    if len(data) < 8 or len(data) < end:
+        return None
+    try:
+        return {"text": data[8:8 + length].decode(), "values": data[end:].hex()}
+    except UnicodeDecodeError:
+        return None
+
+
+def write_details(details):
+    text = details["text"].encode()
+    return struct.pack("<Q", len(text)) + text + bytes(-len(text) % 8) + bytes.fromhex(details["values"])
 
 
 def write_answer(kind, value):
@@ -483,7 +514,8 @@ def write_answer(kind, value):
     name, fields = next(iter(error.items())) if isinstance(error, dict) else (error, {})
     code = next(code for code, (known, _) in ERRORS.items() if known == name)
     numbers = [fields[field] for field in ERRORS[code][1] if field != "index"] + [0, 0]
-    return struct.pack("<BBBBIII", kind, code, fields.get("index", 0), REPLY_BYTES // 4, value["id"], *numbers[:2])
+    return struct.pack("<BBBBIII", kind, code, fields.get("index", 0), REPLY_BYTES // 4, value["id"], *numbers[:2]) + (
+        write_details(value["details"]) if "details" in value else b"")
 
 
 def read_control(kind, body):
@@ -504,28 +536,58 @@ def write_control(name, value):
 # --- functions and values (section 10)
 
 
+# Behind the results: the name of each, and the word in the text form.
+SECTIONS = {1: ("progress", "progress"), 2: ("failure", "fails")}
+
+
 def decode_signature(data):
-    require(len(data) <= 384)
+    require(len(data) <= 1024)
     reader = Reader(data)
     name = read_name(reader, reader.u8())
     arguments = read_variables(reader)
     results = read_variables(reader)
-    reader.end()
+    sections, last = {}, 0
+    while reader.at < len(data):
+        section = reader.u8()
+        require(section > last)
+        last = section
+        if section in SECTIONS:
+            sections[SECTIONS[section][0]] = read_variables(reader)
+            require(sections[SECTIONS[section][0]])
+        else:
+            skip_variables(reader)
     known = {variable["name"]: variable for variable in arguments}
     require(all(known.get(variable["name"], variable) == variable for variable in results))
     require(len(known.keys() | {variable["name"] for variable in results}) <= 16)
-    return {"name": name, "arguments": arguments, "results": results, "text": text_form(name, arguments, results)}
+    text = text_form(name, arguments, results, sections)
+    return {"name": name, "arguments": arguments, "results": results, **sections, "text": text}
 
 
 def encode_signature(signature):
     name = signature["name"].encode()
     out = bytes([len(name)]) + name
-    for variables in (signature["arguments"], signature["results"]):
-        out += bytes([len(variables)])
+    lists = [(b"", signature["arguments"]), (b"", signature["results"])]
+    lists += [(bytes([number]), signature[key]) for number, (key, _) in SECTIONS.items() if key in signature]
+    for before, variables in lists:
+        out += before + bytes([len(variables)])
         for variable in variables:
-            name = variable["name"].encode()
-            out += struct.pack("<BBI", TYPES.index(variable["type"]), len(name), variable["size"]) + name
+            out += write_variable(variable)
     return out
+
+
+def write_variable(variable):
+    name = variable["name"].encode()
+    return struct.pack("<BBI", TYPES.index(variable["type"]), len(name), variable["size"]) + name + write_inner(variable)
+
+
+def write_inner(variable):
+    """What a list or record is made of."""
+    if variable["type"] == "record":
+        return b"".join(map(write_variable, variable["fields"]))
+    if variable["type"] != "list":
+        return b""
+    element = variable["element"]
+    return struct.pack("<BI", TYPES.index(element["type"]), element["size"]) + write_inner(element)
 
 
 def read_name(reader, length):
@@ -535,22 +597,82 @@ def read_name(reader, length):
 
 
 def read_variables(reader):
+    return read_some_variables(reader, reader.u8(), 0)
+
+
+def read_some_variables(reader, count, depth):
     variables = []
-    for _ in range(reader.u8()):
+    for _ in range(count):
         kind, length, size = reader.fixed("BBI")
-        require(kind < len(TYPES))
-        variables.append({"name": read_name(reader, length), "type": TYPES[kind], "size": size})
+        name = read_name(reader, length)
+        variables.append({"name": name, **read_type(reader, kind, size, depth)})
     require(len({variable["name"] for variable in variables}) == len(variables))
     return variables
 
 
-def text_form(name, arguments, results):
-    def one(variable):
-        short = variable["type"] in FIXED and variable["size"] == 1
-        return variable["name"] + ": " + variable["type"] + ("" if short else "[%d]" % variable["size"])
+def skip_variables(reader):
+    """Those of a section that is not known: no more of them is looked at than how long they are."""
+    count = reader.u8()
+    require(count > 0)
+    for _ in range(count):
+        kind, length, size = reader.fixed("BBI")
+        text_of(reader.take(length))
+        skip_type(reader, kind, size)
 
-    text = name + "(" + ", ".join(map(one, arguments)) + ")"
-    return text + " -> (" + ", ".join(map(one, results)) + ")" if results else text
+
+def skip_type(reader, kind, size):
+    require(kind < len(TYPES))
+    if TYPES[kind] == "list":
+        skip_type(reader, *reader.fixed("BI"))
+    elif TYPES[kind] == "record":
+        for _ in range(size):
+            field, length, inner = reader.fixed("BBI")
+            reader.take(length)
+            skip_type(reader, field, inner)
+
+
+def read_type(reader, kind, size, depth):
+    """A type, and what a list or record is made of."""
+    require(kind < len(TYPES))
+    variable = {"type": TYPES[kind], "size": size}
+    if variable["type"] in ("list", "record"):
+        require(depth < DEPTH)
+    if variable["type"] == "list":
+        variable["element"] = read_type(reader, *reader.fixed("BI"), depth + 1)
+        require(least(variable["element"]) > 0)
+    elif variable["type"] == "record":
+        require(1 <= size <= 255)
+        variable["fields"] = read_some_variables(reader, size, depth + 1)
+    return variable
+
+
+def least(variable):
+    """Bytes of the shortest value in a block."""
+    kind, size = variable["type"], variable["size"]
+    if kind == "record":
+        return sum(map(least, variable["fields"]))
+    return -(-size * (1 if kind == "bool" else 8) // 8) * 8 if kind in FIXED else 8
+
+
+def type_text(variable):
+    if variable["type"] == "list":
+        return type_text(variable["element"]) + "[..%d]" % variable["size"]
+    if variable["type"] == "record":
+        return "{" + ", ".join(field["name"] + ": " + type_text(field) for field in variable["fields"]) + "}"
+    short = variable["type"] in FIXED and variable["size"] == 1
+    return variable["type"] + ("" if short else "[%d]" % variable["size"])
+
+
+def text_form(name, arguments, results, sections):
+    def one(variable):
+        return variable["name"] + ": " + type_text(variable)
+
+    def listed(variables):
+        return "(" + ", ".join(map(one, variables)) + ")"
+
+    text = name + listed(arguments) + (" -> " + listed(results) if results else "")
+    declared = [(word, sections[key]) for key, word in SECTIONS.values() if key in sections]
+    return text + "".join(" " + word + " " + listed(variables) for word, variables in declared)
 
 
 def decode_attributes(data):
@@ -574,12 +696,26 @@ def encode_attributes(attributes):
 
 def decode_block(data, variables):
     reader = Reader(data)
-    values = {variable["name"]: read_value(reader, variable["type"], variable["size"]) for variable in variables}
+    values = read_values(reader, variables)
     reader.end()
     return values
 
 
-def read_value(reader, kind, size):
+def read_values(reader, variables):
+    return {variable["name"]: read_value(reader, variable) for variable in variables}
+
+
+def read_value(reader, variable):
+    kind, size = variable["type"], variable["size"]
+    if kind == "record":
+        return read_values(reader, variable["fields"])
+    if kind == "list":
+        count, body = reader.fixed("II")
+        require(count <= size and body % 8 == 0 and count * least(variable["element"]) <= body)
+        elements = Reader(reader.take(body))
+        values = [read_value(elements, variable["element"]) for _ in range(count)]
+        elements.end()
+        return values
     if kind in FIXED:
         data = reader.take(size * (1 if kind == "bool" else 8))
     else:
@@ -598,11 +734,16 @@ def read_value(reader, kind, size):
 
 
 def encode_block(values, variables):
-    return b"".join(write_value(values[variable["name"]], variable["type"]) for variable in variables)
+    return b"".join(write_value(values[variable["name"]], variable) for variable in variables)
 
 
-def write_value(value, kind):
-    head = b""
+def write_value(value, variable):
+    kind, head = variable["type"], b""
+    if kind == "record":
+        return encode_block(value, variable["fields"])
+    if kind == "list":
+        body = b"".join(write_value(element, variable["element"]) for element in value)
+        return struct.pack("<II", len(value), len(body)) + body
     if kind == "int":
         data = struct.pack("<%dq" % len(value), *value)
     elif kind == "float":
@@ -636,6 +777,10 @@ def decode_session_body(data):
         priority, call = reader.fixed("BI")
         require(priority < len(PRIORITIES))
         body = {"release": {"class": PRIORITIES[priority], "call": call}}
+    elif kind == 9:
+        priority, call = reader.fixed("BI")
+        require(priority < len(PRIORITIES))
+        body = {"cancel": {"class": PRIORITIES[priority], "call": call}}
     elif kind == 7:
         slot, call = reader.fixed("HI")
         body = {"release_all": {"slot": slot, "call": call}}
@@ -662,6 +807,8 @@ def encode_session_body(body):
         return struct.pack("<BI", 8, value["call"])
     if name == "release":
         return struct.pack("<BBI", 6, PRIORITIES.index(value["class"]), value["call"])
+    if name == "cancel":
+        return struct.pack("<BBI", 9, PRIORITIES.index(value["class"]), value["call"])
     if name == "release_all":
         return struct.pack("<BHI", 7, value["slot"], value["call"])
     return bytes([3, PRIORITIES.index(value["priority"])]) + encode_message(value["message"])

@@ -1,15 +1,17 @@
 //! Attributes of fields, arguments and functions.
 
+use syn::punctuated::Punctuated;
 use syn::spanned::Spanned;
-use syn::{Attribute, Error, Expr, ExprLit, Ident, Lit, LitInt, LitStr, Meta, Result};
+use syn::{Attribute, Error, Expr, ExprLit, Ident, Lit, LitInt, LitStr, Meta, Result, Token};
 
-/// Most bytes of text or bytes that can be declared.
+/// Most bytes of text or bytes, or elements of a list, that can be declared.
 const LARGEST: u64 = u32::MAX as u64;
 
 /// `#[size(200)]` and `#[name = "…"]` of a variable.
 #[derive(Default)]
 pub(crate) struct OfVariable {
-    pub(crate) size: Option<LitInt>,
+    /// As `#[size(50, 32)]` has them: of a list, then of its elements.
+    pub(crate) size: Vec<LitInt>,
     pub(crate) name: Option<String>,
 }
 
@@ -17,13 +19,15 @@ impl OfVariable {
     /// Takes its attributes away from others.
     pub(crate) fn take(attributes: &mut Vec<Attribute>) -> Result<Self> {
         let mut found = Self::default();
+        let mut size = None;
         for attribute in extract(attributes, &["size", "name"]) {
             if attribute.path().is_ident("size") {
-                set(&mut found.size, size(&attribute)?, &attribute)?;
+                set(&mut size, sizes(&attribute)?, &attribute)?;
             } else {
                 set(&mut found.name, text(&attribute)?.value(), &attribute)?;
             }
         }
+        found.size = size.unwrap_or_default();
         Ok(found)
     }
 
@@ -75,13 +79,17 @@ pub(crate) fn flag(attribute: &Attribute) -> Result<()> {
     }
 }
 
-/// `#[size(200)]`.
-fn size(attribute: &Attribute) -> Result<LitInt> {
-    let size: LitInt = attribute
-        .parse_args()
-        .map_err(|_| Error::new(attribute.span(), "write #[size(200)]: the most bytes that there are"))?;
-    match size.base10_parse::<u64>()? {
-        0..=LARGEST => Ok(size),
-        _ => Err(Error::new(size.span(), "a size is a number of 32 bits")),
+/// `#[size(200)]`, `#[size(50, 32)]`.
+fn sizes(attribute: &Attribute) -> Result<Vec<LitInt>> {
+    let wrong =
+        "write #[size(200)]: the most bytes or elements that there are, or #[size(50, 32)] for those of elements";
+    let sizes = attribute
+        .parse_args_with(Punctuated::<LitInt, Token![,]>::parse_separated_nonempty)
+        .map_err(|_| Error::new(attribute.span(), wrong))?;
+    for size in &sizes {
+        if size.base10_parse::<u64>()? > LARGEST {
+            return Err(Error::new(size.span(), "a size is a number of 32 bits"));
+        }
     }
+    Ok(sizes.into_iter().collect())
 }

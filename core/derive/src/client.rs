@@ -29,7 +29,7 @@ fn shared(function: &Function, root: &TokenStream) -> TokenStream {
     let inputs = inputs(function);
     let mut place = 0_usize;
     let writes = function.inputs.iter().filter_map(|input| match input {
-        Input::Call => None,
+        Input::Call(_) => None,
         Input::Variable(argument, variable) => {
             let write = variable.write(root, &quote!(#argument), &quote!(#place));
             place += 1;
@@ -70,7 +70,7 @@ fn shared(function: &Function, root: &TokenStream) -> TokenStream {
 /// The arguments as a client takes them.
 fn inputs(function: &Function) -> Vec<TokenStream> {
     let input = |input: &Input| match input {
-        Input::Call => None,
+        Input::Call(_) => None,
         Input::Variable(name, variable) => {
             let rust = &variable.rust;
             Some(quote!(#name: #rust))
@@ -83,7 +83,7 @@ fn inputs(function: &Function) -> Vec<TokenStream> {
 /// Their names.
 fn names(function: &Function) -> Vec<TokenStream> {
     let name = |input: &Input| match input {
-        Input::Call => None,
+        Input::Call(_) => None,
         Input::Variable(name, _) | Input::Struct(name, _) => Some(quote!(#name)),
     };
     function.inputs.iter().filter_map(name).collect()
@@ -153,11 +153,15 @@ fn prepared(interface: &Interface, function: &Function, root: &TokenStream) -> T
         (function.constant("ARGUMENTS"), function.constant("RESULTS"), function.constant("SIGNATURE"));
     let (fill, names) = (format_ident!("fill_{}", function.ident), names(function));
     quote! {
-        let mut parameters = #parts::Parameters::<
-            { #typed::parameters_bytes(#holder::#arguments, #holder::#results) + #typed::ROOM },
-        >::sized();
-        self.client.prepare(#holder::#signature, &mut parameters)?;
-        #holder::#fill(&mut parameters, #(#names),*)?;
+        const BYTES: usize = #typed::parameters_bytes(#holder::#arguments, #holder::#results) + #typed::ROOM;
+        let mut on_stack = #parts::Parameters::<{ #typed::on_stack(BYTES) }>::sized();
+        let mut room = if BYTES > #typed::STACK_BYTES { <P as #typed::Caller>::room(BYTES) } else { ::core::option::Option::None };
+        let parameters: &mut #parts::ParametersView = match &mut room {
+            ::core::option::Option::Some(room) => room,
+            ::core::option::Option::None => &mut on_stack,
+        };
+        self.client.prepare(#holder::#signature, parameters)?;
+        #holder::#fill(parameters, #(#names),*)?;
     }
 }
 
@@ -181,22 +185,61 @@ fn blocking(interface: &Interface, function: &Function, root: &TokenStream) -> T
             #[doc = #about]
             #visibility fn #hold(&self, #(#inputs),*) -> ::core::result::Result<P::Hold, #typed::CallError> {
                 #prepared
-                let held = #typed::BlockingCaller::block_and_hold(self.client.peer(), #name, &mut parameters, self.client.options())?;
+                let held = #typed::BlockingCaller::block_and_hold(self.client.peer(), #name, parameters, self.client.options())?;
                 ::core::result::Result::Ok(held)
             }
         }
     });
+    let watch = watch(interface, function, root, false);
     let request = request(interface, function, root);
     quote! {
         #[doc = #help]
         #visibility fn #ident(&self, #(#inputs),*) -> ::core::result::Result<#returned, #typed::CallError> {
             #prepared
-            #typed::BlockingCaller::block(self.client.peer(), #name, &mut parameters, self.client.options())?;
-            ::core::result::Result::Ok(#holder::#take(&parameters)?)
+            #typed::BlockingCaller::block(self.client.peer(), #name, parameters, self.client.options())?;
+            ::core::result::Result::Ok(#holder::#take(parameters)?)
         }
+        #watch
         #request
         #hold
     }
+}
+
+/// The call with its progress and its reasons, where the function declares them.
+fn watch(interface: &Interface, function: &Function, root: &TokenStream, is_awaited: bool) -> Option<TokenStream> {
+    let (progress, fails) = function.told()?;
+    let (typed, holder, visibility) = (quote!(#root::typed), interface.holder(), &interface.item.vis);
+    let (ident, name, take) = (&function.ident, &function.name, format_ident!("take_{}", function.ident));
+    let (inputs, returned, prepared) = (inputs(function), function.returned(), prepared(interface, function, root));
+    let watch = format_ident!("watch_{}", crate::attributes::plain(ident));
+    let about = format!(
+        "As [`{ident}`](Self::{ident}), with what the call tells while it runs, and all that the service says of a failure. `Break` \
+         gives the call up: it ends with `Error::Cancelled`, and what it has started stops."
+    );
+    let (asyncness, watcher, method, wait) = match is_awaited {
+        true => (quote!(async), quote!(AwaitedWatcher), quote!(call_watched), quote!(.await)),
+        false => (quote!(), quote!(WatchingCaller), quote!(block_watched), quote!()),
+    };
+    let failed = quote!(#typed::Failed<#fails>);
+    Some(quote! {
+        #[doc = #about]
+        #[allow(clippy::result_large_err)]
+        #visibility #asyncness fn #watch(
+            &self,
+            #(#inputs,)*
+            mut on_progress: impl ::core::ops::FnMut(#progress) -> ::core::ops::ControlFlow<()>,
+        ) -> ::core::result::Result<#returned, #failed>
+        where
+            P: #typed::#watcher,
+        {
+            #prepared
+            let (mut why, options) = (::core::option::Option::None, self.client.options());
+            let hand = |told: &#typed::parts::ParametersView| #typed::hand(told, &mut on_progress);
+            #typed::#watcher::#method(self.client.peer(), #name, parameters, options, hand, &mut why)#wait
+                .map_err(|error| <#failed>::new(error, why.as_ref()))?;
+            ::core::result::Result::Ok(#holder::#take(parameters)?)
+        }
+    })
 }
 
 fn request(interface: &Interface, function: &Function, root: &TokenStream) -> TokenStream {
@@ -209,7 +252,7 @@ fn request(interface: &Interface, function: &Function, root: &TokenStream) -> To
         #[doc = #about]
         #visibility fn #request(&self, #(#inputs),*) -> ::core::result::Result<#parts::CallId, #typed::CallError> {
             #prepared
-            let call = #typed::Caller::send(self.client.peer(), #name, &parameters, self.client.options())?;
+            let call = #typed::Caller::send(self.client.peer(), #name, parameters, self.client.options())?;
             ::core::result::Result::Ok(call)
         }
     }
@@ -220,14 +263,16 @@ fn awaited(interface: &Interface, function: &Function, root: &TokenStream) -> To
     let (ident, name, take) = (&function.ident, &function.name, format_ident!("take_{}", function.ident));
     let (inputs, returned, prepared, help) =
         (inputs(function), function.returned(), prepared(interface, function, root), help(function));
+    let watch = watch(interface, function, root, true);
     let request = request(interface, function, root);
     quote! {
         #[doc = #help]
         #visibility async fn #ident(&self, #(#inputs),*) -> ::core::result::Result<#returned, #typed::CallError> {
             #prepared
-            #typed::AwaitedCaller::call(self.client.peer(), #name, &mut parameters, self.client.options()).await?;
-            ::core::result::Result::Ok(#holder::#take(&parameters)?)
+            #typed::AwaitedCaller::call(self.client.peer(), #name, parameters, self.client.options()).await?;
+            ::core::result::Result::Ok(#holder::#take(parameters)?)
         }
+        #watch
         #request
     }
 }

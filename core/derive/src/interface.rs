@@ -1,12 +1,13 @@
 //! `#[interface]`: what the trait says, and what is made of it.
 
-use proc_macro2::{Span, TokenStream};
-use quote::{ToTokens, format_ident, quote};
+use proc_macro2::{Span, TokenStream, TokenTree};
+use quote::{ToTokens, format_ident, quote, quote_spanned};
 use syn::parse::{Parse, ParseStream};
 use syn::punctuated::Punctuated;
+use syn::spanned::Spanned;
 use syn::{
     Attribute, Error, Expr, ExprLit, FnArg, GenericArgument, Ident, ItemTrait, Lit, LitInt, LitStr, Meta, Pat,
-    PathArguments, Result, ReturnType, Token, TraitItem, TraitItemFn, Type,
+    PathArguments, Result, ReturnType, Token, TraitItem, TraitItemFn, Type, TypeParamBound,
 };
 
 use crate::attributes::{OfVariable, extract, flag, plain, set, text};
@@ -38,10 +39,18 @@ pub(crate) struct Function {
 /// What a function is called with.
 pub(crate) enum Input {
     /// What tells about the call.
-    Call,
+    Call(Call),
     Variable(Ident, Variable),
     /// A struct whose fields are the arguments.
     Struct(Ident, Type),
+}
+
+/// What an argument that tells about the call says of it.
+pub(crate) struct Call {
+    /// The traits behind `impl`, for a state of the type `T`.
+    pub(crate) bounds: TokenStream,
+    /// The first and the second type of `TypedCall<Left, Blocked>`: the progress, and the values of failures.
+    told: Vec<Type>,
 }
 
 /// What a function gives back.
@@ -78,6 +87,8 @@ impl Interface {
         for member in &mut item.items {
             match member {
                 TraitItem::Fn(function) => functions.push(Function::read(function)?),
+                // As for the order of a call, whose type differs from port to port.
+                TraitItem::Type(_) => {}
                 other => return Err(Error::new_spanned(other, "an interface has functions only")),
             }
         }
@@ -144,7 +155,7 @@ impl Function {
             }
         }
         let span = signature.ident.span();
-        let variables = inputs.iter().filter(|input| !matches!(input, Input::Call)).count();
+        let variables = inputs.iter().filter(|input| !matches!(input, Input::Call(_))).count();
         if variables > 1 && inputs.iter().any(|input| matches!(input, Input::Struct(..))) {
             return Err(Error::new(span, "an argument with #[variables] is the only one"));
         }
@@ -194,9 +205,24 @@ impl Function {
         };
         let arguments = self.inputs.iter().filter_map(|input| match input {
             Input::Variable(_, variable) => Some(variable),
-            Input::Call | Input::Struct(..) => None,
+            Input::Call(_) | Input::Struct(..) => None,
         });
         arguments.chain(results)
+    }
+
+    /// What the argument says that tells about the call.
+    pub(crate) fn call(&self) -> Option<&Call> {
+        self.inputs.iter().find_map(|input| match input {
+            Input::Call(call) => Some(call),
+            Input::Variable(..) | Input::Struct(..) => None,
+        })
+    }
+
+    /// What its calls tell while they run and, second, when they fail; `None` where it says neither.
+    pub(crate) fn told(&self) -> Option<(Type, Type)> {
+        let told = &self.call()?.told;
+        let second = || told.get(1).cloned().unwrap_or_else(|| syn::parse_quote!(()));
+        Some((told.first()?.clone(), second()))
     }
 
     /// A constant of this function.
@@ -225,9 +251,11 @@ impl Input {
             return Err(Error::new_spanned(pattern, "an argument has a name, which is the variable's"));
         };
         if let Type::Reference(reference) = rust
-            && let Type::ImplTrait(_) = &*reference.elem
+            && let Type::ImplTrait(call) = &*reference.elem
         {
-            return Ok(Self::Call);
+            let told = call.bounds.iter().flat_map(types_of).collect();
+            let bounds = call.bounds.to_token_stream().into_iter().map(of_state).collect();
+            return Ok(Self::Call(Call { bounds, told }));
         }
         let is_struct = extract(attributes, &["variables"]);
         let mut said = OfVariable::take(attributes)?;
@@ -240,11 +268,35 @@ impl Input {
     }
 }
 
+/// What implements the trait is `Self` there, and `T` in the server's functions.
+fn of_state(token: TokenTree) -> TokenTree {
+    match token {
+        TokenTree::Ident(word) if word == "Self" => Ident::new("T", word.span()).into(),
+        other => other,
+    }
+}
+
+/// `Left` and `Blocked` of `TypedCall<Left, Blocked>`.
+fn types_of(bound: &TypeParamBound) -> Vec<Type> {
+    let TypeParamBound::Trait(bound) = bound else { return Vec::new() };
+    match bound.path.segments.last().map(|last| &last.arguments) {
+        Some(PathArguments::AngleBracketed(generic)) => generic
+            .args
+            .iter()
+            .filter_map(|argument| match argument {
+                GenericArgument::Type(rust) => Some(rust.clone()),
+                _ => None,
+            })
+            .collect(),
+        _ => Vec::new(),
+    }
+}
+
 /// The name of a result, as `sum`, `"pos-x"` or `#[size(64)] text`.
 struct Named {
     name: String,
     span: Span,
-    size: Option<LitInt>,
+    size: Vec<LitInt>,
 }
 
 impl Parse for Named {
@@ -337,16 +389,17 @@ fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
         let name = &function.name;
         let named = |what: &str| function.constant(what);
         let (arguments, results, places) = (named("ARGUMENTS"), named("RESULTS"), named("PLACES"));
+        let declared = named("DECLARED");
         let (encoded, signature, attributes) = (named("ENCODED"), named("SIGNATURE"), named("ATTRIBUTES"));
         let of_arguments = match function.inputs.iter().find_map(|input| match input {
             Input::Struct(_, rust) => Some(rust),
-            Input::Call | Input::Variable(..) => None,
+            Input::Call(_) | Input::Variable(..) => None,
         }) {
             Some(rust) => quote!(<#rust as #typed::Variables>::SPECS),
             None => {
                 let specs = function.inputs.iter().filter_map(|input| match input {
                     Input::Variable(_, variable) => Some(variable.spec(root)),
-                    Input::Call | Input::Struct(..) => None,
+                    Input::Call(_) | Input::Struct(..) => None,
                 });
                 quote!(&[#(#specs),*])
             }
@@ -358,10 +411,17 @@ fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
                 quote!(&[#(#specs),*])
             }
         };
+        let (progress, fails) = match function.told() {
+            Some((progress, fails)) => {
+                let specs = |rust: Type| quote_spanned! { rust.span() => <#rust as #typed::Variables>::SPECS };
+                (specs(progress), specs(fails))
+            }
+            None => (quote!(&[]), quote!(&[])),
+        };
         let values = function.attributes.expression(root);
         let span = function.ident.span();
-        let made = quote::quote_spanned! { span =>
-            match #typed::Encoded::new(#name, Self::#arguments, Self::#results) {
+        let made = quote_spanned! { span =>
+            match #typed::Encoded::new(#name, Self::#declared) {
                 ::core::result::Result::Ok(encoded) => encoded,
                 ::core::result::Result::Err(rule) => ::core::panic!("{}", rule),
             }
@@ -370,7 +430,13 @@ fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
             const #arguments: &'static [#parts::VariableSpec<'static>] = #of_arguments;
             const #results: &'static [#parts::VariableSpec<'static>] = #of_results;
             const #places: [u8; #typed::IN_ORDER.len()] = #typed::places_of_results(Self::#arguments, Self::#results);
-            const #encoded: &'static #typed::Encoded<{ #typed::encoded_bytes(#name, Self::#arguments, Self::#results) }> = &#made;
+            const #declared: #typed::Declared<'static> = #typed::Declared {
+                arguments: Self::#arguments,
+                results: Self::#results,
+                progress: #progress,
+                fails: #fails,
+            };
+            const #encoded: &'static #typed::Encoded<{ Self::#declared.encoded_bytes(#name) }> = &#made;
             const #signature: #parts::Signature<'static> = Self::#encoded.signature();
             const #attributes: #parts::Attributes = #values;
         }

@@ -20,28 +20,66 @@ pub(crate) enum Kind {
     Text(LitInt),
     /// `Vec<u8>` or `&[u8]`, likewise.
     Bytes(LitInt),
+    /// A list of at most so many elements.
+    List(Holder, TokenStream, Box<Variable>),
+}
+
+/// What holds the elements of a list.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Holder {
+    /// `Vec`.
+    Growing,
+    /// `heapless::Vec`.
+    Bounded,
+    /// `Option`.
+    Optional,
 }
 
 /// What the spelling of a type tells.
 enum Spelling {
     Text,
     Bytes,
+    /// A list of elements of this type; how many, where the type says it.
+    List(Holder, Box<Type>, Option<TokenStream>),
     Other,
 }
 
 impl Variable {
     /// Or what is wrong with its type.
-    pub(crate) fn new(name: String, rust: Type, size: Option<LitInt>) -> Result<Self> {
-        let kind = match (spelling(&rust)?, size) {
-            (Spelling::Text, Some(size)) => Kind::Text(size),
-            (Spelling::Bytes, Some(size)) => Kind::Bytes(size),
-            (Spelling::Other, None) => Kind::Field,
-            (Spelling::Text | Spelling::Bytes, None) => {
-                let wrong = format!("say how many bytes of `{}` there are at most: #[size(200)]", spelled(&rust));
-                return Err(Error::new_spanned(rust, wrong));
+    pub(crate) fn new(name: String, rust: Type, sizes: Vec<LitInt>) -> Result<Self> {
+        let mut sizes = sizes.into_iter();
+        let variable = Self::nested(name, rust, &mut sizes)?;
+        match sizes.next() {
+            None => Ok(variable),
+            Some(size) => {
+                let wrong = match variable.kind {
+                    Kind::Field => "only `String`, `&str`, `Vec` and `&[u8]` have a #[size]",
+                    _ => "this type does not have so many sizes",
+                };
+                Err(Error::new(size.span(), wrong))
             }
-            (Spelling::Other, Some(size)) => {
-                return Err(Error::new(size.span(), "only `String`, `&str`, `Vec<u8>` and `&[u8]` have a #[size]"));
+        }
+    }
+
+    /// Takes the sizes that it needs, from the outermost to the innermost.
+    fn nested(name: String, rust: Type, sizes: &mut impl Iterator<Item = LitInt>) -> Result<Self> {
+        let mut size = |what: &str| {
+            let wrong = || format!("say how many {what} of `{}` there are at most: #[size(200)]", spelled(&rust));
+            sizes.next().ok_or_else(|| Error::new_spanned(&rust, wrong()))
+        };
+        let kind = match spelling(&rust)? {
+            Spelling::Text => Kind::Text(size("bytes")?),
+            Spelling::Bytes => Kind::Bytes(size("bytes")?),
+            Spelling::Other => Kind::Field,
+            Spelling::List(holder, element, most) => {
+                let most = match most {
+                    Some(most) => most,
+                    None => size("elements")?.into_token_stream(),
+                };
+                if let Type::Reference(_) = *element {
+                    return Err(Error::new_spanned(element, "a list owns its elements"));
+                }
+                Kind::List(holder, most, Box::new(Self::nested(String::new(), *element, sizes)?))
             }
         };
         Ok(Self { name, rust, kind })
@@ -55,30 +93,70 @@ impl Variable {
     /// Its `VariableSpec`.
     pub(crate) fn spec(&self, root: &TokenStream) -> TokenStream {
         let Self { name, rust, kind } = self;
-        let (kind, size) = match kind {
+        let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
+        match kind {
             Kind::Field => {
-                let field = quote!(<#rust as #root::typed::Field>);
-                (quote!(#field::KIND), quote!(#field::SIZE))
+                let field = quote!(<#rust as #typed::Field>);
+                quote! {
+                    #parts::VariableSpec { name: #name, kind: #field::KIND, size: #field::SIZE, inner: #field::INNER }
+                }
             }
-            Kind::Text(size) => (quote!(#root::typed::parts::Type::String), size.to_token_stream()),
-            Kind::Bytes(size) => (quote!(#root::typed::parts::Type::Bytes), size.to_token_stream()),
-        };
-        quote!(#root::typed::parts::VariableSpec { name: #name, kind: #kind, size: #size })
+            Kind::Text(size) => quote!(#parts::VariableSpec::flat(#name, #parts::Type::String, #size)),
+            Kind::Bytes(size) => quote!(#parts::VariableSpec::flat(#name, #parts::Type::Bytes, #size)),
+            Kind::List(_, most, element) => {
+                let element = element.spec(root);
+                quote! {
+                    #typed::__list!({
+                        const ELEMENT: #parts::VariableSpec<'static> = #element;
+                        const INNER: [u8; #typed::element_bytes(ELEMENT)] = #typed::element(ELEMENT);
+                        #parts::VariableSpec {
+                            name: #name,
+                            kind: #parts::Type::List,
+                            size: (#most) as u32,
+                            inner: &INNER,
+                        }
+                    })
+                }
+            }
+        }
     }
 
     /// Reads it, as a `Result<_, Error>`.
     pub(crate) fn read(&self, root: &TokenStream, place: &TokenStream) -> TokenStream {
+        let read = self.reader(root);
+        quote!(parameters.value_of(#place).and_then(#read))
+    }
+
+    /// A function from its `Value` to a `Result<_, Error>`.
+    pub(crate) fn reader(&self, root: &TokenStream) -> TokenStream {
         let rust = &self.rust;
-        let value = quote!(parameters.value_of(#place));
         let from = |borrowed: TokenStream| {
-            quote!(#value.and_then(|value| {
+            quote!(|value| {
                 <#borrowed as #root::typed::parts::FromValue>::from_value(value).map(<#rust as ::core::convert::From<#borrowed>>::from)
-            }))
+            })
         };
-        match self.kind {
-            Kind::Field => quote!(#value.and_then(<#rust as #root::typed::Field>::from_field)),
+        match &self.kind {
+            Kind::Field => quote!(<#rust as #root::typed::Field>::from_field),
             Kind::Text(_) => from(quote!(&str)),
             Kind::Bytes(_) => from(quote!(&[u8])),
+            Kind::List(holder, _, element) => {
+                let read = element.reader(root);
+                match holder {
+                    Holder::Growing => quote!(|value| {
+                        #root::typed::elements(value).and_then(|elements| elements.map(#read).collect())
+                    }),
+                    Holder::Bounded => quote!(|value| {
+                        let mut list = <#rust>::new();
+                        for element in #root::typed::elements(value)?.map(#read) {
+                            list.push(element?).map_err(|_| #root::typed::parts::Error::OutOfRange)?;
+                        }
+                        ::core::result::Result::Ok(list)
+                    }),
+                    Holder::Optional => quote!(|value| {
+                        #root::typed::optional(value).and_then(|element| element.map(#read).transpose())
+                    }),
+                }
+            }
         }
     }
 
@@ -93,17 +171,37 @@ impl Variable {
             Kind::Bytes(_) => {
                 quote!(#root::typed::borrowed::<&[u8]>(parameters, #place).map(<#rust as ::core::convert::From<&[u8]>>::from))
             }
+            Kind::List(..) => {
+                let read = self.read(root, &quote!(#place));
+                let error = quote!(#root::typed::parts::Error);
+                quote!({
+                    let read: ::core::result::Result<#rust, #error> = #read;
+                    read.map_err(#root::typed::refused)
+                })
+            }
         }
     }
 
     /// Sets it from an expression, as a `Result<(), Error>`.
     pub(crate) fn write(&self, root: &TokenStream, value: &TokenStream, place: &TokenStream) -> TokenStream {
+        let write = self.writer(root, value);
+        quote!(parameters.slot_of(#place).and_then(|slot| #write))
+    }
+
+    /// Sets what `slot` is, as a `Result<(), Error>`.
+    pub(crate) fn writer(&self, root: &TokenStream, value: &TokenStream) -> TokenStream {
         let rust = &self.rust;
-        let target = quote!(parameters.target_of(#place));
-        match self.kind {
-            Kind::Field => quote!(#target.and_then(|target| <#rust as #root::typed::Field>::to_field(&#value, target))),
-            Kind::Text(_) | Kind::Bytes(_) => {
-                quote!(#target.and_then(|target| #root::typed::parts::IntoValue::into_value(&#value[..], target)))
+        match &self.kind {
+            Kind::Field => quote!(<#rust as #root::typed::Field>::to_field(&#value, slot)),
+            Kind::Text(_) | Kind::Bytes(_) => quote!(slot.set(&#value[..])),
+            Kind::List(_, _, element) => {
+                let write = element.writer(root, &quote!((*element)));
+                quote!(slot.list(|list| {
+                    for element in #value.iter() {
+                        list.push_with(|slot| #write)?;
+                    }
+                    ::core::result::Result::Ok(())
+                }))
             }
         }
     }
@@ -130,14 +228,16 @@ fn spelling(rust: &Type) -> Result<Spelling> {
             match (last.ident.to_string().as_str(), generic.as_slice()) {
                 ("String", []) => Ok(Spelling::Text),
                 ("Vec", [Some(only)]) if is_u8(only) => Ok(Spelling::Bytes),
-                ("Vec", [_]) => Err(Error::new_spanned(
-                    rust,
-                    "lists cannot be variables yet: use an array of a fixed length, or `Vec<u8>` for bytes",
-                )),
-                ("Option", _) => Err(Error::new_spanned(
-                    rust,
-                    "an `Option` cannot be a variable yet: use a `bool` and a value, or two functions",
-                )),
+                ("Vec", [Some(only)]) => Ok(Spelling::List(Holder::Growing, Box::new((*only).clone()), None)),
+                ("Vec", [Some(element), most]) if !is_u8(element) => {
+                    let wrong =
+                        || Error::new_spanned(rust, "of vectors `Vec<T>` and `heapless::Vec<T, N>` are variables");
+                    let most = most.as_ref().map(ToTokens::to_token_stream).or_else(|| bound(&last.arguments));
+                    Ok(Spelling::List(Holder::Bounded, Box::new((*element).clone()), Some(most.ok_or_else(wrong)?)))
+                }
+                ("Option", [Some(only)]) => {
+                    Ok(Spelling::List(Holder::Optional, Box::new((*only).clone()), Some(quote!(1))))
+                }
                 _ => Ok(Spelling::Other),
             }
         }
@@ -165,5 +265,14 @@ fn generic_types(arguments: &PathArguments) -> Vec<Option<&Type>> {
             })
             .collect(),
         _ => Vec::new(),
+    }
+}
+
+/// The second generic argument, where it is a number.
+fn bound(arguments: &PathArguments) -> Option<TokenStream> {
+    let PathArguments::AngleBracketed(generic) = arguments else { return None };
+    match generic.args.get(1)? {
+        GenericArgument::Const(number) => Some(number.to_token_stream()),
+        _ => None,
     }
 }

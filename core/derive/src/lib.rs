@@ -15,9 +15,12 @@ use quote::quote;
 
 /// As `cara_core::Variables`: the fields of a struct are variables by their names, an enum without fields is one integer.
 ///
+/// With the feature `nested` of the core, which Linux has always, a field that is such a struct itself is a record, `Vec<T>`
+/// and `heapless::Vec<T, N>` are lists, and `Option<T>` is a list of one at most.
+///
 /// | attribute of a field | means |
 /// |---|---|
-/// | `#[size(200)]` | how many bytes a `String` or `Vec<u8>` has at most |
+/// | `#[size(200)]` | how many bytes a `String` or `Vec<u8>`, or elements a `Vec<T>`, has at most; `#[size(50, 32)]` for a `Vec<String>` |
 /// | `#[name = "x-1"]` | the variable's name, where it is not the field's |
 #[proc_macro_derive(Variables, attributes(size, name))]
 pub fn variables(input: TokenStream) -> TokenStream {
@@ -51,7 +54,11 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 ///
 /// Arguments have `#[size(200)]` and `#[name = "…"]` as fields do, and names of results too: `#[returns(#[size(64)] text)]`. One
 /// argument alone may be `#[variables] order: Order`, whose fields are the arguments then. An argument `call: &impl AnyCall` tells
-/// about the call.
+/// about the call; where its bounds need types that differ from port to port, the trait declares them (`type Order;`).
+///
+/// `call: &impl TypedCall<Left, Blocked>` declares also what calls tell while they run, and the values of their failures: structs that
+/// derive `Variables`, or `()` for nothing. Clients have `watch_go_to` beside `go_to` then: it hands each `Left` to a closure, and
+/// fails with a `Failed<Blocked>`. It needs the feature `details` of the core, which Linux has always.
 #[proc_macro_attribute]
 pub fn interface(attribute: TokenStream, input: TokenStream) -> TokenStream {
     interface::expand(attribute.into(), input.into(), &quote!(::cara_core)).into()

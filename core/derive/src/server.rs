@@ -19,6 +19,10 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         let fields = quote!(#(#[doc = #docs] pub #actuators: A),*);
         (quote!(#visibility struct #server<A> { #fields }), quote!(#server<F::Actuator>))
     };
+    let bounds = functions.iter().filter_map(Function::call).map(|call| {
+        let bounds = &call.bounds;
+        quote!(F::Call: #bounds,)
+    });
     let debug = if actuators.is_empty() { quote!() } else { quote!(<A>) };
     let text = server.to_string();
     let serving = functions.iter().map(|function| serve(interface, function, root));
@@ -70,6 +74,7 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         where
             T: #name + 'static,
             F: #typed::Functions<T> + ?::core::marker::Sized,
+            #(#bounds)*
         {
             fn add_to(self, functions: &F) -> ::core::result::Result<(), #parts::Error> {
                 #(#adding)*
@@ -87,7 +92,7 @@ fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> Toke
     let mut passed = Vec::new();
     for input in &function.inputs {
         match input {
-            Input::Call => passed.push(quote!(call)),
+            Input::Call(_) => passed.push(quote!(call)),
             Input::Variable(argument, variable) => {
                 let read = variable.argument(root, place);
                 let local = format_ident!("argument_{}", place);
@@ -109,11 +114,15 @@ fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> Toke
         true => (quote!(state: &mut T,), quote!(state,)),
         false => (quote!(), quote!()),
     };
+    let bounds = function.call().map(|call| {
+        let bounds = &call.bounds;
+        quote!(+ #bounds)
+    });
     let question = function.can_fail.then(|| quote!(?));
     let writes = write_results(function, root);
     quote! {
         #[allow(unused_variables, clippy::unit_arg, clippy::let_unit_value)]
-        fn #serve<T: #name, C: #typed::AnyCall>(
+        fn #serve<T: #name, C: #typed::AnyCall #bounds>(
             #state
             call: &C,
             parameters: &mut #parts::ParametersView,

@@ -47,6 +47,15 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, root: &TokenStream) -> Result<T
         names.push(name);
         variables.push(variable);
     }
+    let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
+    let taken = variables.iter().zip(&names).map(|(variable, field)| {
+        let (name, read) = (&variable.name, variable.reader(root));
+        quote!(#field: fields.take(#name).and_then(#read)?)
+    });
+    let set = variables.iter().zip(&names).map(|(variable, field)| {
+        let (name, write) = (&variable.name, variable.writer(root, &quote!(self.#field)));
+        quote!(record.set_with(#name, |slot| #write)?;)
+    });
     let specs = variables.iter().map(|variable| variable.spec(root));
     let places = (0..variables.len()).map(|index| quote!(#root::typed::place(places, #index))).collect::<Vec<_>>();
     let reads = variables.iter().zip(&places).map(|(variable, place)| variable.read(root, place));
@@ -68,6 +77,42 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, root: &TokenStream) -> Result<T
             fn write_places(&self, parameters: &mut #parameters, places: &[u8]) -> ::core::result::Result<(), #error> {
                 #(#writes?;)*
                 ::core::result::Result::Ok(())
+            }
+
+            fn with_parameters<R>(&self, look: impl FnOnce(&#parameters) -> R) -> ::core::result::Result<R, #error> {
+                const BYTES: usize =
+                    #root::typed::parameters_bytes(&[], <#ident as #root::typed::Variables>::SPECS);
+                let mut parameters = #root::typed::parts::Parameters::<BYTES>::sized();
+                #root::typed::Variables::to_parameters(self, &mut parameters)?;
+                ::core::result::Result::Ok(look(&parameters))
+            }
+        }
+
+        #typed::__nested! {
+            #[automatically_derived]
+            impl #typed::Field for #ident {
+                const KIND: #parts::Type = #parts::Type::Record;
+                const SIZE: u32 = <Self as #typed::Variables>::SPECS.len() as u32;
+                const INNER: &'static [u8] = {
+                    const FIELDS: &[#parts::VariableSpec<'static>] = <#ident as #typed::Variables>::SPECS;
+                    const INNER: [u8; #typed::fields_bytes(FIELDS)] = match #typed::fields(FIELDS) {
+                        ::core::result::Result::Ok(inner) => inner,
+                        ::core::result::Result::Err(rule) => ::core::panic!("{}", rule),
+                    };
+                    &INNER
+                };
+
+                fn from_field(value: #parts::Value<'_>) -> ::core::result::Result<Self, #error> {
+                    let mut fields = #typed::Record::of(value)?;
+                    ::core::result::Result::Ok(Self { #(#taken),* })
+                }
+
+                fn to_field(&self, slot: #parts::Slot<'_>) -> ::core::result::Result<(), #error> {
+                    slot.record(|record| {
+                        #(#set)*
+                        ::core::result::Result::Ok(())
+                    })
+                }
             }
         }
     })
@@ -102,11 +147,11 @@ fn of_enum(ident: &Ident, data: &DataEnum, root: &TokenStream) -> Result<TokenSt
                 }
             }
 
-            fn to_field(&self, target: #root::typed::parts::Target<'_>) -> #result<(), #error> {
+            fn to_field(&self, slot: #root::typed::parts::Slot<'_>) -> #result<(), #error> {
                 let number = match self {
                     #(Self::#variants => Self::#variants as i64,)*
                 };
-                <i64 as #field>::to_field(&number, target)
+                <i64 as #field>::to_field(&number, slot)
             }
         }
     })

@@ -2,11 +2,13 @@
 
 use core::cell::RefCell;
 use core::future::Future;
+use core::ops::ControlFlow;
 use core::pin::pin;
 use core::task::{Context, Poll, Waker};
 
 use cara_core::config::Priority;
 use cara_core::distribution::block::{self, SliceWriter};
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Definition, Signature};
 use cara_core::distribution::identity::Identity;
 use cara_core::services::heart::Renew;
@@ -15,9 +17,9 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_core::typed::{
-    AwaitedCaller, BAD_ARGUMENT, BlockingCaller, CallError, Caller, Free, Functions, Interface, Method,
+    AwaitedCaller, BAD_ARGUMENT, BlockingCaller, CallError, Caller, Free, Functions, Interface, Method, WatchingCaller,
 };
-use cara_core::{AnyCall, Error, Parameters, ParametersView, ServiceError, Variables, interface};
+use cara_core::{AnyCall, Error, Parameters, ParametersView, ServiceError, TypedCall, Variables, interface};
 
 #[derive(Variables, Clone, Copy, Debug, PartialEq)]
 enum Gear {
@@ -94,6 +96,22 @@ trait Agv {
     ) -> Result<(String, u16, Gear), ServiceError>;
 
     fn place(&mut self, #[variables] pose: Pose);
+
+    fn dock(&mut self, call: &impl TypedCall<Left, Blocked>, gate: u8) -> Result<(), ServiceError>;
+
+    fn undock(&mut self, call: &impl TypedCall<Left>);
+}
+
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+struct Left {
+    left: f32,
+}
+
+#[derive(Variables, Clone, Debug, PartialEq)]
+struct Blocked {
+    at: [i32; 2],
+    #[size(8)]
+    by: String,
 }
 
 #[derive(Default)]
@@ -134,12 +152,44 @@ impl Agv for Vehicle {
     fn place(&mut self, pose: Pose) {
         self.placed = Some(pose);
     }
+
+    fn dock(&mut self, call: &impl TypedCall<Left, Blocked>, gate: u8) -> Result<(), ServiceError> {
+        call.progress(&Left { left: 2.5 })?;
+        let by = if gate > 8 { "a pallet of bricks" } else { "a pallet" }.to_owned();
+        Err(call.fail_with(7, "the way is blocked", &Blocked { at: [3, 4], by }))
+    }
+
+    fn undock(&mut self, call: &impl TypedCall<Left>) {
+        let _ = call.progress(&Left { left: 0.0 });
+    }
 }
 
-/// What a call tells here.
-struct Told(Identity, Option<Ended>);
+/// For any port, whose orders are of a type of its own.
+#[interface]
+trait Winch {
+    type Order;
+
+    #[returns(wound)]
+    fn wind(&mut self, call: &impl TypedCall<Left, Order = Self::Order>) -> bool;
+}
+
+impl Winch for Vehicle {
+    type Order = u32;
+
+    fn wind(&mut self, call: &impl TypedCall<Left, Order = u32>) -> bool {
+        call.order() == Some(7)
+    }
+}
+
+/// What a call tells here, and what it is told.
+struct Told(Identity, Option<Ended>, RefCell<Parameters>, RefCell<Option<Failure>>);
 
 impl AnyCall for Told {
+    type Order = u32;
+
+    fn order(&self) -> Option<u32> {
+        Some(7)
+    }
     fn caller(&self) -> &Identity {
         &self.0
     }
@@ -154,6 +204,14 @@ impl AnyCall for Told {
     }
     fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
         self.1.map_or_else(|| Ok(change()), Err)
+    }
+    fn fail(&self, failure: Failure) -> ServiceError {
+        let error = failure.error();
+        *self.3.borrow_mut() = Some(failure);
+        error
+    }
+    fn tell(&self, progress: &ParametersView) -> Result<(), Error> {
+        self.2.borrow_mut().copy_from(progress)
     }
 }
 
@@ -178,6 +236,9 @@ struct Unit {
     vehicle: RefCell<Vehicle>,
     ended: Option<Ended>,
     sent: RefCell<Vec<RequestOptions>>,
+    /// What the newest call has told, and why it has failed.
+    told: RefCell<Parameters>,
+    failure: RefCell<Option<Failure>>,
 }
 
 impl Functions<Vehicle> for Unit {
@@ -240,11 +301,14 @@ impl BlockingCaller for Unit {
         let mut served = Parameters::<1024>::sized();
         block::read_arguments(arguments, &bytes, &mut served)?;
         block::prepare_results(results, &mut served)?;
-        let call = Told(Identity::m_unit("manager", 1)?, self.ended);
-        match listed.run {
-            Run::Method(run) => run(&mut self.vehicle.borrow_mut(), &call, &mut served)?,
-            Run::Free(run) => run(&call, &mut served)?,
-        }
+        let call = Told(Identity::m_unit("manager", 1)?, self.ended, RefCell::default(), RefCell::default());
+        let outcome = match listed.run {
+            Run::Method(run) => run(&mut self.vehicle.borrow_mut(), &call, &mut served),
+            Run::Free(run) => run(&call, &mut served),
+        };
+        *self.told.borrow_mut() = call.2.take();
+        *self.failure.borrow_mut() = call.3.take();
+        outcome?;
         let mut bytes = vec![0; block::measure(results, &served)?];
         block::write(results, &served, &mut SliceWriter::new(&mut bytes));
         block::read(results, &bytes, parameters)
@@ -257,6 +321,24 @@ impl BlockingCaller for Unit {
         options: &RequestOptions,
     ) -> Result<&'static str, Error> {
         self.block(function, parameters, options).map(|()| "held")
+    }
+}
+
+impl WatchingCaller for Unit {
+    fn block_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error> {
+        let outcome = self.block(function, parameters, options);
+        *why = self.failure.take();
+        match on_progress(&self.told.borrow()) {
+            ControlFlow::Continue(()) => outcome,
+            ControlFlow::Break(()) => Err(Error::Cancelled),
+        }
     }
 }
 
@@ -294,6 +376,8 @@ fn signatures_are_those_of_the_text_form() {
             "say(text: string[64], raw: bytes[8], n.1: int, gear: int) -> (text: string[64], length-1: int, gear: int)"
                 .to_owned(),
             format!("place({pose})"),
+            "dock(gate: int) progress (left: float) fails (at: int[2], by: string[8])".to_owned(),
+            "undock() progress (left: float)".to_owned(),
         ]
     );
     for (text, listed) in shown.iter().zip(unit.listed.borrow().iter()) {
@@ -334,6 +418,40 @@ fn a_client_gets_what_the_service_gives() {
     unit.vehicle.borrow_mut().stands_by = true;
     assert_eq!(agv.reset(), Err(CallError::Call(Error::Service(ServiceError::Failed(2)))));
     assert_eq!(unit.vehicle.borrow().resets, 1);
+}
+
+#[test]
+fn progress_and_failures_are_typed() {
+    let unit = unit();
+    let agv = AgvClient::at(&unit);
+    let mut told = Vec::new();
+    let mut dock = |gate| {
+        let on_progress = |left| {
+            told.push(left);
+            ControlFlow::Continue(())
+        };
+        agv.watch_dock(gate, on_progress).unwrap_err()
+    };
+    let error = CallError::Call(Error::Service(ServiceError::Failed(7)));
+    let failed = dock(1);
+    assert_eq!((&failed.error, failed.text.as_str()), (&error, "the way is blocked"));
+    assert_eq!(failed.values, Some(Blocked { at: [3, 4], by: "a pallet".to_owned() }));
+    assert_eq!(failed.to_string(), "the way is blocked (code 7)");
+    // Longer than it is declared: the rest is told.
+    let failed = dock(9);
+    assert_eq!((failed.values, failed.text.as_str()), (None, "the way is blocked"));
+    assert_eq!(told, [Left { left: 2.5 }; 2]);
+    assert_eq!(agv.dock(1), Err(error), "without what it tells");
+    let cancelled =
+        agv.watch_undock(|left| if left.left == 0.0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) });
+    assert_eq!(cancelled.map_err(|failed| failed.error), Err(CallError::Call(Error::Cancelled)));
+}
+
+#[test]
+fn a_service_of_any_port_gets_its_order() {
+    let unit = Unit::default();
+    WinchServer.add_to(&unit).unwrap();
+    assert_eq!(WinchClient::at(&unit).wind(), Ok(true));
 }
 
 #[test]

@@ -3,9 +3,10 @@
 //! Every value starts at a multiple of 8 bytes from the block's start. Integers are 8 bytes each, little-endian;
 //! floats the same with their bits; truth values one byte each, 0 or 1, padded with zeros to 8; strings and bytes have
 //! their length as u32, four bytes of zero, then the bytes, padded with zeros to 8. There is one encoding of each
-//! list of values; anything else is malformed.
+//! list of values; anything else is malformed. Lists and records are in [`nested`].
 
 use super::function::{RawSpec, VariableSpecs};
+use super::nested;
 use super::parameters::{ParametersView, Type, Value, bytes_of_variable};
 use super::value::saturate;
 use crate::bytes::{copy, is_text};
@@ -75,6 +76,10 @@ pub fn measure(specs: VariableSpecs<'_>, parameters: &ParametersView) -> Result<
         if value.kind() != spec.kind {
             return Err(Error::WrongType { index });
         }
+        if spec.kind.is_nested() {
+            length = length.saturating_add(nested::measure(spec, value, index)?);
+            continue;
+        }
         let found = if spec.kind.is_fixed() { value.size() } else { saturate(value.raw().len()) };
         if found > spec.size || (spec.kind.is_fixed() && found != spec.size) {
             return Err(Error::WrongSize { index, expected: spec.size, found });
@@ -89,7 +94,7 @@ pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut imp
     for spec in specs.raw() {
         let Some(value) = parameters.named(spec.name) else { continue };
         let bytes = value.raw();
-        if !spec.kind.is_fixed() {
+        if !spec.kind.is_fixed() && !spec.kind.is_nested() {
             to.put(&u64::from(saturate(bytes.len())).to_le_bytes());
         }
         to.put(bytes);
@@ -103,6 +108,9 @@ pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut imp
 /// The longest block that `specs` allow, in bytes; `None` where that exceeds the address space.
 pub fn longest(specs: VariableSpecs<'_>) -> Option<usize> {
     specs.raw().try_fold(0_usize, |sum, spec| {
+        if spec.kind.is_nested() {
+            return sum.checked_add(nested::longest(spec)?);
+        }
         let head = if spec.kind.is_fixed() { 0 } else { 8 };
         sum.checked_add(head)?.checked_add(spec.kind.bytes_of(spec.size)?.checked_next_multiple_of(8)?)
     })
@@ -122,6 +130,9 @@ pub fn check(specs: VariableSpecs<'_>, block: &[u8]) -> Result<(), Error> {
 pub fn read(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
     let read = each(specs, block, |index, spec, value| {
+        if spec.kind.is_nested() {
+            return room.take_nested(parameters, index, spec, value);
+        }
         let needed = if spec.kind.is_fixed() { spec.size } else { saturate(value.len()) };
         room.take(parameters, index, spec, needed)
     });
@@ -130,10 +141,15 @@ pub fn read(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersV
     commit(specs, block, parameters)
 }
 
-/// Whether `parameters` can hold every result that `specs` allow, before the call is sent; the errors of [`read`].
+/// Whether `parameters` can hold every result that `specs` allow, before the call is sent; the errors of [`read`]. How long
+/// a list gets is not known before: it is taken as empty.
 pub fn check_results_fit(specs: VariableSpecs<'_>, parameters: &ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
     for (position, spec) in specs.raw().enumerate() {
+        if spec.kind.is_nested() {
+            room.take_any_nested(parameters, position as u8, spec)?;
+            continue;
+        }
         room.take(parameters, position as u8, spec, spec.size)?;
     }
     room.check()
@@ -145,7 +161,7 @@ pub fn check_results_fit(specs: VariableSpecs<'_>, parameters: &ParametersView) 
 /// [`Error::Malformed`], or [`Error::Full`] if the parameters are too small; they may be empty after an error.
 pub fn read_arguments(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     parameters.clear();
-    let read = each(specs, block, |_, spec, value| parameters.add_with(spec.name, spec.kind, spec.size, value));
+    let read = each(specs, block, |_, spec, value| parameters.add_with(spec, value));
     if read.is_err() {
         parameters.clear();
     }
@@ -160,10 +176,10 @@ pub fn prepare_results(specs: VariableSpecs<'_>, parameters: &mut ParametersView
     for (position, spec) in specs.raw().enumerate() {
         let index = position as u8;
         let Some(value) = parameters.named(spec.name) else {
-            parameters.add_checked(spec.name, spec.kind, spec.size)?;
+            parameters.add_checked(spec)?;
             continue;
         };
-        if value.kind() != spec.kind {
+        if value.kind() != spec.kind || (spec.kind.is_nested() && value.inner != spec.inner) {
             return Err(Error::WrongType { index });
         }
         if value.size() != spec.size {
@@ -189,7 +205,7 @@ impl Room {
     fn take(&mut self, parameters: &ParametersView, index: u8, spec: RawSpec<'_>, size: u32) -> Result<(), Error> {
         let Some(value) = parameters.named(spec.name) else {
             self.variables = self.variables.checked_sub(1).ok_or(Error::Full(Limit::Variables))?;
-            let bytes = bytes_of_variable(spec.name, spec.kind, spec.size).unwrap_or(usize::MAX);
+            let bytes = bytes_of_variable(spec).unwrap_or(usize::MAX);
             self.needed = self.needed.saturating_add(bytes);
             return Ok(());
         };
@@ -204,6 +220,28 @@ impl Room {
             return Err(Error::WrongSize { index, expected: value.size(), found: size });
         }
         Ok(())
+    }
+
+    /// Takes the room for a list or record. Its new value is put behind all others before the old one goes.
+    fn take_nested(&mut self, to: &ParametersView, index: u8, spec: RawSpec<'_>, bytes: &[u8]) -> Result<(), Error> {
+        let Some(own) = to.named(spec.name) else {
+            self.take(to, index, spec, spec.size)?;
+            self.needed = self.needed.saturating_add(bytes.len().saturating_sub(nested::least(spec)));
+            return Ok(());
+        };
+        let value = Value { index, kind: spec.kind, size: spec.size, inner: spec.inner, bytes };
+        nested::measure(own.raw_spec(), value, index)?;
+        self.needed = self.needed.saturating_add(bytes.len());
+        Ok(())
+    }
+
+    /// The same before the value is known.
+    fn take_any_nested(&mut self, to: &ParametersView, index: u8, spec: RawSpec<'_>) -> Result<(), Error> {
+        match to.named(spec.name) {
+            Some(own) if nested::can_be(spec, own.raw_spec(), nested::Bounds::Free) => Ok(()),
+            Some(_) => Err(Error::WrongType { index }),
+            None => self.take(to, index, spec, spec.size),
+        }
     }
 
     /// Whether everything new fits together.
@@ -225,9 +263,13 @@ fn each<'s>(
     let mut refusal = Ok(());
     for (index, spec) in specs.raw().enumerate() {
         let value;
-        (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
-        if !is_canonical(spec.kind, value) {
-            return Err(Error::Malformed);
+        if spec.kind.is_nested() {
+            (value, rest) = nested::check(spec, rest).ok_or(Error::Malformed)?;
+        } else {
+            (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
+            if !is_canonical(spec.kind, value) {
+                return Err(Error::Malformed);
+            }
         }
         refusal = refusal.and_then(|()| visit(index as u8, spec, value));
     }
@@ -240,21 +282,30 @@ fn commit(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersVie
     let mut rest = block;
     for spec in specs.raw() {
         let value;
-        (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
+        (value, rest) = if spec.kind.is_nested() { nested::extent(spec, rest) } else { split(spec, rest) }
+            .ok_or(Error::Malformed)?;
         let index = match parameters.find(spec.name) {
             Some(index) => index,
+            None if spec.kind.is_nested() => {
+                parameters.add_with(spec, value)?;
+                continue;
+            }
             None => {
-                parameters.add_checked(spec.name, spec.kind, spec.size)?;
+                parameters.add_checked(spec)?;
                 parameters.len().saturating_sub(1)
             }
         };
-        parameters.set_checked(index, value);
+        if spec.kind.is_nested() {
+            parameters.set_nested(index, value)?;
+        } else {
+            parameters.set_checked(index, value);
+        }
     }
     Ok(())
 }
 
 /// The value at the start of `block`, and what follows it; `None` if it is cut off, too long or not padded with zeros.
-fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
+pub(super) fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
     let (length, rest) = if spec.kind.is_fixed() {
         (spec.kind.bytes_of(spec.size)?, block)
     } else {
@@ -268,11 +319,11 @@ fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])>
     padding.iter().all(|&byte| byte == 0).then_some((value, rest))
 }
 
-fn is_canonical(kind: Type, value: &[u8]) -> bool {
+pub(super) fn is_canonical(kind: Type, value: &[u8]) -> bool {
     match kind {
         Type::String => is_text(value),
         Type::Bool => value.iter().all(|&byte| byte <= 1),
-        Type::Int | Type::Float | Type::Bytes => true,
+        Type::Int | Type::Float | Type::Bytes | Type::List | Type::Record => true,
     }
 }
 
@@ -284,7 +335,7 @@ fn encoded_length(value: Value<'_>) -> usize {
 }
 
 /// Bytes of zero after `length` bytes, so that the next value starts at a multiple of 8.
-const fn padding_after(length: usize) -> usize {
+pub(super) const fn padding_after(length: usize) -> usize {
     length.wrapping_neg() & 7
 }
 

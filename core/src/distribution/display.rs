@@ -2,7 +2,7 @@
 
 use core::fmt::{Display, Formatter, Result, Write};
 
-use super::parameters::{ParametersInner, ParametersView};
+use super::parameters::{Elements, ParametersInner, ParametersView, Variable};
 use super::value::{Type, Value};
 
 impl Display for Value<'_> {
@@ -12,6 +12,12 @@ impl Display for Value<'_> {
             Type::Float => elements(f, self.size(), self.floats()),
             Type::Bool => elements(f, self.size(), self.bools()),
             Type::String => f.write_str(self.text().unwrap_or_default()),
+            Type::List => bracketed(f, self.elements()),
+            Type::Record => {
+                f.write_char('{')?;
+                separated(f, self.fields(), variable)?;
+                f.write_char('}')
+            }
             Type::Bytes => self.raw().iter().try_for_each(|byte| write!(f, "{byte:02x}")),
         }
     }
@@ -28,6 +34,26 @@ fn elements<E: Display>(f: &mut Formatter<'_>, size: u32, elements: impl Iterato
         f.write_char(']')?;
     }
     Ok(())
+}
+
+fn bracketed(f: &mut Formatter<'_>, elements: Elements<'_>) -> Result {
+    f.write_char('[')?;
+    separated(f, elements, |f, element| quoted(f, &element))?;
+    f.write_char(']')
+}
+
+/// `name: value`.
+fn variable(f: &mut Formatter<'_>, variable: Variable<'_>) -> Result {
+    write!(f, "{}: ", variable.name)?;
+    quoted(f, &variable.value)
+}
+
+/// The value, text in quotes.
+fn quoted(f: &mut Formatter<'_>, value: &Value<'_>) -> Result {
+    match value.text() {
+        Some(text) => write!(f, "{text:?}"),
+        None => Display::fmt(value, f),
+    }
 }
 
 fn separated<E>(
@@ -57,10 +83,7 @@ fn separated<E>(
 /// ```
 impl Display for ParametersView {
     fn fmt(&self, f: &mut Formatter<'_>) -> Result {
-        separated(f, self.iter(), |f, variable| match variable.value.text() {
-            Some(text) => write!(f, "{}: {text:?}", variable.name),
-            None => write!(f, "{}: {}", variable.name, variable.value),
-        })
+        separated(f, self.iter(), variable)
     }
 }
 

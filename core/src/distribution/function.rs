@@ -1,8 +1,9 @@
 //! The paper's `Function`: a name with the arguments that it needs and the results that it gives.
 //!
 //! A signature exists in one encoding, which is stored and travels as it is: name length u8, name, number of
-//! arguments u8, arguments, number of results u8, results; each variable: type u8, name length u8, size u32
-//! little-endian, name. [`Definition`] owns one, [`Signature`] borrows one.
+//! arguments u8, arguments, number of results u8, results; where declared, a section u8, its number of variables u8 and
+//! those, for the progress of calls (1) and for the values of failures (2); each variable: type u8, name length u8, size u32
+//! little-endian, name, and what a list or record is made of. [`Definition`] owns one, [`Signature`] borrows one.
 
 use core::fmt;
 
@@ -11,6 +12,7 @@ use crate::error::{Error, Limit};
 
 pub use super::attributes::Attributes;
 use super::name::check_name;
+use super::nested;
 use super::parameters::{ParametersView, Type, bytes_of_variable};
 use super::text::{self, ParseError};
 use super::value::saturate;
@@ -39,31 +41,35 @@ pub struct Signature<'a> {
     bytes: &'a [u8],
 }
 
-/// Name, type and size of one argument or result.
+/// Name, type and size of one argument or result, or of a field of a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VariableSpec<'a> {
     /// Its name.
     pub name: &'a str,
     /// Its type.
     pub kind: Type,
-    /// Its size: exactly this many elements, or at most this many bytes of a string or bytes.
+    /// Its size: exactly this many numbers or truth values, at most this many bytes of a string or bytes, at most this many
+    /// elements of a list, or the number of a record's fields.
     pub size: u32,
+    /// What a list or record is made of, as it stands in a signature; empty for other types.
+    pub inner: &'a [u8],
 }
 
 /// A [`VariableSpec`] with an unvalidated name, for comparison only: validating UTF-8 would dominate the cost of a
 /// short request.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct RawSpec<'a> {
     pub(super) name: &'a [u8],
     pub(super) kind: Type,
     pub(super) size: u32,
+    pub(super) inner: &'a [u8],
 }
 
 /// The arguments or the results of a [`Signature`], in its order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VariableSpecs<'a> {
-    left: u8,
-    rest: &'a [u8],
+    pub(super) left: u8,
+    pub(super) rest: &'a [u8],
 }
 
 impl Definition {
@@ -96,7 +102,9 @@ impl Definition {
     /// The same function with the variables of `parameters` as its arguments; their values don't matter.
     pub fn arguments(self, parameters: &ParametersView) -> Result<Self, Error> {
         let signature = self.signature();
-        Self::build(signature.name(), specs_of(parameters), signature.results())
+        let mut builder = Builder::of(signature.name(), specs_of(parameters), signature.results())?;
+        builder.sections_of(signature)?;
+        Ok(builder.finish())
     }
 
     /// The same function with the variables of `parameters` as its results; their values don't matter.
@@ -104,7 +112,9 @@ impl Definition {
     /// A result with the name of an argument is the same variable, so it has the same type and size.
     pub fn results(self, parameters: &ParametersView) -> Result<Self, Error> {
         let signature = self.signature();
-        Self::build(signature.name(), signature.arguments(), specs_of(parameters))
+        let mut builder = Builder::of(signature.name(), signature.arguments(), specs_of(parameters))?;
+        builder.sections_of(signature)?;
+        Ok(builder.finish())
     }
 
     /// The function's name.
@@ -122,33 +132,71 @@ impl Definition {
         &self.bytes
     }
 
-    fn build<'a>(
-        name: &str,
-        arguments: impl Iterator<Item = VariableSpec<'a>>,
-        results: impl Iterator<Item = VariableSpec<'a>>,
+    /// The same function whose calls tell the variables of `parameters` while they run; their values don't matter.
+    ///
+    /// ```
+    /// # use cara_core::{Definition, distribution::parameters::Parameters};
+    /// let mut left = Parameters::new();
+    /// left.add_float("left", 1)?;
+    /// let go_to = Definition::new("go_to")?.progress(&left)?;
+    /// assert_eq!(go_to.to_string(), "go_to() progress (left: float)");
+    /// # Ok::<(), cara_core::error::Error>(())
+    /// ```
+    #[cfg(feature = "details")]
+    pub fn progress(self, parameters: &ParametersView) -> Result<Self, Error> {
+        self.declaring(specs_of(parameters), self.signature().failure())
+    }
+
+    /// The same function whose failures have the variables of `parameters`; their values don't matter.
+    #[cfg(feature = "details")]
+    pub fn failure(self, parameters: &ParametersView) -> Result<Self, Error> {
+        self.declaring(self.signature().progress(), specs_of(parameters))
+    }
+
+    #[cfg(feature = "details")]
+    fn declaring<'a>(
+        &self,
+        mut progress: impl Iterator<Item = VariableSpec<'a>>,
+        mut failure: impl Iterator<Item = VariableSpec<'a>>,
     ) -> Result<Self, Error> {
-        let mut builder = Builder::new(name)?;
-        for argument in arguments {
-            builder.argument(argument)?;
-        }
-        for result in results {
-            builder.result(result)?;
-        }
+        let signature = self.signature();
+        let mut builder = Builder::of(signature.name(), signature.arguments(), signature.results())?;
+        progress.try_for_each(|spec| builder.declare(Section::Progress, spec))?;
+        failure.try_for_each(|spec| builder.declare(Section::Failure, spec))?;
         Ok(builder.finish())
     }
 }
 
 /// The variables of `parameters` as a signature names them.
 fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_>> {
-    parameters.iter().map(|variable| VariableSpec { name: variable.name, kind: variable.kind, size: variable.size })
+    parameters.iter().map(|variable| VariableSpec {
+        name: variable.name,
+        kind: variable.kind,
+        size: variable.size,
+        inner: variable.value.inner,
+    })
+}
+
+/// What a signature may declare behind its results.
+#[cfg(feature = "details")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Section {
+    Progress = 1,
+    Failure = 2,
+}
+
+#[cfg(feature = "details")]
+impl Section {
+    pub(super) const ALL: [(Self, &'static str); 2] = [(Self::Progress, "progress"), (Self::Failure, "fails")];
 }
 
 impl<'a> Signature<'a> {
     /// Checks an encoded signature; [`Error::Malformed`] for anything that [`Definition`] could not have made.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
         let (name, arguments, results) = Self::split(bytes).ok_or(Error::Malformed)?;
-        let rebuilt = Definition::build(name, arguments, results);
-        rebuilt.map(|_| Self { bytes }).map_err(|_| Error::Malformed)
+        let this = Self { bytes };
+        let rebuilt = Builder::of(name, arguments, results).and_then(|mut builder| builder.sections_of(this));
+        rebuilt.map(|()| this).map_err(|_| Error::Malformed)
     }
 
     /// The function's name.
@@ -169,6 +217,31 @@ impl<'a> Signature<'a> {
         VariableSpecs::of_checked(self.arguments().behind())
     }
 
+    /// What its calls tell while they run.
+    #[cfg(feature = "details")]
+    pub fn progress(&self) -> VariableSpecs<'a> {
+        self.section(Section::Progress)
+    }
+
+    /// The values of its failures.
+    #[cfg(feature = "details")]
+    pub fn failure(&self) -> VariableSpecs<'a> {
+        self.section(Section::Failure)
+    }
+
+    #[cfg(feature = "details")]
+    fn section(&self, wanted: Section) -> VariableSpecs<'a> {
+        let mut rest = self.results().behind();
+        while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {
+            let specs = VariableSpecs::of_checked(Some(behind));
+            if section == wanted as u8 {
+                return specs;
+            }
+            rest = specs.behind();
+        }
+        VariableSpecs::of_checked(None)
+    }
+
     /// The length of the name, and what follows it.
     #[inline]
     fn behind_length(&self) -> Option<(usize, &'a [u8])> {
@@ -186,14 +259,14 @@ impl<'a> Signature<'a> {
         Definition { bytes: heapless::Vec::from_slice(self.bytes).unwrap_or_default() }
     }
 
-    /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does.
+    /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does; of lists as long as they are empty.
     pub fn parameters_bytes(&self) -> u32 {
         let arguments = self.arguments();
         let only_results = self.results().raw().filter(|result| arguments.raw().all(|known| known.name != result.name));
         let bytes = arguments
             .raw()
             .chain(only_results)
-            .try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec.name, spec.kind, spec.size)?));
+            .try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec)?));
         bytes.map_or(u32::MAX, saturate)
     }
 
@@ -208,12 +281,26 @@ impl<'a> Signature<'a> {
         let (name, rest) = rest.split_at_checked(usize::from(length))?;
         let name = core::str::from_utf8(name).ok()?;
         let (arguments, rest) = VariableSpecs::split(rest)?;
-        let (results, rest) = VariableSpecs::split(rest)?;
-        rest.is_empty().then_some((name, arguments, results))
+        let (results, mut rest) = VariableSpecs::split(rest)?;
+        let mut last = 0;
+        while let Some((&section, behind)) = rest.split_first() {
+            let specs;
+            (specs, rest) = VariableSpecs::split(behind)?;
+            if section <= core::mem::replace(&mut last, section) || specs.left == 0 {
+                return None;
+            }
+        }
+        (bytes.len() <= SIGNATURE_BYTES).then_some((name, arguments, results))
     }
 }
 
 impl<'a> VariableSpecs<'a> {
+    /// Bytes of a `Parameters` that holds all of them.
+    pub fn parameters_bytes(self) -> u32 {
+        let bytes = self.raw().try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec)?));
+        bytes.map_or(u32::MAX, saturate)
+    }
+
     /// The variable of this name.
     pub fn named(mut self, name: &str) -> Option<VariableSpec<'a>> {
         self.find(|spec| spec.name == name)
@@ -221,12 +308,15 @@ impl<'a> VariableSpecs<'a> {
 
     /// The same, without a look at the names.
     pub(super) fn raw(mut self) -> impl Iterator<Item = RawSpec<'a>> + Clone {
-        core::iter::from_fn(move || {
-            self.left = self.left.checked_sub(1)?;
-            let (spec, rest) = RawSpec::split(self.rest)?;
-            self.rest = rest;
-            Some(spec)
-        })
+        core::iter::from_fn(move || self.next_raw())
+    }
+
+    #[inline]
+    pub(super) fn next_raw(&mut self) -> Option<RawSpec<'a>> {
+        self.left = self.left.checked_sub(1)?;
+        let (spec, rest) = RawSpec::split(self.rest)?;
+        self.rest = rest;
+        Some(spec)
     }
 
     #[inline]
@@ -241,8 +331,12 @@ impl<'a> VariableSpecs<'a> {
     #[inline]
     fn behind(&self) -> Option<&'a [u8]> {
         (0..self.left).try_fold(self.rest, |rest, _| {
-            let (&[_, length, _, _, _, _], rest) = rest.split_first_chunk()?;
-            rest.get(usize::from(length)..)
+            let (&[kind, length, size @ ..], rest) = rest.split_first_chunk::<6>()?;
+            let rest = rest.get(usize::from(length)..)?;
+            match Type::from_wire(kind) {
+                Some(kind) if kind.is_nested() => nested::behind(kind, u32::from_le_bytes(size), rest),
+                _ => Some(rest),
+            }
         })
     }
 
@@ -273,19 +367,45 @@ impl<'a> Iterator for VariableSpecs<'a> {
 
 impl<'a> RawSpec<'a> {
     #[inline]
-    fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
+    pub(super) fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
         let (&[kind, length], rest) = bytes.split_first_chunk::<2>()?;
         let (&size, rest) = rest.split_first_chunk::<4>()?;
         let (name, rest) = rest.split_at_checked(usize::from(length))?;
-        Some((Self { name, kind: Type::from_wire(kind)?, size: u32::from_le_bytes(size) }, rest))
+        let (kind, size) = (Type::from_wire(kind)?, u32::from_le_bytes(size));
+        let (inner, rest) = if kind.is_nested() { nested::split_inner(kind, size, rest)? } else { (&[][..], rest) };
+        Some((Self { name, kind, size, inner }, rest))
     }
 }
 
 impl<'a> VariableSpec<'a> {
+    /// A variable that is no list or record.
+    pub const fn flat(name: &'a str, kind: Type, size: u32) -> Self {
+        Self { name, kind, size, inner: &[] }
+    }
+
+    /// What a list's elements are, without a name; `None` for another type.
+    pub fn element(&self) -> Option<Self> {
+        self.raw().element().map(|element| Self {
+            name: "",
+            kind: element.kind,
+            size: element.size,
+            inner: element.inner,
+        })
+    }
+
+    /// A record's fields; none for another type.
+    pub fn fields(&self) -> VariableSpecs<'a> {
+        self.raw().fields()
+    }
+
+    pub(super) const fn raw(&self) -> RawSpec<'a> {
+        RawSpec { name: self.name.as_bytes(), kind: self.kind, size: self.size, inner: self.inner }
+    }
+
     fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
-        let (RawSpec { name, kind, size }, rest) = RawSpec::split(bytes)?;
+        let (RawSpec { name, kind, size, inner }, rest) = RawSpec::split(bytes)?;
         let name = core::str::from_utf8(name).ok()?;
-        Some((Self { name, kind, size }, rest))
+        Some((Self { name, kind, size, inner }, rest))
     }
 }
 
@@ -294,12 +414,65 @@ pub(super) struct Builder {
     bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
     arguments_at: usize,
     results_at: Option<usize>,
+    /// The section that was begun last, and where its count is.
+    #[cfg(feature = "details")]
+    section: Option<(Section, usize)>,
 }
 
 impl Builder {
+    /// The arguments and results of a function.
+    fn of<'a>(
+        name: &str,
+        mut arguments: impl Iterator<Item = VariableSpec<'a>>,
+        mut results: impl Iterator<Item = VariableSpec<'a>>,
+    ) -> Result<Self, Error> {
+        let mut builder = Self::new(name)?;
+        arguments.try_for_each(|argument| builder.argument(argument))?;
+        results.try_for_each(|result| builder.result(result))?;
+        Ok(builder)
+    }
+
+    /// Adds what a signature declares behind its results.
+    #[cfg(feature = "details")]
+    fn sections_of(&mut self, signature: Signature<'_>) -> Result<(), Error> {
+        let mut all = Section::ALL.into_iter();
+        all.try_for_each(|(section, _)| signature.section(section).try_for_each(|spec| self.declare(section, spec)))
+    }
+
+    /// A unit that has no use for sections passes them over.
+    #[cfg(not(feature = "details"))]
+    fn sections_of(&mut self, _: Signature<'_>) -> Result<(), Error> {
+        Ok(())
+    }
+
+    /// Adds a variable to a section; the sections come behind the results, in their order.
+    #[cfg(feature = "details")]
+    pub(super) fn declare(&mut self, section: Section, spec: VariableSpec<'_>) -> Result<(), Error> {
+        self.begin_results()?;
+        let at = match self.section {
+            Some((begun, at)) if begun == section => at,
+            _ => {
+                self.push(&[section as u8, 0])?;
+                self.bytes.len().saturating_sub(1)
+            }
+        };
+        self.section = Some((section, at));
+        self.check_free(at, spec.name)?;
+        if self.list(at).count() >= VARIABLES {
+            return Err(Error::Full(Limit::Variables));
+        }
+        self.variable(at, spec)
+    }
+
     pub(super) fn new(name: &str) -> Result<Self, Error> {
         check_name(name)?;
-        let mut builder = Self { bytes: heapless::Vec::new(), arguments_at: 0, results_at: None };
+        let mut builder = Self {
+            bytes: heapless::Vec::new(),
+            arguments_at: 0,
+            results_at: None,
+            #[cfg(feature = "details")]
+            section: None,
+        };
         builder.push(&[name.len() as u8])?;
         builder.push(name.as_bytes())?;
         builder.arguments_at = builder.bytes.len();
@@ -354,7 +527,8 @@ impl Builder {
 
     fn variable(&mut self, list_at: usize, spec: VariableSpec<'_>) -> Result<(), Error> {
         check_name(spec.name)?;
-        let end = self.bytes.len().saturating_add(spec.name.len()).saturating_add(6);
+        nested::check_inner(spec.raw())?;
+        let end = self.bytes.len().saturating_add(spec.name.len()).saturating_add(spec.inner.len()).saturating_add(6);
         let count_of_results = usize::from(self.results_at.is_none());
         if end.saturating_add(count_of_results) > SIGNATURE_BYTES {
             return Err(Error::Full(Limit::SignatureBytes));
@@ -362,6 +536,7 @@ impl Builder {
         self.push(&[spec.kind as u8, spec.name.len() as u8])?;
         self.push(&spec.size.to_le_bytes())?;
         self.push(spec.name.as_bytes())?;
+        self.push(spec.inner)?;
         if let Some(count) = self.bytes.get_mut(list_at) {
             *count = count.saturating_add(1);
         }
@@ -384,7 +559,7 @@ impl Builder {
 
 fn check_same(argument: VariableSpec<'_>, result: VariableSpec<'_>, position: usize) -> Result<(), Error> {
     let index = position as u8;
-    if argument.kind != result.kind {
+    if argument.kind != result.kind || argument.inner != result.inner {
         return Err(Error::WrongType { index });
     }
     if argument.size != result.size {
@@ -402,8 +577,8 @@ impl core::str::FromStr for Definition {
 
 impl fmt::Display for VariableSpec<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.name, self.kind)?;
-        if self.kind.is_fixed() && self.size == 1 { Ok(()) } else { write!(f, "[{}]", self.size) }
+        write!(f, "{}: ", self.name)?;
+        nested::show(f, self.raw())
     }
 }
 
@@ -424,7 +599,17 @@ impl fmt::Display for Signature<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let results = self.results();
         write!(f, "{}{}", self.name(), self.arguments())?;
-        if results.left == 0 { Ok(()) } else { write!(f, " -> {results}") }
+        if results.left > 0 {
+            write!(f, " -> {results}")?;
+        }
+        #[cfg(feature = "details")]
+        for (section, word) in Section::ALL {
+            let specs = self.section(section);
+            if specs.left > 0 {
+                write!(f, " {word} {specs}")?;
+            }
+        }
+        Ok(())
     }
 }
 

@@ -155,12 +155,19 @@ pub struct TheirFunctionList<S: Storage> {
     table: Table<S, ()>,
     only: Option<&'static [&'static str]>,
     skipped: u32,
+    /// Functions and bytes of signatures that it may grow to.
+    most: (usize, usize),
 }
 
 impl<S: Storage> TheirFunctionList<S> {
     /// An empty list with room for as many functions as there are entries, and for `bytes` of signatures.
     pub fn new(entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> Self {
-        Self { table: Table::new(entries, bytes), only: None, skipped: 0 }
+        Self { table: Table::new(entries, bytes), only: None, skipped: 0, most: (0, 0) }
+    }
+
+    /// Lets it grow to so many functions, and so many bytes of signatures, where the storage has an allocator.
+    pub const fn let_grow(&mut self, functions: usize, bytes: usize) {
+        self.most = (functions, bytes);
     }
 
     /// Keeps functions of these names only from now on; the others count as skipped.
@@ -246,21 +253,6 @@ impl<S: Storage> TheirFunctionList<S> {
         self.skipped = 0;
     }
 
-    /// Entries and bytes of signatures that are free.
-    pub fn room(&self) -> (usize, usize) {
-        (self.table.free_entries(), self.table.free_bytes())
-    }
-
-    /// Entries and bytes of signatures in all.
-    pub fn capacity(&self) -> (usize, usize) {
-        (self.table.entries.len(), self.table.bytes.len())
-    }
-
-    /// Moves to longer slices and returns the unused ones: the old slices, or the new ones if they are shorter.
-    pub(crate) fn grow(&mut self, entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> (S::Slice<Entry>, S::Slice<u8>) {
-        self.table.grow(entries, bytes)
-    }
-
     /// The slices, with nothing in them.
     pub(crate) fn into_slices(mut self) -> (S::Slice<Entry>, S::Slice<u8>) {
         self.table.clear();
@@ -319,6 +311,7 @@ impl<S: Storage> TheirFunctionList<S> {
         attributes: Attributes,
         signature: &[u8],
     ) -> Result<(), Error> {
+        self.table.make_room(signature.len(), self.most);
         let preferred = usize::from(slot.0);
         let free = self.table.entries.get(preferred).is_some_and(|entry| entry.function.is_none());
         let index = if free { Some(preferred) } else { self.table.free_index() };

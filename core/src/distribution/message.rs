@@ -18,10 +18,14 @@ const REQUEST: u8 = 1;
 const REPLY: u8 = 2;
 pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
+#[cfg(feature = "details")]
+const PROGRESS: u8 = 5;
 #[cfg(feature = "streams")]
 const SAMPLE: u8 = 6;
 
 const WANTS_REPLY: u8 = 1;
+/// The caller wants to be told progress; a callee may pass it over.
+const WANTS_PROGRESS: u8 = 0x02;
 /// An operator made it, and not the unit's program.
 const OPERATOR: u8 = 0x04;
 /// What another caller moves is taken over.
@@ -29,7 +33,7 @@ const TAKES_OVER: u8 = 0x10;
 /// Flags without which a callee must not run the request, and which this version does not know.
 const UNKNOWN: u8 = 0xE0;
 /// Flags that a callee may pass over, and which this version does not know.
-const SKIPPABLE: u8 = 0x0A;
+const SKIPPABLE: u8 = 0x08;
 
 /// Bytes before a request's block.
 pub const REQUEST_BYTES: usize = LEAST_REQUEST_BYTES + MORE_BYTES;
@@ -63,6 +67,9 @@ pub enum Message<'b> {
     Reply(u32, Result<&'b [u8], Error>),
     /// An asynchronous request was not run, or its service failed.
     Failure(u32, Error),
+    /// What a running call tells.
+    #[cfg(feature = "details")]
+    Progress(u32, &'b [u8]),
     /// Lists, limits, leases: [items](super::items), of which [`Control`] is one each.
     Control(&'b [u8]),
     /// The newest value of a stream.
@@ -87,6 +94,12 @@ impl<'b> Message<'b> {
             FAILURE => {
                 let (id, status) = decode_reply(bytes.first_chunk()?);
                 Some(Self::Failure(id, status.err()?))
+            }
+            #[cfg(feature = "details")]
+            PROGRESS => {
+                let &[_, _, _, words, a, b, c, d] = bytes.first_chunk::<LEAST_PROGRESS_BYTES>()?;
+                let block = behind_header(bytes, &words, LEAST_PROGRESS_BYTES)?;
+                Some(Self::Progress(u32::from_le_bytes([a, b, c, d]), block))
             }
             CONTROL => Some(Self::Control(bytes.get(CONTROL_HEADER_BYTES..)?)),
             #[cfg(feature = "streams")]
@@ -134,6 +147,8 @@ pub struct RequestHeader {
     pub generation: Generation,
     /// The caller waits for a reply.
     pub wants_reply: bool,
+    /// The caller wants to be told progress.
+    pub wants_progress: bool,
     /// What another caller moves is taken over.
     pub takes_over: bool,
     /// An operator made it, and not the unit's program.
@@ -153,6 +168,7 @@ impl RequestHeader {
     #[inline]
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
         let flags = if self.wants_reply { WANTS_REPLY } else { 0 }
+            | if self.wants_progress { WANTS_PROGRESS } else { 0 }
             | if self.takes_over { TAKES_OVER } else { 0 }
             | if self.operator { OPERATOR } else { 0 }
             | if LATER { SKIPPABLE } else { 0 }
@@ -208,6 +224,7 @@ impl RequestHeader {
             slot: Slot(u16::from_le_bytes([*s0, *s1])),
             generation: Generation(u16::from_le_bytes([*g0, *g1])),
             wants_reply: flags & WANTS_REPLY != 0,
+            wants_progress: flags & WANTS_PROGRESS != 0,
             takes_over: flags & TAKES_OVER != 0,
             operator: flags & OPERATOR != 0,
             unknown: flags & UNKNOWN,
@@ -256,6 +273,57 @@ impl SampleHeader {
     }
 }
 
+/// The header of progress that each version has.
+#[cfg(feature = "details")]
+const LEAST_PROGRESS_BYTES: usize = 8;
+/// Bytes before the block of progress.
+#[cfg(feature = "details")]
+pub const PROGRESS_BYTES: usize = LEAST_PROGRESS_BYTES + MORE_BYTES;
+
+/// The header of what call `id` tells.
+#[cfg(feature = "details")]
+pub fn encode_progress(id: u32) -> [u8; PROGRESS_BYTES] {
+    let [a, b, c, d] = id.to_le_bytes();
+    with_more([PROGRESS, 0, 0, (PROGRESS_BYTES / WORD) as u8, a, b, c, d])
+}
+
+/// What stands behind the header of a reply or failure whose service failed: its text, and the block of its values.
+#[cfg(feature = "details")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FailureDetails<'b> {
+    /// The reason in words.
+    pub text: &'b str,
+    /// The block of the values that the signature declares, or nothing.
+    pub values: &'b [u8],
+}
+
+#[cfg(feature = "details")]
+impl<'b> FailureDetails<'b> {
+    /// `None` for any other message, and where there are none.
+    pub fn of(message: &'b [u8]) -> Option<Self> {
+        let &[REPLY | FAILURE, SERVICE_FAILED, _, words, ..] = message.first_chunk::<LEAST_REPLY_BYTES>()? else {
+            return None;
+        };
+        let (&head, rest) = behind_header(message, &words, LEAST_REPLY_BYTES)?.split_first_chunk()?;
+        let length = usize::try_from(u64::from_le_bytes(head)).ok()?;
+        let (text, rest) = rest.split_at_checked(length)?;
+        let values = rest.get(length.wrapping_neg() & 7..)?;
+        Some(Self { text: core::str::from_utf8(text).ok()?, values })
+    }
+
+    /// Bytes of a text with its length and padding.
+    pub const fn text_bytes(text: &str) -> usize {
+        text.len().next_multiple_of(8).saturating_add(8)
+    }
+
+    /// Writes a text, which takes [`text_bytes`](Self::text_bytes).
+    pub fn put_text(text: &str, to: &mut impl Put) {
+        to.put(&(text.len() as u64).to_le_bytes());
+        to.put(text.as_bytes());
+        to.put([0; 8].get(..text.len().wrapping_neg() & 7).unwrap_or_default());
+    }
+}
+
 fn micros(bytes: [u8; 4]) -> Duration {
     Duration::from_micros(u64::from(u32::from_le_bytes(bytes)))
 }
@@ -292,6 +360,9 @@ fn decode_reply(bytes: &[u8; LEAST_REPLY_BYTES]) -> (u32, Result<(), Error>) {
     (id, Err(error_of(code, index, first, second)))
 }
 
+/// The code of a service that failed with one of its own.
+const SERVICE_FAILED: u8 = 20;
+
 /// (code, index, first number, second number) of an error that a callee answers.
 fn error_code(error: Error) -> (u8, u8, u32, u32) {
     match error {
@@ -312,7 +383,7 @@ fn error_code(error: Error) -> (u8, u8, u32, u32) {
         Error::Unsupported => (16, 0, 0, 0),
         Error::Held { by, operator } => (17, 0, by, operator.into()),
         Error::Inhibited { by, reason } => (18, 0, by, reason.into()),
-        Error::Service(ServiceError::Failed(code)) => (20, 0, u32::from(code), 0),
+        Error::Service(ServiceError::Failed(code)) => (SERVICE_FAILED, 0, u32::from(code), 0),
         Error::Service(ServiceError::Panicked) => (21, 0, 0, 0),
         Error::Service(ServiceError::NotReady) => (22, 0, 0, 0),
         Error::Service(ServiceError::BadResults) => (23, 0, 0, 0),
@@ -340,7 +411,7 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
         16 => Error::Unsupported,
         17 => Error::Held { by: first, operator: second & 1 != 0 },
         18 => Error::Inhibited { by: first, reason: second as u16 },
-        20 => Error::Service(ServiceError::Failed(first as u16)),
+        SERVICE_FAILED => Error::Service(ServiceError::Failed(first as u16)),
         21 => Error::Service(ServiceError::Panicked),
         22 => Error::Service(ServiceError::NotReady),
         23 => Error::Service(ServiceError::BadResults),
@@ -362,6 +433,9 @@ pub enum SessionBody<'b> {
     Renewed(u32),
     /// The caller no longer wants a leased call, wherever it is.
     Release(Release),
+    /// The caller has given a call up, and waits for it no longer.
+    #[cfg(feature = "details")]
+    Cancel(Release),
     /// The caller gives up all its calls of a leased function up to this id, whether in flight, queued or running.
     ReleaseAll(Slot, u32),
     /// One whole message: a best-effort request, or an emergency's second copy. The priority's byte, the message.
@@ -387,13 +461,20 @@ pub struct Renewal {
     pub age: Duration,
 }
 
-/// The caller gives up a leased call: it ends, leaves the queue, or does not begin if it arrives later.
+/// The caller gives up a call: it ends, leaves the queue, or does not begin if it arrives later.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Release {
     /// The caller's id of the call.
     pub call: u32,
     /// The class that the call was made in.
     pub class: Priority,
+}
+
+impl Release {
+    fn decode(bytes: &[u8]) -> Option<Self> {
+        let (&class, call) = bytes.split_first()?;
+        Some(Self { call: u32::from_le_bytes(*call.first_chunk()?), class: Priority::from_wire(class)? })
+    }
 }
 
 /// Longest session body that is not a message.
@@ -407,6 +488,8 @@ const PONG: u8 = 5;
 const RELEASE: u8 = 6;
 const RELEASE_ALL: u8 = 7;
 const RENEWED: u8 = 8;
+#[cfg(feature = "details")]
+const CANCEL: u8 = 9;
 
 impl<'b> SessionBody<'b> {
     /// Reads a session body. All but a message may be longer than this version knows; `None` for what it does not know.
@@ -428,11 +511,9 @@ impl<'b> SessionBody<'b> {
                 }))
             }
             RENEWED => Some(Self::Renewed(u32::from_le_bytes(*rest.first_chunk()?))),
-            RELEASE => {
-                let (&class, call) = rest.split_first()?;
-                let (call, class) = (u32::from_le_bytes(*call.first_chunk()?), Priority::from_wire(class)?);
-                Some(Self::Release(Release { call, class }))
-            }
+            RELEASE => Some(Self::Release(Release::decode(rest)?)),
+            #[cfg(feature = "details")]
+            CANCEL => Some(Self::Cancel(Release::decode(rest)?)),
             RELEASE_ALL => {
                 let (slot, id) = rest.split_first_chunk()?;
                 Some(Self::ReleaseAll(Slot(u16::from_le_bytes(*slot)), u32::from_le_bytes(*id.first_chunk()?)))
@@ -474,6 +555,14 @@ impl<'b> SessionBody<'b> {
         [RELEASE, release.class.to_wire(), c0, c1, c2, c3]
     }
 
+    /// The bytes that cancel one call.
+    #[cfg(feature = "details")]
+    pub fn cancel(release: &Release) -> [u8; 6] {
+        let [_, rest @ ..] = Self::release(release);
+        let [a, b, c, d, e] = rest;
+        [CANCEL, a, b, c, d, e]
+    }
+
     /// The bytes that release all calls of a function up to `id`.
     pub fn release_all(slot: Slot, id: u32) -> [u8; 7] {
         let ([s0, s1], [i0, i1, i2, i3]) = (slot.0.to_le_bytes(), id.to_le_bytes());
@@ -510,6 +599,7 @@ mod tests {
                 slot: Slot(slot),
                 generation: Generation(generation),
                 wants_reply,
+                wants_progress: unknown & 4 != 0,
                 takes_over: unknown & 1 != 0,
                 operator: unknown & 2 != 0,
                 unknown: unknown & UNKNOWN,
@@ -580,6 +670,37 @@ mod tests {
         assert!(Message::decode(&bytes).is_none());
     }
 
+    #[cfg(feature = "details")]
+    #[test]
+    fn progress_details_and_cancellation_survive() {
+        let mut bytes = Vec::from(encode_progress(7));
+        assert_eq!(bytes[..8], [5, 0, 0, (PROGRESS_BYTES / WORD) as u8, 7, 0, 0, 0]);
+        bytes[3] += 1;
+        bytes.extend([0xEE; WORD + 3]);
+        let Some(Message::Progress(7, block)) = Message::decode(&bytes) else { panic!() };
+        assert_eq!(block, [0xEE; 3], "a later version says more");
+        bytes[3] = 1;
+        assert!(Message::decode(&bytes).is_none());
+
+        let cancel = Release { call: 5, class: Priority::High };
+        assert_eq!(SessionBody::decode(&SessionBody::cancel(&cancel)), Some(SessionBody::Cancel(cancel)));
+        assert_eq!(SessionBody::cancel(&cancel), [9, 1, 5, 0, 0, 0]);
+
+        for text in ["", "too far", "achteinh"] {
+            let mut failure = Vec::from(encode_failure(7, Error::Service(ServiceError::Failed(300))));
+            assert_eq!(FailureDetails::of(&failure), None);
+            let mut more = [0; 32];
+            FailureDetails::put_text(text, &mut super::super::block::SliceWriter::new(&mut more));
+            failure.extend(&more[..FailureDetails::text_bytes(text)]);
+            failure.extend([1; 8]);
+            assert_eq!(FailureDetails::of(&failure), Some(FailureDetails { text, values: &[1; 8] }));
+            assert_eq!(FailureDetails::of(&failure[..failure.len() - 9]), None, "it is cut");
+        }
+        let mut other = Vec::from(encode_reply(7, Err(Error::Busy)));
+        other.extend([0; 8]);
+        assert_eq!(FailureDetails::of(&other), None, "of another error what follows is passed over");
+    }
+
     /// Flag 2 is one that a callee which does not know it passes over, and the answer says it in what had been a 0.
     #[test]
     fn an_operators_origin_is_told_both_ways() {
@@ -588,6 +709,7 @@ mod tests {
             slot: Slot(1),
             generation: Generation(2),
             wants_reply: false,
+            wants_progress: false,
             takes_over: false,
             operator: true,
             unknown: 0,

@@ -2,7 +2,7 @@
 //!
 //! [`Parameters`] owns its bytes and has no heap; functions take a [`ParametersView`], to which a `Parameters` of any
 //! size coerces. Names and values lie in one arena; each value reserves its declared size, so that setting one
-//! never moves another.
+//! never moves another. A list or record takes what its value takes, and moves what follows it.
 
 use core::fmt;
 use core::ops::{Deref, DerefMut};
@@ -11,11 +11,14 @@ use crate::config::{PARAMETERS_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
 use super::block::prepare_results;
-use super::function::Signature;
+use super::function::{RawSpec, Signature, VariableSpec};
 use super::name::check_name;
+use super::nested;
+pub use super::nested::{Elements, Fields};
 pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
 use super::value::{read_elements, saturate};
-use crate::bytes::{are_same, copy};
+pub use super::writer::{ListWriter, RecordWriter, Slot};
+use crate::bytes::{are_same, copy, move_down, rotate_up};
 
 /// Variables in `BYTES` bytes of names and values (paper, listing line 11).
 ///
@@ -55,7 +58,7 @@ pub struct ParametersInner<B: ?Sized> {
     bytes: B,
 }
 
-/// One variable. Its name lies right before its value in the arena.
+/// One variable. In the arena lie what a list or record is made of, the name, and the value.
 #[derive(Clone, Copy)]
 struct Entry {
     value_at: u32,
@@ -64,10 +67,11 @@ struct Entry {
     length: u32,
     name_length: u8,
     kind: Type,
+    inner_length: u16,
 }
 
 impl Entry {
-    const EMPTY: Self = Self { value_at: 0, size: 0, length: 0, name_length: 0, kind: Type::Int };
+    const EMPTY: Self = Self { value_at: 0, size: 0, length: 0, name_length: 0, kind: Type::Int, inner_length: 0 };
 }
 
 /// One variable of a [`ParametersView`], borrowed.
@@ -135,9 +139,69 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         self.add(name, Type::Bytes, maximum)
     }
 
-    /// Adds a variable of any type, with the value 0, `false` or empty.
+    /// Adds a variable of any type but a list or record, with the value 0, `false` or empty.
     pub fn add(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
-        self.as_mut_view().add_variable(name, kind, size)
+        self.as_mut_view().add_variable(VariableSpec::flat(name, kind, size))
+    }
+
+    /// Adds a variable as a signature has it, with the value 0, `false` or empty; a list is empty, and a record has such
+    /// fields.
+    #[cfg_attr(feature = "nested", doc = "```")]
+    #[cfg_attr(not(feature = "nested"), doc = "```ignore")]
+    /// use cara_core::distribution::{function::Definition, parameters::Parameters};
+    ///
+    /// let order = Definition::parse("order(nodes: {id: string[32], x: float}[..50])").unwrap();
+    /// let mut parameters = Parameters::new();
+    /// for argument in order.signature().arguments() {
+    ///     parameters.add_spec(argument)?;
+    /// }
+    /// parameters.set_list("nodes", |nodes| {
+    ///     nodes.push_record(|node| {
+    ///         node.set("id", "a")?;
+    ///         node.set("x", 1.5)
+    ///     })
+    /// })?;
+    /// for node in parameters.list("nodes")? {
+    ///     assert_eq!((node.field("id")?.read::<&str>()?, node.field("x")?.read::<f64>()?), ("a", 1.5));
+    /// }
+    /// # Ok::<(), cara_core::error::Error>(())
+    /// ```
+    pub fn add_spec(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
+        self.as_mut_view().add_variable(spec)
+    }
+
+    /// The elements of a list; [`Error::UnknownVariable`] or [`Error::WrongType`].
+    pub fn list(&self, name: &str) -> Result<Elements<'_>, Error> {
+        let value = self.value(name)?;
+        if value.kind() == Type::List { Ok(value.elements()) } else { Err(Error::WrongType { index: value.index }) }
+    }
+
+    /// The fields of a record; [`Error::UnknownVariable`] or [`Error::WrongType`].
+    pub fn record(&self, name: &str) -> Result<Fields<'_>, Error> {
+        let value = self.value(name)?;
+        if value.kind() == Type::Record { Ok(value.fields()) } else { Err(Error::WrongType { index: value.index }) }
+    }
+
+    /// Sets a list to the elements that `write` adds. On an error, which may be one of `write`, the old value stays.
+    pub fn set_list(
+        &mut self,
+        name: &str,
+        write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        let view = self.as_mut_view();
+        let index = view.find(name.as_bytes()).ok_or(Error::UnknownVariable)?;
+        view.write_list(index, write)
+    }
+
+    /// Sets a record, all of whose fields `write` sets in their order. On an error the old value stays.
+    pub fn set_record(
+        &mut self,
+        name: &str,
+        write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        let view = self.as_mut_view();
+        let index = view.find(name.as_bytes()).ok_or(Error::UnknownVariable)?;
+        view.write_record(index, write)
     }
 
     /// Sets a variable from a number, a truth value, an array or slice of them, a `&str` or a `&[u8]`.
@@ -253,12 +317,13 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
 }
 
 impl ParametersView {
-    fn add_variable(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
-        check_name(name)?;
-        if self.find(name.as_bytes()).is_some() {
+    fn add_variable(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
+        check_name(spec.name)?;
+        nested::check_inner(spec.raw())?;
+        if self.find(spec.name.as_bytes()).is_some() {
             return Err(Error::NameTaken);
         }
-        self.add_checked(name.as_bytes(), kind, size)
+        self.add_checked(spec.raw())
     }
 
     /// Replaces all variables by the arguments of a function, then its other results, each 0, `false` or empty: in the order
@@ -267,7 +332,7 @@ impl ParametersView {
     pub fn lay_out(&mut self, function: Signature<'_>) -> Result<(), Error> {
         self.clear();
         for spec in function.arguments() {
-            self.add_checked(spec.name.as_bytes(), spec.kind, spec.size)?;
+            self.add_checked(spec.raw())?;
         }
         prepare_results(function.results(), self)
     }
@@ -285,9 +350,10 @@ impl ParametersView {
     }
 
     /// Adds a variable whose name may be one, and is not there.
-    pub(super) fn add_checked(&mut self, name: &[u8], kind: Type, size: u32) -> Result<(), Error> {
-        let target = self.reserve(name, kind, size)?;
-        if kind.is_fixed() {
+    pub(super) fn add_checked(&mut self, spec: RawSpec<'_>) -> Result<(), Error> {
+        let nested = if spec.kind.is_nested() { nested::least(spec) } else { 0 };
+        let target = self.reserve(spec, nested)?;
+        if spec.kind.is_fixed() || spec.kind.is_nested() {
             target.bytes.fill(0);
             *target.length = saturate(target.bytes.len());
         }
@@ -295,23 +361,33 @@ impl ParametersView {
     }
 
     /// The same with a value that was checked against its type and size.
-    pub(super) fn add_with(&mut self, name: &[u8], kind: Type, size: u32, value: &[u8]) -> Result<(), Error> {
-        self.reserve(name, kind, size)?.set_checked(value);
+    pub(super) fn add_with(&mut self, spec: RawSpec<'_>, value: &[u8]) -> Result<(), Error> {
+        self.reserve(spec, value.len())?.set_checked(value);
         Ok(())
     }
 
-    /// The place of a new variable, whose value is not set.
-    fn reserve(&mut self, name: &[u8], kind: Type, size: u32) -> Result<Target<'_>, Error> {
+    /// The place of a new variable, whose value is not set; that of a list or record takes `nested` bytes.
+    fn reserve(&mut self, spec: RawSpec<'_>, nested: usize) -> Result<Target<'_>, Error> {
+        let RawSpec { name, kind, size, inner } = spec;
         let index = self.count;
         let place = self.table.get_mut(self.count as usize).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);
-        let length = kind.bytes_of(size).ok_or(full)?;
-        let (_, free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
+        let length = if kind.is_nested() { nested } else { kind.bytes_of(size).ok_or(full)? };
+        let (_, mut free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
+        let mut value_at = self.used.saturating_add(saturate(name.len()));
+        let mut inner_length = 0;
+        if kind.is_nested() {
+            let inner_place;
+            (inner_place, free) = free.split_at_mut_checked(inner.len()).ok_or(full)?;
+            copy(inner, inner_place);
+            value_at = value_at.saturating_add(saturate(inner.len()));
+            // What a variable is made of is part of a signature, or was checked like one.
+            inner_length = u16::try_from(inner.len()).map_err(|_| Error::Full(Limit::SignatureBytes))?;
+        }
         let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
         let value = free.get_mut(..length).ok_or(full)?;
         copy(name, name_place);
-        let value_at = self.used.saturating_add(saturate(name.len()));
-        *place = Entry { value_at, size, length: 0, name_length: name.len() as u8, kind };
+        *place = Entry { value_at, size, length: 0, name_length: name.len() as u8, kind, inner_length };
         self.used = value_at.saturating_add(saturate(length));
         self.count = index.saturating_add(1);
         Ok(Target { index: index as u8, kind, size, length: &mut place.length, bytes: value })
@@ -343,7 +419,64 @@ impl ParametersView {
         let entry = self.table.get(index)?;
         let start = entry.value_at as usize;
         let bytes = self.bytes.get(start..start.saturating_add(entry.length as usize))?;
-        Some(Value { index: index as u8, kind: entry.kind, size: entry.size, bytes })
+        let inner = if entry.kind.is_nested() { self.inner_of(entry) } else { &[] };
+        Some(Value { index: index as u8, kind: entry.kind, size: entry.size, inner, bytes })
+    }
+
+    /// All bytes of names and values, also those that are not used.
+    pub(super) const fn arena(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    pub(super) const fn used(&self) -> usize {
+        self.used as usize
+    }
+
+    /// The bytes from a place on that nothing uses: `most` of them, or all that there are.
+    pub(super) fn room_at(&mut self, at: usize, most: usize) -> Option<&mut [u8]> {
+        let (_, free) = self.bytes.split_at_mut_checked(at)?;
+        let end = free.len().min(most);
+        free.get_mut(..end)
+    }
+
+    /// Sets a list or record from bytes that were checked against what it is made of.
+    pub(super) fn set_nested(&mut self, index: usize, bytes: &[u8]) -> Result<(), Error> {
+        let start = self.used as usize;
+        let place = self.bytes.get_mut(start..start.saturating_add(bytes.len()));
+        copy(bytes, place.ok_or(Error::Full(Limit::ParametersBytes))?);
+        self.replace_nested(index, bytes.len());
+        Ok(())
+    }
+
+    /// Puts `length` bytes, which lie behind all that is used, in the place of the value of a list or record.
+    pub(super) fn replace_nested(&mut self, index: usize, length: usize) {
+        let Some(entry) = self.table.get_mut(index) else { return };
+        let (at, old) = (entry.value_at, entry.length as usize);
+        entry.length = saturate(length);
+        let end = (self.used as usize).saturating_add(length);
+        let Some(region) = self.bytes.get_mut(at as usize..end).filter(|region| region.len() >= length) else { return };
+        rotate_up(region, length);
+        if let Some(behind) = region.get_mut(length..) {
+            let until = behind.len();
+            move_down(behind, old..until);
+        }
+        let moved = |place: u32| place.saturating_add(saturate(length)).saturating_sub(saturate(old));
+        for later in self.table.iter_mut().take(self.count as usize).filter(|later| later.value_at > at) {
+            later.value_at = moved(later.value_at);
+        }
+        self.used = moved(self.used);
+    }
+
+    /// Where in the arena stands what the variable at `index` is made of.
+    pub(super) fn inner_at(&self, index: usize) -> Option<usize> {
+        let entry = self.table.get(index)?;
+        let behind = usize::from(entry.name_length).checked_add(usize::from(entry.inner_length))?;
+        (entry.value_at as usize).checked_sub(behind)
+    }
+
+    fn inner_of(&self, entry: &Entry) -> &[u8] {
+        let end = (entry.value_at as usize).saturating_sub(usize::from(entry.name_length));
+        self.bytes.get(end.saturating_sub(usize::from(entry.inner_length))..end).unwrap_or_default()
     }
 
     /// Sets the value of the variable at `index` from bytes that were checked against its type and size.
@@ -357,7 +490,8 @@ impl ParametersView {
     fn target(&mut self, index: usize) -> Option<Target<'_>> {
         let entry = self.table.get_mut(index)?;
         let start = entry.value_at as usize;
-        let end = start.saturating_add(entry.kind.bytes_of(entry.size)?);
+        let length = if entry.kind.is_nested() { entry.length as usize } else { entry.kind.bytes_of(entry.size)? };
+        let end = start.saturating_add(length);
         let bytes = self.bytes.get_mut(start..end)?;
         Some(Target { index: index as u8, kind: entry.kind, size: entry.size, length: &mut entry.length, bytes })
     }
@@ -405,8 +539,11 @@ impl Arena for [u8] {
 }
 
 /// Bytes of a [`Parameters`] that one variable takes; `None` where that exceeds the address space.
-pub(crate) fn bytes_of_variable(name: &[u8], kind: Type, size: u32) -> Option<usize> {
-    kind.bytes_of(size)?.checked_add(name.len())
+pub(super) fn bytes_of_variable(spec: RawSpec<'_>) -> Option<usize> {
+    if spec.kind.is_nested() {
+        return nested::least(spec).checked_add(spec.inner.len())?.checked_add(spec.name.len());
+    }
+    spec.kind.bytes_of(spec.size)?.checked_add(spec.name.len())
 }
 
 impl<const BYTES: usize> Deref for ParametersInner<[u8; BYTES]> {

@@ -107,8 +107,10 @@ impl<H> Default for Entry<H> {
     }
 }
 
-/// What a table is lent.
-pub(super) type Slices<S, H> = (<S as Storage>::Slice<Entry<H>>, <S as Storage>::Slice<u8>);
+/// Half as much again, at least what is `needed` and at most `most`; as it is where that much is there.
+fn longer(length: usize, needed: usize, most: usize) -> usize {
+    if length >= needed { length } else { length.saturating_add(length / 2).max(needed).min(most) }
+}
 
 /// Entries, and one arena for all their signatures without gaps.
 pub(super) struct Table<S: Storage, H: 'static> {
@@ -127,24 +129,20 @@ impl<S: Storage, H: 'static> Table<S, H> {
         self.entries.iter().position(|entry| entry.function.is_none())
     }
 
-    pub(super) fn free_entries(&self) -> usize {
-        self.entries.len().saturating_sub(self.len)
-    }
-
-    /// Moves to longer slices; shorter ones are given back as they are.
-    pub(super) fn grow(&mut self, mut entries: S::Slice<Entry<H>>, mut bytes: S::Slice<u8>) -> Slices<S, H> {
-        if entries.len() < self.entries.len() || bytes.len() < self.bytes.len() {
-            return (entries, bytes);
+    /// Makes room for one more function, whose signature has so many bytes, in at most `most` entries and bytes.
+    pub(super) fn make_room(&mut self, signature: usize, most: (usize, usize))
+    where
+        Entry<H>: Default,
+    {
+        let (entries, bytes) = (self.entries.len(), self.bytes.len());
+        let longest = longer(entries, self.len.saturating_add(1), most.0);
+        if longest > entries {
+            S::lengthen(&mut self.entries, longest, Entry::default);
         }
-        for (new, old) in entries.iter_mut().zip(self.entries.iter_mut()) {
-            core::mem::swap(new, old);
+        let longest = longer(bytes, self.used.saturating_add(signature), most.1);
+        if longest > bytes {
+            S::lengthen(&mut self.bytes, longest, || 0);
         }
-        if let (Some(old), Some(new)) = (self.bytes.get(..self.used), bytes.get_mut(..self.used)) {
-            copy(old, new);
-        }
-        core::mem::swap(&mut self.entries, &mut entries);
-        core::mem::swap(&mut self.bytes, &mut bytes);
-        (entries, bytes)
     }
 
     pub(super) fn free_bytes(&self) -> usize {

@@ -1,15 +1,18 @@
 //! The text form of a signature, used by `show_functions`, the command line and the documentation, and its parser.
 //!
 //! `pos_info(position: int[2]) -> (position: int[2])`; `int`, `float` and `bool` alone have the size 1; a function
-//! without results has no arrow. Spaces are free between words.
+//! without results has no arrow. Behind them `progress (left: float)` and `fails (at: int[2])` may follow. A list of at most 8
+//! `int` is `int[..8]`, a record `{id: string[32], x: float}`. Spaces are free between words.
 
 use core::fmt;
 
+use crate::bytes::rotate_up;
 use crate::error::{Error, Limit};
 
 use super::function::{Builder, Definition, VariableSpec};
 use super::name::is_name_byte;
 use super::parameters::Type;
+use crate::config::{DEPTH, SIGNATURE_BYTES};
 
 /// The position of a syntax error, and what is expected there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -33,8 +36,10 @@ pub enum Expected {
     NewName,
     /// The type and size of the argument of the same name.
     SameAsArgument,
-    /// One of the five types.
+    /// A type.
     Type,
+    /// Fewer lists and records inside each other.
+    ShallowerType,
     /// A size in 32 bits.
     Size,
     /// Fewer variables.
@@ -45,6 +50,8 @@ pub enum Expected {
     Character(char),
     /// A further variable or the end of the list.
     CommaOrParenthesis,
+    /// A further field or the end of the record.
+    CommaOrBrace,
     /// The results or the end of the text.
     ArrowOrEnd,
     /// The end of the text.
@@ -58,12 +65,15 @@ impl fmt::Display for Expected {
             Self::ShorterName => "a shorter name",
             Self::NewName => "a name that is not in the list yet",
             Self::SameAsArgument => "the type and size of the argument of this name",
+            Self::Type if cfg!(feature = "nested") => "a type: int, float, string, bool, bytes or {…}",
             Self::Type => "a type: int, float, string, bool or bytes",
+            Self::ShallowerType => "at most 4 lists and records inside each other",
             Self::Size => "a size: a number of 32 bits",
             Self::FewerVariables => "fewer variables",
             Self::ShorterSignature => "a shorter signature",
             Self::Character(character) => return write!(f, "'{character}'"),
             Self::CommaOrParenthesis => "',' or ')'",
+            Self::CommaOrBrace => "',' or '}'",
             Self::ArrowOrEnd => "'->' or the end",
             Self::End => "the end",
         })
@@ -77,15 +87,21 @@ pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
     let mut builder = Builder::new(name).map_err(|error| explain(at, error))?;
     parser.list(|spec| builder.argument(spec))?;
     parser.skip_spaces();
-    if parser.rest().is_empty() {
-        return Ok(builder.finish());
+    let mut expected = Expected::ArrowOrEnd;
+    if parser.take(b"->") {
+        parser.list(|spec| builder.result(spec))?;
+        expected = Expected::End;
     }
-    if !parser.take(b"->") {
-        return Err(parser.error(Expected::ArrowOrEnd));
+    #[cfg(feature = "details")]
+    for (section, word) in super::function::Section::ALL {
+        parser.skip_spaces();
+        if parser.take(word.as_bytes()) {
+            parser.list(|spec| builder.declare(section, spec))?;
+            expected = Expected::End;
+        }
     }
-    parser.list(|spec| builder.result(spec))?;
     parser.skip_spaces();
-    if parser.rest().is_empty() { Ok(builder.finish()) } else { Err(parser.error(Expected::End)) }
+    if parser.rest().is_empty() { Ok(builder.finish()) } else { Err(parser.error(expected)) }
 }
 
 /// Reads a stream; see [`Definition::stream`].
@@ -97,6 +113,24 @@ pub(super) fn parse_stream(text: &str) -> Result<Definition, ParseError> {
     parser.list(|spec| builder.result(spec))?;
     parser.skip_spaces();
     if parser.rest().is_empty() { Ok(builder.finish()) } else { Err(parser.error(Expected::End)) }
+}
+
+const IS_NESTED: bool = Type::List.is_nested();
+
+/// What a list or record is made of, in the form of a signature.
+type Inner = heapless::Vec<u8, { if IS_NESTED { SIGNATURE_BYTES } else { 0 } }>;
+
+/// Puts `bytes` in front of what lies at `at`.
+fn insert(inner: &mut Inner, at: usize, bytes: &[u8]) -> Result<(), ()> {
+    inner.extend_from_slice(bytes).map_err(|_| ())?;
+    if let Some(tail) = inner.get_mut(at..) {
+        rotate_up(tail, bytes.len());
+    }
+    Ok(())
+}
+
+const fn too_long(position: usize) -> ParseError {
+    ParseError { position, expected: Expected::ShorterSignature }
 }
 
 struct Parser<'a> {
@@ -114,8 +148,9 @@ impl<'a> Parser<'a> {
         loop {
             let (at, name) = self.name()?;
             self.character(':')?;
-            let (kind, size) = self.type_and_size()?;
-            add(VariableSpec { name, kind, size }).map_err(|error| explain(at, error))?;
+            let mut inner = Inner::new();
+            let (kind, size) = self.whole_type(&mut inner, 0)?;
+            add(VariableSpec { name, kind, size, inner: &inner }).map_err(|error| explain(at, error))?;
             self.skip_spaces();
             if self.take(b")") {
                 return Ok(());
@@ -126,23 +161,81 @@ impl<'a> Parser<'a> {
         }
     }
 
+    /// A type with all that is inside it, which is put behind `inner`.
+    fn whole_type(&mut self, inner: &mut Inner, depth: usize) -> Result<(Type, u32), ParseError> {
+        if !IS_NESTED {
+            return self.type_and_size();
+        }
+        let start = inner.len();
+        self.skip_spaces();
+        let at = self.position;
+        let (mut kind, mut size) =
+            if self.take(b"{") { (Type::Record, self.fields(inner, depth)?) } else { self.type_and_size()? };
+        loop {
+            self.skip_spaces();
+            if !self.take(b"[..") {
+                return Ok((kind, size));
+            }
+            let most = self.size()?;
+            self.character(']')?;
+            insert(inner, start, &[kind as u8]).map_err(|()| too_long(at))?;
+            insert(inner, start.saturating_add(1), &size.to_le_bytes()).map_err(|()| too_long(at))?;
+            (kind, size) = (Type::List, most);
+        }
+    }
+
+    /// The fields of a record and its closing brace. Returns how many they are.
+    fn fields(&mut self, inner: &mut Inner, depth: usize) -> Result<u32, ParseError> {
+        if depth >= DEPTH {
+            return Err(self.error(Expected::ShallowerType));
+        }
+        let mut count = 0_u32;
+        loop {
+            let (at, name) = self.name()?;
+            self.character(':')?;
+            let start = inner.len();
+            let (kind, size) = self.whole_type(inner, depth.saturating_add(1))?;
+            let length =
+                u8::try_from(name.len()).map_err(|_| ParseError { position: at, expected: Expected::ShorterName })?;
+            let head = [&[kind as u8, length][..], &size.to_le_bytes(), name.as_bytes()];
+            let mut to = start;
+            for part in head {
+                insert(inner, to, part).map_err(|()| too_long(at))?;
+                to = to.saturating_add(part.len());
+            }
+            count = count.saturating_add(1);
+            self.skip_spaces();
+            if self.take(b"}") {
+                return Ok(count);
+            }
+            if !self.take(b",") {
+                return Err(self.error(Expected::CommaOrBrace));
+            }
+        }
+    }
+
     fn type_and_size(&mut self) -> Result<(Type, u32), ParseError> {
         self.skip_spaces();
         let at = self.position;
         let word = self.word();
-        let kind = Type::ALL.into_iter().find(|kind| kind.word() == word);
+        let kind = Type::FLAT.into_iter().find(|kind| kind.word() == word);
         let kind = kind.ok_or(ParseError { position: at, expected: Expected::Type })?;
         self.skip_spaces();
-        if kind.is_fixed() && self.rest().first() != Some(&b'[') {
+        let is_alone = self.rest().first() != Some(&b'[') || (IS_NESTED && self.rest().starts_with(b"[.."));
+        if kind.is_fixed() && is_alone {
             return Ok((kind, 1));
         }
         self.character('[')?;
+        let size = self.size()?;
+        self.character(']')?;
+        Ok((kind, size))
+    }
+
+    fn size(&mut self) -> Result<u32, ParseError> {
         self.skip_spaces();
         let at = self.position;
         let size = self.take_while(|byte| byte.is_ascii_digit()).parse();
-        let size = size.map_err(|_| ParseError { position: at, expected: Expected::Size })?;
-        self.character(']')?;
-        Ok((kind, size))
+        size.map_err(|_| ParseError { position: at, expected: Expected::Size })
     }
 
     fn name(&mut self) -> Result<(usize, &'a str), ParseError> {
@@ -200,6 +293,7 @@ const fn explain(position: usize, error: Error) -> ParseError {
         Error::WrongType { .. } | Error::WrongSize { .. } => Expected::SameAsArgument,
         Error::Full(Limit::NameBytes) => Expected::ShorterName,
         Error::Full(Limit::Variables) => Expected::FewerVariables,
+        Error::Full(Limit::Depth) => Expected::ShallowerType,
         Error::Full(_) => Expected::ShorterSignature,
         _ => Expected::Name,
     };

@@ -24,11 +24,15 @@ pub enum Type {
     Bool = 3,
     /// At most `size` bytes.
     Bytes = 4,
+    /// At most `size` elements of one other type.
+    List = 5,
+    /// Named fields, `size` of them, each of a type of its own.
+    Record = 6,
 }
 
 impl Type {
-    /// Every type.
-    pub const ALL: [Self; 5] = [Self::Int, Self::Float, Self::String, Self::Bool, Self::Bytes];
+    /// The types that are not made of others.
+    pub const FLAT: [Self; 5] = [Self::Int, Self::Float, Self::String, Self::Bool, Self::Bytes];
 
     /// The type that travels as `byte`.
     pub const fn from_wire(byte: u8) -> Option<Self> {
@@ -38,11 +42,13 @@ impl Type {
             2 => Some(Self::String),
             3 => Some(Self::Bool),
             4 => Some(Self::Bytes),
+            5 if cfg!(feature = "nested") => Some(Self::List),
+            6 if cfg!(feature = "nested") => Some(Self::Record),
             _ => None,
         }
     }
 
-    /// The word of the text form.
+    /// Its name: the word of the text form, where lists and records have none.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Int => "int",
@@ -50,19 +56,28 @@ impl Type {
             Self::String => "string",
             Self::Bool => "bool",
             Self::Bytes => "bytes",
+            Self::List => "list",
+            Self::Record => "record",
         }
     }
 
-    /// Whether a size n means exactly n elements; of the others it means at most n bytes.
+    /// Whether a size n means exactly n numbers or truth values.
     pub const fn is_fixed(self) -> bool {
         matches!(self, Self::Int | Self::Float | Self::Bool)
     }
 
-    /// Bytes of one element.
+    /// Whether it is made of other types. Without the feature `nested` none is, and what asks costs nothing.
+    #[inline]
+    pub const fn is_nested(self) -> bool {
+        cfg!(feature = "nested") && matches!(self, Self::List | Self::Record)
+    }
+
+    /// Bytes of one element; 0 for lists and records, whose elements differ.
     pub const fn width(self) -> usize {
         match self {
             Self::Int | Self::Float => 8,
             Self::String | Self::Bool | Self::Bytes => 1,
+            Self::List | Self::Record => 0,
         }
     }
 
@@ -84,6 +99,8 @@ pub struct Value<'a> {
     pub(crate) index: u8,
     pub(crate) kind: Type,
     pub(crate) size: u32,
+    /// What a list or record is made of, as in a signature.
+    pub(crate) inner: &'a [u8],
     pub(crate) bytes: &'a [u8],
 }
 
@@ -98,7 +115,8 @@ impl<'a> Value<'a> {
         self.size
     }
 
-    /// The value as it lies in memory: little-endian words, one byte per truth value, or the bytes of text.
+    /// The value as it lies in memory: little-endian words, one byte per truth value, the bytes of text, or a list or
+    /// record as in a block.
     pub const fn raw(&self) -> &'a [u8] {
         self.bytes
     }
@@ -125,6 +143,11 @@ impl<'a> Value<'a> {
             return None;
         }
         as_text(self.bytes)
+    }
+
+    /// The value as `T`: a number, a truth value, an array of them, a `&str` or a `&[u8]`.
+    pub fn read<T: FromValue<'a>>(&self) -> Result<T, Error> {
+        T::from_value(*self)
     }
 
     fn words(&self, kind: Type) -> impl Iterator<Item = [u8; 8]> + Clone + use<'a> {

@@ -19,6 +19,9 @@ pub struct Pending {
     pub(crate) deadline: Instant,
     /// The class of a call whose function has a lease, which is released when the call fails.
     pub(crate) leased: Option<Priority>,
+    /// The class that the call was made in.
+    #[cfg(feature = "details")]
+    pub(crate) class: Priority,
     /// The call has ended, and its release has yet to be sent in the stream.
     pub(crate) release_unsent: bool,
 }
@@ -69,7 +72,8 @@ impl<S: Storage> Requests<S> {
         slot: Slot,
         generation: Generation,
         deadline: Instant,
-        leased: Option<Priority>,
+        class: Priority,
+        leased: bool,
     ) -> Result<Option<CallId>, Error> {
         if self.in_flight >= self.pending.len() {
             return Err(Error::Full(Limit::Calls));
@@ -79,7 +83,16 @@ impl<S: Storage> Requests<S> {
             let Some(id) = self.next_id() else { return Ok(None) };
             let Some(place) = self.place(id) else { continue };
             if place.is_none() {
-                *place = Some(Pending { id, slot, generation, deadline, leased, release_unsent: false });
+                *place = Some(Pending {
+                    id,
+                    slot,
+                    generation,
+                    deadline,
+                    leased: leased.then_some(class),
+                    #[cfg(feature = "details")]
+                    class,
+                    release_unsent: false,
+                });
                 self.in_flight = self.in_flight.saturating_add(1);
                 self.earliest = self.earliest.min(deadline);
                 return Ok(Some(id));
@@ -113,6 +126,13 @@ impl<S: Storage> Requests<S> {
     pub(crate) fn interrupt(&mut self) -> Option<CallId> {
         let id = self.waiting().map(|pending| pending.id).min()?;
         self.close(id).map(|pending| pending.id)
+    }
+
+    /// A call that waits for its reply.
+    #[cfg(feature = "details")]
+    pub(crate) fn waiting_for(&self, id: CallId) -> Option<&Pending> {
+        let index = (id.0 as usize).checked_rem(self.pending.len())?;
+        self.pending.get(index)?.as_ref().filter(|pending| pending.id == id && !pending.release_unsent)
     }
 
     fn waiting(&self) -> impl Iterator<Item = &Pending> {
@@ -197,7 +217,7 @@ mod tests {
     }
 
     fn open(requests: &mut Requests<Boxed>, deadline: u64) -> Result<Option<CallId>, Error> {
-        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline), None)
+        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline), Priority::Low, false)
     }
 
     #[test]
@@ -226,7 +246,7 @@ mod tests {
     #[test]
     fn a_release_that_waits_for_room_keeps_its_slot_and_no_reply() {
         let mut requests = table(2);
-        let leased = requests.open(Slot(0), Generation(0), Instant::from_micros(10), Some(Priority::Low)).unwrap();
+        let leased = requests.open(Slot(0), Generation(0), Instant::from_micros(10), Priority::Low, true).unwrap();
         let pending = requests.expire(Instant::from_micros(10)).unwrap();
         requests.keep_unsent_release(pending);
         assert_eq!(requests.unsent_release(), Some((leased.unwrap(), Priority::Low)));

@@ -4,9 +4,18 @@
 //! which call them at a peer. Signatures and the places of variables are constants; a peer that has another version of the
 //! interface is told apart before anything is sent.
 
+#[cfg(feature = "details")]
+use core::fmt;
 use core::future::Future;
+#[cfg(feature = "details")]
+use core::ops::ControlFlow;
+use core::ops::DerefMut;
 
+#[cfg(feature = "details")]
+use crate::config::FAILURE_TEXT_BYTES;
 use crate::config::Priority;
+#[cfg(feature = "details")]
+use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::identity::Identity;
 use crate::distribution::parameters::ParametersView;
@@ -27,8 +36,8 @@ pub use heapless;
 pub mod parts {
     pub use crate::config::Priority;
     pub use crate::distribution::function::{Attributes, Signature, VariableSpec};
-    pub use crate::distribution::parameters::{FromValue, IntoValue, Parameters, ParametersView, Type};
-    pub use crate::distribution::value::{Target, Value};
+    pub use crate::distribution::parameters::{FromValue, IntoValue, Parameters, ParametersView, Slot, Type};
+    pub use crate::distribution::value::Value;
     pub use crate::error::{Error, ServiceError};
     pub use crate::services::heart::Renew;
     pub use crate::services::requests::CallId;
@@ -39,9 +48,23 @@ pub mod parts {
 /// Bytes beside those of its own variables that a client has for results which only the peer's version of a function knows.
 pub const ROOM: usize = 64;
 
+/// Variables that take more bytes than these are not put on a client's stack.
+pub const STACK_BYTES: usize = 32 * 1024;
+
+/// Bytes of the variables that a client puts on its stack.
+pub const fn on_stack(bytes: usize) -> usize {
+    if bytes > STACK_BYTES { 0 } else { bytes }
+}
+
 /// What a service is told about its call, on any port: an argument `call: &impl AnyCall` of a function is no variable, but
 /// this.
 pub trait AnyCall {
+    /// What the port knows an order by. `call: &impl AnyCall<Order = LeaseWatch>` tells it to a function that is written for one port;
+    /// a trait for any port says `type Order;` and `Order = Self::Order`.
+    type Order;
+
+    /// The order of a service with a lease: its unit ends it with `unit.end_order(&order)`, and a motor's loop looks at it.
+    fn order(&self) -> Option<Self::Order>;
     /// The caller.
     fn caller(&self) -> &Identity;
     /// The call's class.
@@ -52,7 +75,46 @@ pub trait AnyCall {
     fn wants_reply(&self) -> bool;
     /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
     fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended>;
+    /// What the service returns for this failure, whose text goes to the caller; on a port that cannot tell it, its code alone.
+    #[cfg(feature = "details")]
+    fn fail(&self, failure: Failure) -> ServiceError {
+        failure.error()
+    }
+    /// Tells the caller how far the call is, if it wants to know and the signature says `progress (…)`. Nothing on a port whose
+    /// services have run to their end before anything can be sent, as on boards. An error where the values do not fit the signature.
+    #[cfg(feature = "details")]
+    fn tell(&self, _progress: &ParametersView) -> Result<(), Error> {
+        Ok(())
+    }
+    /// Whether the caller has given the call up, waits no longer, or is gone; never on a port as above.
+    #[cfg(feature = "details")]
+    fn is_cancelled(&self) -> bool {
+        false
+    }
 }
+
+/// A call that tells `P` while it runs, and `F` when it fails: an argument `call: &impl TypedCall<Left, Blocked>` of a function
+/// declares both for its signature, as `progress (…)` and `fails (…)`. `()` stands for nothing. Every [`AnyCall`] is one.
+#[cfg(feature = "details")]
+pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
+    /// Tells the caller how far the call is, as [`tell`](AnyCall::tell) does.
+    fn progress(&self, values: &P) -> Result<(), Error> {
+        values.with_parameters(|values| self.tell(values))?
+    }
+
+    /// What the service returns for a failure with this code, whose text and values go to the caller. Text and bytes that are longer
+    /// than they are declared keep the values from it.
+    fn fail_with(&self, code: u16, text: &str, values: &F) -> ServiceError {
+        let mut failure = Failure::new(code, text);
+        if values.to_parameters(failure.values_mut()).is_err() {
+            failure = Failure::new(code, text);
+        }
+        self.fail(failure)
+    }
+}
+
+#[cfg(feature = "details")]
+impl<C: AnyCall, P: Variables, F: Variables> TypedCall<P, F> for C {}
 
 /// A service with the application's state.
 pub type Method<T, C> = dyn Fn(&mut T, &C, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
@@ -114,6 +176,65 @@ pub enum CallError {
     Call(#[from] Error),
 }
 
+/// Why a typed call has no results, with what its service has said of it.
+#[cfg(feature = "details")]
+#[derive(Clone, Debug, PartialEq)]
+pub struct Failed<F> {
+    /// What every caller learns.
+    pub error: CallError,
+    /// The reason in words; empty where there is none.
+    pub text: heapless::String<FAILURE_TEXT_BYTES>,
+    /// The values; `None` where the service sent none.
+    pub values: Option<F>,
+}
+
+#[cfg(feature = "details")]
+impl<F: Variables> Failed<F> {
+    /// Of an error, and what the service has said of it.
+    #[doc(hidden)]
+    pub fn new(error: Error, why: Option<&Failure>) -> Self {
+        let text = why.and_then(|why| heapless::String::try_from(why.text()).ok());
+        let values = why.filter(|why| !why.values().is_empty()).and_then(|why| F::from_parameters(why.values()).ok());
+        Self { error: error.into(), text: text.unwrap_or_default(), values }
+    }
+}
+
+#[cfg(feature = "details")]
+impl<F> From<CallError> for Failed<F> {
+    fn from(error: CallError) -> Self {
+        Self { error, text: heapless::String::new(), values: None }
+    }
+}
+
+#[cfg(feature = "details")]
+impl<F> From<Error> for Failed<F> {
+    fn from(error: Error) -> Self {
+        CallError::Call(error).into()
+    }
+}
+
+#[cfg(feature = "details")]
+impl<F> fmt::Display for Failed<F> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match (self.text.as_str(), &self.error) {
+            ("", error) => fmt::Display::fmt(error, f),
+            (text, CallError::Call(Error::Service(ServiceError::Failed(code)))) => write!(f, "{text} (code {code})"),
+            (text, error) => write!(f, "{error}: {text}"),
+        }
+    }
+}
+
+#[cfg(feature = "details")]
+impl<F: fmt::Debug> core::error::Error for Failed<F> {}
+
+/// Hands over what a call tells, as the struct that the interface declares for it.
+#[cfg(feature = "details")]
+#[doc(hidden)]
+pub fn hand<V: Variables>(told: &ParametersView, mut on_progress: impl FnMut(V) -> ControlFlow<()>) -> ControlFlow<()> {
+    // What cannot be read is of another version, which is no reason to end a motion.
+    V::from_parameters(told).map_or(ControlFlow::Continue(()), &mut on_progress)
+}
+
 impl From<CallError> for ServiceError {
     fn from(error: CallError) -> Self {
         match error {
@@ -127,6 +248,12 @@ impl From<CallError> for ServiceError {
 pub trait Caller {
     /// Shows what the peer has published under a name.
     fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R;
+
+    /// Room for variables of so many bytes, which are too many for the stack; `None` where there is no other memory.
+    #[doc(hidden)]
+    fn room(_bytes: usize) -> Option<impl DerefMut<Target = ParametersView> + Send> {
+        None::<&'static mut ParametersView>
+    }
 
     /// Calls without waiting.
     fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error>;
@@ -157,6 +284,35 @@ pub trait AwaitedCaller: Caller {
         function: &str,
         parameters: &mut ParametersView,
         options: &RequestOptions,
+    ) -> impl Future<Output = Result<(), Error>>;
+}
+
+/// A peer that a thread can wait for while it hears how far its call is.
+#[cfg(feature = "details")]
+pub trait WatchingCaller: BlockingCaller {
+    /// As [`block`](BlockingCaller::block), with what the call tells while it runs, and what the service has said of a failure in
+    /// `why`. `Break` gives the call up, which ends with [`Error::Cancelled`].
+    fn block_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error>;
+}
+
+/// A peer that a task can await while it hears how far its call is.
+#[cfg(feature = "details")]
+pub trait AwaitedWatcher: AwaitedCaller {
+    /// As [`block_watched`](WatchingCaller::block_watched).
+    fn call_watched(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
     ) -> impl Future<Output = Result<(), Error>>;
 }
 

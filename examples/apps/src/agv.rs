@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+use cara_core::Variables;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
 use cara_core::time::Duration;
@@ -12,14 +13,28 @@ pub const POS_INFO: &str = "pos_info(position: int[2]) -> (position: int[2])";
 pub const GO_TO: &str = "go_to(position: int[2])";
 /// Tells how full the battery is, in percent.
 pub const BATTERY: &str = "battery() -> (charge: float)";
-/// The stream of where the vehicle is, in units.
-pub const POSE: &str = "pose(position: float[2])";
-/// The stream of how full the battery is, in percent.
-pub const CHARGE: &str = "charge(percent: float)";
+/// The stream of where the vehicle is: [`Pose`].
+pub const POSE: &str = "pose";
+/// The stream of how full the battery is: [`Charge`].
+pub const CHARGE: &str = "charge";
 /// Stops at once, and keeps the vehicle from driving until [`RESET`].
 pub const STOP: &str = "stop()";
 /// Lets the vehicle drive again, unless its bumper is pressed.
 pub const RESET: &str = "reset()";
+
+/// Where the vehicle is.
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+pub struct Pose {
+    /// In units.
+    pub position: [f64; 2],
+}
+
+/// How full the battery is.
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+pub struct Charge {
+    /// Of a full one.
+    pub percent: f64,
+}
 
 /// How long [`GO_TO`] goes on after the manager's last renewal.
 pub const GO_TO_LEASE: Duration = Duration::from_millis(400);

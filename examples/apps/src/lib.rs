@@ -10,3 +10,4 @@ pub mod agv;
 pub mod depot;
 pub mod mechanic;
 pub mod telemetry;
+pub mod warehouse;

@@ -220,12 +220,15 @@ fn the_typed_listing_runs_and_is_short() {
     ends_well(&mut process);
     for said in [
         "pos_info() -> (position: int[2])",
-        "go_to(position: int[2])",
+        "go_to(position: int[2]) progress (left: int) fails (at: int[2])",
         "position [0, 0]",
         "driving to [1, 2]",
         "call_mechanic: a wheel squeaks",
         "a mechanic comes in 5 minutes",
-        "ended at [1, 2]",
+        " m to go",
+        "arrived at [4, 6]",
+        "the hall ends before (code 1): Some(Blocked { at: [4, 6] })",
+        "ended at [4, 6]",
     ] {
         process.seen(said, Duration::ZERO).unwrap();
     }

@@ -172,7 +172,7 @@ mod tests {
     fn node(name: &str, id: u32, connected: bool) -> NodeInfo {
         let (role, functions) = ("s_unit".into(), 0);
         let name = name.into();
-        let (address, version, epoch, connected_ms, limits) = (None, None, None, None, None);
+        let (address, version, epoch, connected_ms, limits, link) = (None, None, None, None, None, None);
         let (left_ms, left_reason, left_text) = (None, None, None);
         NodeInfo {
             name,
@@ -188,6 +188,7 @@ mod tests {
             left_reason,
             left_text,
             limits,
+            link,
             functions,
         }
     }

@@ -392,7 +392,7 @@ fn programs_that_misbehave_are_errors_of_their_own_calls() {
     // Nothing of what they started is left.
     until("no program is left", || children_of(&node).is_empty());
     let log = node.log();
-    for told in ["its time was up", "exit status: 7", "SIGSEGV", "no JSON", "something else than m: int", "more than"] {
+    for told in ["its time was up", "exit status: 7", "SIGSEGV", "no JSON", "m: expected int", "more than"] {
         assert!(log.contains(told), "`{told}` in\n{log}");
     }
 }

@@ -1,6 +1,5 @@
 //! Calls, what they hold, and round trips.
 
-use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::Error;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
@@ -8,8 +7,9 @@ use cara_core::time::Duration;
 use std::future::poll_fn;
 
 use super::reply::PendingReply;
-use crate::communication_system::{CommunicationSystem, outcomes};
+use crate::communication_system::{CommunicationSystem, outcomes, rooms};
 use crate::engine::CallsToAll;
+use crate::growing::CallParameters;
 use crate::heart::Hold;
 use crate::peer::Peer;
 
@@ -34,9 +34,10 @@ impl<T: Send + 'static> Peer<T> {
     pub fn request_async<'p>(
         &self,
         function: &str,
-        parameters: &'p mut ParametersView,
+        parameters: &'p mut (impl CallParameters + ?Sized),
         options: &RequestOptions,
     ) -> Result<PendingReply<'p, T>, Error> {
+        let parameters = self.with_room(function, parameters);
         let call = self.engine.pending_call(self.link()?, function, parameters, options)?;
         Ok(PendingReply::new(&self.engine, call, parameters))
     }
@@ -58,7 +59,7 @@ impl<T: Send + 'static> Peer<T> {
     pub async fn hold_async(
         &self,
         function: &str,
-        parameters: &mut ParametersView,
+        parameters: &mut (impl CallParameters + ?Sized),
         options: &RequestOptions,
     ) -> Result<Hold<T>, Error> {
         let mut reply = self.request_async(function, parameters, options)?;
@@ -107,14 +108,14 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// }
     /// # }
     /// ```
-    pub async fn request_all_async<const BYTES: usize>(
+    pub async fn request_all_async<P: CallParameters + Clone>(
         &self,
         function: &str,
-        parameters: &Parameters<BYTES>,
+        parameters: &P,
         options: &RequestOptions,
-    ) -> Vec<(Peer<T>, Result<Parameters<BYTES>, Error>)> {
+    ) -> Vec<(Peer<T>, Result<P, Error>)> {
         let peers = self.asked_with_all(function);
-        let mut results = vec![parameters.clone(); peers.len()];
+        let mut results = rooms(&peers, function, parameters);
         let mut calls = CallsToAll::new(self.engine(), peers.iter().map(Peer::link), function, options);
         poll_fn(|cx| calls.poll(cx, &mut results)).await;
         outcomes(peers, calls, results)

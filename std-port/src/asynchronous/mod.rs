@@ -16,6 +16,7 @@
 //! | anything else that events tell of | [`Handle::wait_until_async`] | nothing |
 //! | readers of the published list | [`CommunicationSystem::publish_and_wait_async`], [`Peer::publish_and_wait_async`] | the list is published all the same |
 //! | an event | [`Handle::events_async`], [`EventStream::next`] | no event is lost |
+//! | a value of a stream of a node | [`TheirStream::subscribe_async`], [`SampleStream::next`] | no value is lost; dropping the stream ends the subscription |
 //! | the application's state | [`Handle::with_state_async`] | the turn is given up |
 //! | the end of a lease | [`LeaseWatch::ended`], [`Call::lease_ended`] | nothing |
 //! | the start and the end of the unit | [`Handle::start_async`], [`Handle::stop_async`] | it starts, or stops, all the same |
@@ -54,6 +55,7 @@
 //! [`Peer::request`]: crate::Peer::request
 //! [`Peer::request_async`]: crate::Peer::request_async
 //! [`Peer::wait_for_function_async`]: crate::Peer::wait_for_function_async
+//! [`TheirStream::subscribe_async`]: crate::TheirStream::subscribe_async
 //! [`Unit::wait_for_manager_async`]: crate::Unit::wait_for_manager_async
 //! [`block_request`]: crate::Peer::block_request
 
@@ -61,10 +63,12 @@ mod calls;
 mod elsewhere;
 mod events;
 mod reply;
+mod samples;
 mod services;
 mod waiting;
 
 pub(crate) use events::EventQueue;
 pub use events::{EventStream, EventsLost};
 pub use reply::PendingReply;
+pub use samples::SampleStream;
 pub use services::CallGivenUp;

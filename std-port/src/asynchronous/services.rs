@@ -7,10 +7,11 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 
 use crate::engine::{GivenUp, Spawned};
+use crate::growing::HandlerParameters;
 use crate::handle::Handle;
 use crate::handler::{Call, IntoHandler, Run, RunOf, ServiceOptions};
 
@@ -80,10 +81,10 @@ impl<Form> fmt::Debug for Awaited<Form> {
     }
 }
 
-impl<T, F, W, const BYTES: usize> IntoHandler<T, Awaited<fn(Parameters<BYTES>) -> W>> for F
+impl<T, F, W, P: HandlerParameters> IntoHandler<T, Awaited<fn(P) -> W>> for F
 where
-    F: Fn(Parameters<BYTES>) -> W + Send + Sync + 'static,
-    W: Future<Output = Parameters<BYTES>> + Send + 'static,
+    F: Fn(P) -> W + Send + Sync + 'static,
+    W: Future<Output = P> + Send + 'static,
 {
     fn into_run(self) -> RunOf<T> {
         by_value(move |_, arguments| {
@@ -93,10 +94,10 @@ where
     }
 }
 
-impl<T, F, W, const BYTES: usize> IntoHandler<T, Awaited<fn(Call, Parameters<BYTES>) -> W>> for F
+impl<T, F, W, P: HandlerParameters> IntoHandler<T, Awaited<fn(Call, P) -> W>> for F
 where
-    F: Fn(Call, Parameters<BYTES>) -> W + Send + Sync + 'static,
-    W: Future<Output = Result<Parameters<BYTES>, ServiceError>> + Send + 'static,
+    F: Fn(Call, P) -> W + Send + Sync + 'static,
+    W: Future<Output = Result<P, ServiceError>> + Send + 'static,
 {
     fn into_run(self) -> RunOf<T> {
         by_value(self)
@@ -113,19 +114,17 @@ where
     }
 }
 
-fn by_value<T, W, const BYTES: usize>(
-    service: impl Fn(Call, Parameters<BYTES>) -> W + Send + Sync + 'static,
-) -> RunOf<T>
+fn by_value<T, W, P: HandlerParameters>(service: impl Fn(Call, P) -> W + Send + Sync + 'static) -> RunOf<T>
 where
-    W: Future<Output = Result<Parameters<BYTES>, ServiceError>> + Send + 'static,
+    W: Future<Output = Result<P, ServiceError>> + Send + 'static,
 {
     RunOf(Run::Task(Arc::new(move |call, mut view| {
-        let mut arguments = Parameters::<BYTES>::sized();
-        let copied = arguments.copy_from(&view);
-        let work = copied.map(|()| service(call, arguments));
+        let mut arguments = P::empty();
+        let filled = arguments.fill(&view);
+        let work = filled.map(|()| service(call, arguments));
         Box::pin(async move {
-            let results = work.map_err(|_| ServiceError::BadResults)?.await?;
-            view.copy_from(&results).map_err(|_| ServiceError::BadResults)?;
+            let mut results = work.map_err(|_| ServiceError::BadResults)?.await?;
+            view.copy_from(results.view_mut()).map_err(|_| ServiceError::BadResults)?;
             Ok(view)
         })
     })))

@@ -61,6 +61,17 @@ pub fn execute<T: Send + 'static>(
     execute_for(system, question, answer, &|_| true);
 }
 
+/// As [`execute`], and what takes long ends as well once `wanted` says `false`: a watch, values of streams, a call, and what
+/// a [`Question::Hold`] keeps moving.
+pub fn execute_while<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &Question,
+    answer: &mut dyn FnMut(Answer) -> ControlFlow<()>,
+    wanted: &dyn Fn() -> bool,
+) {
+    execute_for(system, question, answer, &|_| wanted());
+}
+
 /// As [`execute`]; a call or a watch ends as well when the client has gone.
 pub(super) fn execute_for<T: Send + 'static>(
     system: &CommunicationSystem<T>,
@@ -121,6 +132,7 @@ fn attempt<T: Send + 'static>(
         Question::Stream { node, name, interval_ms } => {
             stream::values(system, node, name.as_deref(), Duration::from_millis(*interval_ms), sink, wanted)
         }
+        Question::Streams { interval_ms } => stream::all(system, Duration::from_millis(*interval_ms), sink, wanted),
         Question::Counters { node } => counters(system, node.as_deref(), sink),
         Question::Metrics => metrics(system, sink),
         Question::Ping { node, count, pause_us, timeout_ms } => {

@@ -208,6 +208,7 @@ impl<'q> Asked<'q> {
             | Question::Counters { .. }
             | Question::Metrics
             | Question::Stream { .. }
+            | Question::Streams { .. }
             | Question::Ping { .. } => None,
         }
     }

@@ -3,7 +3,6 @@
 use std::task::Poll;
 use std::time::Instant;
 
-use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Cause, Error};
 use cara_core::services::access::Verb;
 use cara_core::services::heart::Renew;
@@ -11,10 +10,11 @@ use cara_core::time::Duration;
 
 use super::answering::{End, LOOK, Lives, Sink, pause, permit, send};
 use super::hold::{lease_of, unattended};
-use super::protocol::{Answer, Argument, CallQuestion, Failure};
+use super::protocol::{Answer, Argument, CallQuestion, Failure, Said};
 use super::{describe, select, values};
 use crate::communication_system::thread_waker;
 use crate::engine::{CallFuture, worth_waiting};
+use crate::growing::GrowingParameters;
 use crate::{CommunicationSystem, Delivery, Peer, RequestOptions, TheirFunction};
 
 /// Most bytes of parameters in flight when all nodes are called.
@@ -38,7 +38,7 @@ pub(super) fn call<T: Send + 'static>(
         return tell(&peer, question, &options, sink);
     }
     let started = Instant::now();
-    let outcome = await_one(&peer, question, &options, wanted)?.map(|(outcome, _)| outcome);
+    let outcome = await_one(&peer, question, &options, sink, wanted)?.map(|(outcome, _)| outcome);
     send(sink, called(&peer, outcome, started))
 }
 
@@ -67,7 +67,7 @@ pub(super) struct Outcome {
 /// A call that could be made.
 struct Prepared {
     function: TheirFunction,
-    parameters: Box<ParametersView>,
+    parameters: GrowingParameters,
 }
 
 pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
@@ -89,6 +89,8 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         renew: Renew::Never,
         take_over: question.take_over,
         operator: true,
+        // Also for why it fails.
+        progress: true,
     })
 }
 
@@ -98,6 +100,7 @@ pub(super) fn await_one<T: Send + 'static>(
     peer: &Peer<T>,
     question: &CallQuestion,
     options: &RequestOptions,
+    sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
 ) -> Result<Result<(Outcome, CallFuture<T>), Failure>, End> {
     let mut prepared = match prepare(peer, question) {
@@ -111,8 +114,15 @@ pub(super) fn await_one<T: Send + 'static>(
     let waker = thread_waker();
     let mut cx = std::task::Context::from_waker(&waker);
     loop {
+        if question.progress
+            && let Poll::Ready(Some(told)) = call.poll_progress(&cx)
+        {
+            let values = values::arguments(prepared.function.definition.signature().progress(), &told);
+            send(sink, Answer::Progress { node: peer.name().to_owned(), id: peer.id(), values })?;
+        }
         if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
-            return Ok(prepared.outcome(outcome).map(|outcome| (outcome, call)));
+            let failure = call.take_failure();
+            return Ok(prepared.outcome(outcome, failure.as_deref()).map(|outcome| (outcome, call)));
         }
         if !wanted() {
             return Err(End::Gone);
@@ -151,8 +161,10 @@ fn prepare<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion) -> Result
         return Err(Error::NotConnected.into());
     }
     let function = peer.function(&question.function).ok_or_else(|| unknown(peer, &question.function))?;
-    let results = values::bytes_of(function.definition.signature().results())?;
-    let parameters = values::parameters(&question.arguments, results).map_err(|failure| signed(failure, &function))?;
+    let signature = function.definition.signature();
+    let mut parameters =
+        values::parameters(&question.arguments, signature.arguments()).map_err(|failure| signed(failure, &function))?;
+    peer.with_room(&question.function, &mut parameters);
     Ok(Prepared { function, parameters })
 }
 
@@ -172,8 +184,20 @@ fn signed(failure: Failure, function: &TheirFunction) -> Failure {
 }
 
 impl Prepared {
-    fn outcome(&self, outcome: Result<(), Error>) -> Result<Outcome, Failure> {
-        outcome.map_err(|error| self.explain(error))?;
+    fn outcome(
+        &self,
+        outcome: Result<(), Error>,
+        failure: Option<&cara_core::distribution::failure::Failure>,
+    ) -> Result<Outcome, Failure> {
+        outcome.map_err(|error| match failure {
+            Some(failure) => {
+                let values = values::arguments(self.function.definition.signature().failure(), failure.values());
+                let text = format!("the service failed: {failure}");
+                let said = Some(Box::new(Said { reason: failure.text().to_owned(), values }));
+                Failure { said, text, ..Failure::from(error) }
+            }
+            None => self.explain(error),
+        })?;
         let results = values::arguments(self.function.definition.signature().results(), &self.parameters);
         Ok(Outcome { results, call: None })
     }
@@ -252,7 +276,8 @@ pub(super) fn block_all<T: Send + 'static>(
         while let Some((number, peer, started, prepared, call)) = under_way.get_mut(index) {
             if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
                 bytes -= size_of_val(&*prepared.parameters);
-                let (number, answer) = (*number, called(peer, prepared.outcome(outcome), *started));
+                let outcome = prepared.outcome(outcome, call.take_failure().as_deref());
+                let (number, answer) = (*number, called(peer, outcome, *started));
                 drop(under_way.swap_remove(index));
                 tell(number, answer)?;
             } else {
@@ -283,8 +308,7 @@ pub(super) fn bench<T: Send + 'static>(
     let peer = select::node(system, node)?;
     let prepared = prepare(&peer, question)?;
     let lease = lease_of(&peer, &question.function);
-    let mut parameters =
-        values::parameters(&question.arguments, values::bytes_of(prepared.function.definition.signature().results())?)?;
+    let mut parameters = prepared.parameters.clone();
     for number in 0..count {
         if number > 0 {
             pause(system, between)?;
@@ -298,7 +322,7 @@ pub(super) fn bench<T: Send + 'static>(
         }
         parameters.copy_from(&prepared.parameters)?;
         let started = Instant::now();
-        let outcome = peer.block_request_with(&question.function, &mut parameters, &options);
+        let outcome = peer.block_request_with(&question.function, &mut *parameters, &options);
         let took = started.elapsed();
         send(sink, sample(outcome.map(|()| took).map_err(|error| prepared.explain(error))))?;
     }

@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::io::{self, Write};
+use std::net::Shutdown;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -267,6 +268,11 @@ impl Client {
         &self.unit
     }
 
+    /// A handle with which another thread closes the connection while answers are waited for. What was held is released.
+    pub fn closer(&self) -> io::Result<Closer> {
+        self.lines.source().try_clone().map(Closer)
+    }
+
     /// Asks. Unread answers to the previous question are skipped, which for [`Question::Watch`] never ends: drop the
     /// client instead.
     ///
@@ -312,6 +318,18 @@ impl Client {
             Answer::Failed(failure) => Err(ControlError::Failed(failure)),
             answer => Ok(Some(answer)),
         }
+    }
+}
+
+/// Closes the connection of a [`Client`].
+#[derive(Debug)]
+pub struct Closer(UnixStream);
+
+impl Closer {
+    /// Closes it: answers that are waited for end with [`ControlError::Broken`].
+    pub fn close(&self) {
+        // One that has ended cannot be closed, which is what is wanted.
+        let _ = self.0.shutdown(Shutdown::Both);
     }
 }
 

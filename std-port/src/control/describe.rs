@@ -66,6 +66,7 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInf
         left_reason: left.map(|(_, reason)| name_of(&reason)),
         left_text: left.map(|(_, reason)| reason.to_string()),
         limits: limits.map(self::limits),
+        link: peer.link_info(),
         functions: peer.their_function_list().len(),
     }
 }

@@ -53,7 +53,7 @@ impl Failure {
 
     fn new(cause: Cause, error: &str, text: impl Display) -> Self {
         let (cause, error) = (cause_word(cause).to_owned(), error.to_owned());
-        Self { cause, error, kind: None, code: None, text: text.to_string() }
+        Self { cause, error, kind: None, code: None, said: None, text: text.to_string() }
     }
 
     /// The same with more to its text.

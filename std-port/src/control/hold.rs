@@ -36,7 +36,7 @@ pub(super) fn hold<T: Send + 'static>(
     let is_wanted = || lives(lease) && !system.is_stopped();
     let gone = || if lives(None) && !system.is_stopped() { unattended(&question.function).into() } else { End::Gone };
     let started = Instant::now();
-    let mut held = match await_one(&peer, question, &options, &is_wanted) {
+    let mut held = match await_one(&peer, question, &options, sink, &is_wanted) {
         Err(End::Gone) => return Err(gone()),
         Err(end) => return Err(end),
         Ok(Ok((outcome, call))) => {

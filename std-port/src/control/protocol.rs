@@ -93,6 +93,12 @@ pub enum Question {
         /// Least time between two values; 0 for as often as the node grants.
         interval_ms: u64,
     },
+    /// Values of all streams of all nodes as they come, also of nodes that join later, until the connection is closed: an
+    /// [`Answer::Value`] for each. Streams that the operator may not call are left out.
+    Streams {
+        /// Least time between two values of a stream; 0 for as often as the node grants.
+        interval_ms: u64,
+    },
     /// Counters of the unit, or of the link to one node. Answered by an [`Answer::Counters`] for each.
     Counters {
         /// The unit and all connected nodes if absent.
@@ -162,6 +168,9 @@ pub struct CallQuestion {
     /// Take over what another unit, or the program of this one, moves.
     #[serde(default)]
     pub take_over: bool,
+    /// Tell what it tells while it runs, as [`Answer::Progress`]; calls of one node only.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub progress: bool,
 }
 
 /// A variable with its value.
@@ -190,6 +199,10 @@ pub enum ArgumentValue {
     Bool(Vec<bool>),
     /// Bytes in hexadecimal, two digits each.
     Bytes(String),
+    /// A list, as [`json`](super::json) has it.
+    List(serde_json::Value),
+    /// A record, likewise.
+    Record(serde_json::Value),
 }
 
 /// A number with a fraction.
@@ -264,6 +277,15 @@ pub enum Answer {
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         functions: Vec<String>,
     },
+    /// What a call tells while it runs.
+    Progress {
+        /// The node's name.
+        node: String,
+        /// The node's id.
+        id: u32,
+        /// The values.
+        values: Vec<Argument>,
+    },
     /// What a call started has ended.
     Ended {
         /// Its lease ended there without being renewed, it was stopped, or the node was lost, as opposed to: it has finished.
@@ -331,7 +353,7 @@ pub enum Answer {
 }
 
 /// An error as text, and where its remedy lies.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
     /// `configuration`, `peer`, `resource` or `transport`.
     pub cause: String,
@@ -343,8 +365,21 @@ pub struct Failure {
     /// The code with which a service failed.
     #[serde(default)]
     pub code: Option<u16>,
+    /// What the service has said of it, beside its code.
+    #[serde(flatten)]
+    pub said: Option<Box<Said>>,
     /// What happened and what to do.
     pub text: String,
+}
+
+/// What a service has said of its failure.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Said {
+    /// Why, in words; empty where it gave values alone.
+    pub reason: String,
+    /// The values that its signature declares.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub values: Vec<Argument>,
 }
 
 /// A unit that is asked.
@@ -456,6 +491,9 @@ pub struct NodeInfo {
     pub left_text: Option<String>,
     /// What it takes, while it is connected.
     pub limits: Option<LimitsInfo>,
+    /// Its link, while it is connected; absent where the unit is older than this.
+    #[serde(default)]
+    pub link: Option<LinkInfo>,
     /// Functions that it has published to this unit.
     pub functions: usize,
 }
@@ -471,6 +509,19 @@ pub struct LimitsInfo {
     pub calls: u16,
     /// Least time between two requests to it.
     pub minimum_interval_us: u64,
+}
+
+/// How the link to a node is at this moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LinkInfo {
+    /// How long ago the node was last heard.
+    pub silent_ms: u64,
+    /// Calls of the unit that wait for its reply.
+    pub calls: usize,
+    /// Calls of the node that run or wait at the unit.
+    pub calls_here: u16,
+    /// Bytes for it that the network has not taken yet.
+    pub queued_bytes: usize,
 }
 
 /// A refusal.

@@ -1,6 +1,7 @@
 //! Values of a node's streams, for an operator. However many ask, the node's link has one subscription.
 
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::collections::HashMap;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use cara_core::distribution::function::Definition;
 use cara_core::error::Error;
@@ -10,7 +11,7 @@ use cara_core::time::Duration;
 use super::answering::{End, LOOK, Sink, permit, send};
 use super::protocol::Answer;
 use super::{select, values};
-use crate::{CommunicationSystem, Peer, Sample};
+use crate::{CommunicationSystem, Identity, Peer, Sample, Subscription};
 
 /// How long a node may take to tell the last value of a stream.
 const LAST_VALUE: Duration = Duration::from_millis(500);
@@ -38,6 +39,64 @@ pub(super) fn values<T: Send + 'static>(
         // Also while values come: a client that has gone is seen by a write at the latest.
         if !wanted() {
             return Err(End::Gone);
+        }
+    }
+}
+
+/// How often is looked for nodes that have joined, and for streams that they have published.
+const JOINED: std::time::Duration = std::time::Duration::from_millis(500);
+
+/// A stream that is told, with its subscription.
+struct Told<T: Send + 'static> {
+    peer: Peer<T>,
+    definition: Definition,
+    subscription: Subscription<T>,
+}
+
+/// Values of all streams of all nodes.
+pub(super) fn all<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    interval: Duration,
+    sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
+) -> Result<(), End> {
+    let mut told: HashMap<(Identity, String), Told<T>> = HashMap::new();
+    let mut looked: Option<Instant> = None;
+    while !system.is_stopped() {
+        if looked.is_none_or(|looked| looked.elapsed() >= JOINED) {
+            looked = Some(Instant::now());
+            subscribe(system, interval, &mut told);
+        }
+        for Told { peer, definition, subscription } in told.values_mut() {
+            // One that the node does not grant has no values; it is told when it is granted.
+            if let Ok(sample) = subscription.next(Duration::ZERO) {
+                send(sink, answer(peer, definition, Ok(&sample)))?;
+            }
+        }
+        if !wanted() {
+            return Err(End::Gone);
+        }
+        std::thread::sleep(LOOK);
+    }
+    Ok(())
+}
+
+/// Subscribes to streams that have come, and drops those that nodes have no longer.
+fn subscribe<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    interval: Duration,
+    told: &mut HashMap<(Identity, String), Told<T>>,
+) {
+    for peer in select::nodes(system).into_iter().filter(Peer::is_connected) {
+        let streams = peer.streams();
+        let has = |name: &str| streams.iter().any(|stream| stream.definition().name() == name);
+        told.retain(|(identity, name), _| identity != peer.identity() || has(name));
+        for stream in &streams {
+            let key = (peer.identity().clone(), stream.definition().name().to_owned());
+            if !told.contains_key(&key) && permit(system, &key.1, Verb::Call).is_ok() {
+                let (peer, definition) = (peer.clone(), stream.definition().clone());
+                told.insert(key, Told { peer, definition, subscription: stream.subscribe(interval) });
+            }
         }
     }
 }

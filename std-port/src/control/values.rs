@@ -1,41 +1,32 @@
-//! Values between the control socket's form and [`Parameters`].
+//! Values between the control socket's form and parameters.
 
 use cara_core::distribution::function::VariableSpecs;
-use cara_core::distribution::parameters::{Parameters, ParametersView, Type, Value};
-use cara_core::error::{Error, Limit};
+use cara_core::distribution::parameters::{ParametersView, Type, Value};
 
+use super::json;
 use super::protocol::{Argument, ArgumentValue, Failure, Number};
+use crate::growing::GrowingParameters;
 
-/// Sizes of parameters that are made, in bytes of names and values.
-const SMALL: usize = 8 * 1024;
-const MIDDLE: usize = 48 * 1024;
-const LARGE: usize = 320 * 1024;
-
-/// Parameters with the arguments, and with room for `results` more bytes.
-pub(super) fn parameters(arguments: &[Argument], results: usize) -> Result<Box<ParametersView>, Failure> {
-    let own = arguments.iter().try_fold(0_usize, |sum, argument| {
-        let bytes = argument.value.kind().bytes_of(argument.size)?;
-        sum.checked_add(bytes)?.checked_add(argument.name.len())
-    });
-    let bytes = own.and_then(|own| own.checked_add(results));
-    let mut made = bytes.and_then(sized).ok_or(Error::TooLarge { limit: LARGE as u32 })?;
+/// Parameters with the arguments of a function. What a list or record is made of, its function says.
+pub(super) fn parameters(arguments: &[Argument], specs: VariableSpecs<'_>) -> Result<GrowingParameters, Failure> {
+    let mut made = GrowingParameters::new();
     for argument in arguments {
-        put(&mut made, argument).map_err(|failure| failure.and(format_args!("the argument is '{}'", argument.name)))?;
+        put(&mut made, specs, argument)
+            .map_err(|failure| failure.and(format_args!("the argument is '{}'", argument.name)))?;
     }
     Ok(made)
 }
 
-fn sized(bytes: usize) -> Option<Box<ParametersView>> {
-    match bytes {
-        bytes if bytes <= SMALL => Some(Box::new(Parameters::<SMALL>::sized())),
-        bytes if bytes <= MIDDLE => Some(Box::new(Parameters::<MIDDLE>::sized())),
-        bytes if bytes <= LARGE => Some(Box::new(Parameters::<LARGE>::sized())),
-        _ => None,
-    }
-}
-
-fn put(parameters: &mut ParametersView, argument: &Argument) -> Result<(), Failure> {
+fn put(parameters: &mut GrowingParameters, specs: VariableSpecs<'_>, argument: &Argument) -> Result<(), Failure> {
     let name = &argument.name;
+    if let ArgumentValue::List(json) | ArgumentValue::Record(json) = &argument.value {
+        let Some(spec) = specs.named(name) else {
+            return Err(Failure::configuration("UnknownVariable", format!("the function has no argument '{name}'")));
+        };
+        json::check(spec, json).map_err(|bad| Failure::configuration("WrongType", bad.to_string()))?;
+        parameters.add_spec(spec)?;
+        return Ok(parameters.fit(|parameters| json::set_checked(parameters, spec, json))?);
+    }
     parameters.add(name, argument.value.kind(), argument.size)?;
     match &argument.value {
         ArgumentValue::Int(numbers) => parameters.set_value(name, &numbers[..])?,
@@ -46,6 +37,8 @@ fn put(parameters: &mut ParametersView, argument: &Argument) -> Result<(), Failu
         ArgumentValue::String(text) => parameters.set_value(name, text.as_str())?,
         ArgumentValue::Bool(values) => parameters.set_value(name, &values[..])?,
         ArgumentValue::Bytes(digits) => parameters.set_value(name, &bytes(digits)?[..])?,
+        // Those are set above.
+        ArgumentValue::List(_) | ArgumentValue::Record(_) => {}
     }
     Ok(())
 }
@@ -65,6 +58,8 @@ fn read(value: &Value<'_>) -> ArgumentValue {
         Type::Float => ArgumentValue::Float(value.floats().map(number).collect()),
         Type::String => ArgumentValue::String(value.text().unwrap_or_default().to_owned()),
         Type::Bool => ArgumentValue::Bool(value.bools().collect()),
+        Type::List => ArgumentValue::List(json::to_json(value)),
+        Type::Record => ArgumentValue::Record(json::to_json(value)),
         Type::Bytes => ArgumentValue::Bytes(value.raw().iter().map(|byte| format!("{byte:02x}")).collect()),
     }
 }
@@ -78,6 +73,8 @@ impl ArgumentValue {
             Self::String(_) => Type::String,
             Self::Bool(_) => Type::Bool,
             Self::Bytes(_) => Type::Bytes,
+            Self::List(_) => Type::List,
+            Self::Record(_) => Type::Record,
         }
     }
 }
@@ -121,14 +118,6 @@ fn bytes(digits: &str) -> Result<Vec<u8>, Failure> {
     pairs.iter().map(|[high, low]| Ok((nibble(high)? << 4 | nibble(low)?) as u8)).collect()
 }
 
-/// Bytes that the parameters of a call need beyond its arguments: those of every result.
-pub(super) fn bytes_of(specs: VariableSpecs<'_>) -> Result<usize, Error> {
-    let full = Error::Full(Limit::ParametersBytes);
-    specs.map(|spec| (spec.name.len(), spec.kind.bytes_of(spec.size))).try_fold(0_usize, |sum, (name, value)| {
-        value.and_then(|value| sum.checked_add(name)?.checked_add(value)).ok_or(full)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use cara_core::distribution::function::Definition;
@@ -148,6 +137,7 @@ mod tests {
             argument("s", 20, ArgumentValue::String("Fähre \"7\"\n".into())),
             argument("b", 2, ArgumentValue::Bool(vec![true, false])),
             argument("y", 8, ArgumentValue::Bytes("00ff7f".into())),
+            argument("l", 3, ArgumentValue::List(serde_json::json!([{ "a": 1 }, { "a": -2 }]))),
         ]
     }
 
@@ -155,9 +145,11 @@ mod tests {
     fn every_type_survives_both_ways_through_text() {
         let text = serde_json::to_string(&every_type()).unwrap();
         let read_back: Vec<Argument> = serde_json::from_str(&text).unwrap();
-        let parameters = parameters(&read_back, 0).unwrap();
-        let signature =
-            Definition::parse("f() -> (i: int[2], f: float[4], s: string[20], b: bool[2], y: bytes[8])").unwrap();
+        let signature = Definition::parse(
+            "f(l: {a: int}[..3]) -> (i: int[2], f: float[4], s: string[20], b: bool[2], y: bytes[8], l: {a: int}[..3])",
+        );
+        let signature = signature.unwrap();
+        let parameters = parameters(&read_back, signature.signature().arguments()).unwrap();
         let results = arguments(signature.signature().results(), &parameters);
         assert_eq!(results, every_type());
         assert_eq!(serde_json::to_string(&results).unwrap(), text);
@@ -165,7 +157,11 @@ mod tests {
 
     #[test]
     fn what_is_no_value_is_refused_with_its_name() {
-        let failure = |value, size| parameters(&[argument("v", size, value)], 0).unwrap_err();
+        let definition = Definition::parse("f(v: {x: int}[..2])").unwrap();
+        let specs = definition.signature().arguments();
+        let failure = |value, size| parameters(&[argument("v", size, value)], specs).unwrap_err();
+        let wrong = failure(ArgumentValue::List(serde_json::json!([{ "x": 1 }, { "x": "a" }])), 2);
+        assert!(wrong.error == "WrongType" && wrong.text.contains("v[1].x: expected int, got string"), "{wrong:?}");
         assert_eq!(failure(ArgumentValue::Bytes("0".into()), 4).error, "BadBytes");
         assert_eq!(failure(ArgumentValue::Bytes("0g".into()), 4).error, "BadBytes");
         assert_eq!(failure(ArgumentValue::Float(vec![Number::Other("nan".into())]), 1).error, "BadNumber");

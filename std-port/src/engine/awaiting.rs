@@ -3,7 +3,8 @@
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
-use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::distribution::failure::Failure;
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 #[cfg(feature = "async")]
 use cara_core::services::lease::LeaseEnd;
@@ -16,10 +17,11 @@ use super::alarms::Alarm;
 #[cfg(feature = "async")]
 use super::calling::PAUSE;
 use super::calling::worth_waiting;
-use super::link::{LinkCell, Waiter, Wake};
+use super::link::{LinkCell, Wake};
 use super::noting::Noted;
 use super::reader::Cause;
 use super::state_gate::Mark;
+use crate::growing::CallParameters;
 
 /// The pause before the next try for calls of many links, of which one or the other soon has room.
 const SHORT_PAUSE: Duration = Duration::from_millis(2);
@@ -41,12 +43,17 @@ impl<T: Send + 'static> Engine<T> {
         self.read_by(now, link, &mut state, Cause::NeedsPool);
         let sent = self.request_on(now, link, &mut state, function, parameters, options, true);
         match (sent, waker) {
-            (Ok(id), _) => state.waiters.push(Waiter { id, wake: Wake::Task(waker.cloned()), outcome: None }),
+            (Ok(id), _) => {
+                state.await_reply(id, Wake::Task(waker.cloned()));
+                if options.progress {
+                    state.details.watch(id);
+                }
+            }
             (Err(Error::Full(_)), Some(waker)) => state.await_change(waker),
             _ => {}
         }
         self.settle(link, state);
-        sent.map(|id| CallFuture { engine: self.clone(), link: link.clone(), id, has_succeeded: false })
+        sent.map(|id| CallFuture { engine: self.clone(), link: link.clone(), id, has_succeeded: false, failure: None })
     }
 
     /// Begins a call, which waits within its deadline until it can be sent; the error where it never can.
@@ -76,12 +83,14 @@ pub(crate) struct CallFuture<T: Send + 'static> {
     link: Arc<LinkCell>,
     id: CallId,
     has_succeeded: bool,
+    /// Why it failed, of one that is watched.
+    failure: Option<Box<Failure>>,
 }
 
 impl<T: Send + 'static> CallFuture<T> {
     /// One that has ended well: what it has started is given up with this.
     pub(crate) const fn held(engine: Arc<Engine<T>>, link: Arc<LinkCell>, id: CallId) -> Self {
-        Self { engine, link, id, has_succeeded: false }
+        Self { engine, link, id, has_succeeded: false, failure: None }
     }
 
     /// The call's id.
@@ -109,10 +118,31 @@ impl<T: Send + 'static> CallFuture<T> {
         engine.end_of_order(&link, id, timeout).await
     }
 
+    /// Why it failed, where its service has said so and it was watched.
+    pub(crate) const fn take_failure(&mut self) -> Option<Box<Failure>> {
+        self.failure.take()
+    }
+
+    /// The newest that it has told, if it is watched; `None` as well where it has ended. Otherwise the task of `cx` is woken.
+    pub(crate) fn poll_progress(&self, cx: &Context<'_>) -> Poll<Option<Box<ParametersView>>> {
+        let mut state = self.link.lock();
+        let told = state.details.take_progress(self.id);
+        let waiter = state.waiters.iter_mut().find(|waiter| waiter.id == self.id && waiter.outcome.is_none());
+        let Some(waiter) = waiter else { return Poll::Ready(None) };
+        if told.is_some() {
+            return Poll::Ready(told);
+        }
+        let earlier = std::mem::replace(&mut waiter.wake, Wake::Task(Some(cx.waker().clone())));
+        drop(state);
+        drop(earlier);
+        Poll::Pending
+    }
+
     /// Polls for the reply, which updates `parameters`.
     pub(crate) fn poll(&mut self, cx: &mut Context<'_>, parameters: &mut ParametersView) -> Poll<Result<(), Error>> {
         let mut state = self.link.lock();
         if let Some(outcome) = state.take_outcome(self.id) {
+            self.failure = state.details.unwatch(self.id);
             drop(state);
             let result = self.engine.read_outcome(&self.link, self.id, outcome, parameters);
             self.has_succeeded = result.is_ok();
@@ -132,6 +162,7 @@ impl<T: Send + 'static> CallFuture<T> {
 impl<T: Send + 'static> Drop for CallFuture<T> {
     fn drop(&mut self) {
         if !self.has_succeeded {
+            drop(self.link.lock().details.unwatch(self.id));
             self.engine.give_up_call(&self.link, self.id);
         }
     }
@@ -159,6 +190,17 @@ pub(crate) enum Step {
     InFlight,
     /// It is to be tried again then, or when its link has changed.
     Again(Instant),
+}
+
+/// What a call that is watched has told.
+#[cfg(feature = "async")]
+pub(crate) enum Told {
+    Progress(Box<ParametersView>),
+    Nothing,
+    /// It has not been sent, and is to be tried again then.
+    Again(Instant),
+    /// It has ended, or could not be sent.
+    Over(Option<Error>),
 }
 
 impl<T: Send + 'static> PendingCall<T> {
@@ -235,6 +277,36 @@ impl<T: Send + 'static> PendingCall<T> {
         matches!(self.stage, Stage::Sent(_))
     }
 
+    /// As [`CallFuture::poll_progress`], sending the call first where it has not been; an error where that failed.
+    #[cfg(feature = "async")]
+    pub(crate) fn advance_progress(&mut self, cx: &Context<'_>, parameters: &ParametersView) -> Told {
+        self.mark();
+        match self.send(parameters, Some(cx.waker()), PAUSE) {
+            Err(error) => {
+                self.over(Err(error));
+                Told::Over(Some(error))
+            }
+            Ok(Some(at)) => Told::Again(at),
+            Ok(None) => {
+                let Stage::Sent(call) = &self.stage else { return Told::Nothing };
+                match call.poll_progress(cx) {
+                    Poll::Ready(Some(told)) => Told::Progress(told),
+                    Poll::Ready(None) => Told::Over(None),
+                    Poll::Pending => Told::Nothing,
+                }
+            }
+        }
+    }
+
+    /// Why it failed, where its service has said so and it was watched.
+    #[cfg(feature = "async")]
+    pub(crate) const fn take_failure(&mut self) -> Option<Box<Failure>> {
+        match &mut self.stage {
+            Stage::Sent(call) => call.take_failure(),
+            Stage::Unsent { .. } => None,
+        }
+    }
+
     /// The call, once it has ended: what it has started is given up with it.
     #[cfg(feature = "async")]
     pub(crate) fn into_held(mut self) -> Option<CallFuture<T>> {
@@ -303,16 +375,12 @@ impl<T: Send + 'static> CallsToAll<T> {
     }
 
     /// Ready when all have ended. `parameters` lends those of a call, by its place.
-    pub(crate) fn poll<const BYTES: usize>(
-        &mut self,
-        cx: &mut Context<'_>,
-        parameters: &mut [Parameters<BYTES>],
-    ) -> Poll<()> {
+    pub(crate) fn poll(&mut self, cx: &mut Context<'_>, parameters: &mut [impl CallParameters]) -> Poll<()> {
         self.send_unsent(cx, parameters);
         // A reply that comes out of turn stays at its link, and wakes no task: the work is that of one look for each call.
         while let Some((call, parameters)) = self.calls.get_mut(self.front).zip(parameters.get_mut(self.front)) {
             if let Call::Goes(pending) = call {
-                match pending.poll(cx, parameters) {
+                match pending.poll(cx, parameters.view_mut()) {
                     Step::Over(result) => *call = Call::Ended(result),
                     Step::InFlight | Step::Again(_) => return Poll::Pending,
                 }
@@ -322,7 +390,7 @@ impl<T: Send + 'static> CallsToAll<T> {
         Poll::Ready(())
     }
 
-    fn send_unsent<const BYTES: usize>(&mut self, cx: &mut Context<'_>, parameters: &mut [Parameters<BYTES>]) {
+    fn send_unsent(&mut self, cx: &mut Context<'_>, parameters: &mut [impl CallParameters]) {
         if self.unsent == 0 {
             return;
         }
@@ -333,7 +401,7 @@ impl<T: Send + 'static> CallsToAll<T> {
             if pending.is_sent() {
                 continue;
             }
-            match pending.advance_after(cx, parameters, SHORT_PAUSE) {
+            match pending.advance_after(cx, parameters.view_mut(), SHORT_PAUSE) {
                 Step::Over(result) => *call = Call::Ended(result),
                 Step::InFlight => {}
                 Step::Again(at) => {

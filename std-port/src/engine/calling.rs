@@ -1,5 +1,6 @@
 //! Requests of this unit: blocking ones, whose caller reads its own reply, and those that do not wait.
 
+use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::thread;
 
@@ -14,8 +15,9 @@ use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use super::awaiting::CallFuture;
+use super::details::Watch;
 use super::inbound::OwnCall;
-use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
+use super::link::{LinkCell, LinkState, Outcome, Wake};
 use super::reader::{Cause, Token};
 use super::settling::RETRY;
 use super::worker::READ_BYTES;
@@ -68,14 +70,42 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
         let noted = self.noted(link, function, options);
+        // Nothing here would look at it.
+        let options = RequestOptions { progress: false, ..*options };
         let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
-            let begun = self.begin_call(link, function, parameters, options)?;
+            let begun = self.begin_call(link, function, parameters, &options)?;
             let id = begun.id;
-            self.await_reply(link, begun, parameters).map(|()| id)
+            self.await_reply(link, begun, parameters, None).map(|()| id)
         });
         if let Some(noted) = noted {
             noted.ended(result.map(drop));
+        }
+        result
+    }
+
+    /// The same for a call that is watched.
+    pub(crate) fn block_request_watched(
+        &self,
+        link: &Arc<LinkCell>,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        watch: &mut Watch<'_>,
+    ) -> Result<(), Error> {
+        let noted = self.noted(link, function, options);
+        let options = RequestOptions { progress: true, ..*options };
+        let result = self.services.state.waiting_for(link.id, || {
+            self.go_on_with_parked();
+            let mut begun = self.begin_call(link, function, parameters, &options)?;
+            let id = begun.id;
+            begun.state.details.watch(id);
+            let result = self.await_reply(link, begun, parameters, Some(&mut *watch));
+            watch.failure = link.lock().details.unwatch(id).filter(|_| result.is_err());
+            result
+        });
+        if let Some(noted) = noted {
+            noted.ended(result);
         }
         result
     }
@@ -111,7 +141,7 @@ impl<T: Send + 'static> Engine<T> {
             let sent = self.request_on(now, link, &mut state, function, parameters, &options, true);
             let (error, wait) = match sent {
                 Ok(id) => {
-                    state.waiters.push(Waiter { id, wake: Wake::Thread(thread::current()), outcome: None });
+                    state.await_reply(id, Wake::Thread(thread::current()));
                     return Ok(Begun { state, token, id, now, deadline });
                 }
                 Err(error) => (error, worth_waiting(&error, PAUSE).unwrap_or(Duration::MAX)),
@@ -138,6 +168,7 @@ impl<T: Send + 'static> Engine<T> {
         link: &Arc<LinkCell>,
         begun: Begun<'_>,
         parameters: &mut ParametersView,
+        mut watch: Option<&mut Watch<'_>>,
     ) -> Result<(), Error> {
         let Begun { mut state, mut token, id, now: asked, deadline } = begun;
         let mut now = asked;
@@ -153,10 +184,32 @@ impl<T: Send + 'static> Engine<T> {
                 self.leave(link, state, token);
                 return Err(Error::TimedOut);
             }
+            if let Some(watch) = watch.as_deref_mut() {
+                let told = state.details.take_progress(id).filter(|_| !watch.canceller.is_cancelled());
+                let is_told = told.is_some();
+                let mut flow = ControlFlow::Continue(());
+                if let Some(told) = told {
+                    // What it does may take its time: others read the link meanwhile.
+                    self.leave(link, state, token.take());
+                    flow = (watch.on_progress)(&told);
+                    state = link.lock();
+                    now = self.now();
+                }
+                if flow.is_break() || watch.canceller.is_cancelled() {
+                    self.cancel(now, link, &mut state, id);
+                    self.leave(link, state, token);
+                    return Err(Error::Cancelled);
+                }
+                if is_told {
+                    continue;
+                }
+            }
+            // A thread that reads is woken by what comes alone, so one that may be told to give up looks now and then.
+            let until = if watch.is_some() { deadline.min(now + PAUSE) } else { deadline };
             token = token.or_else(|| self.read_by(now, link, &mut state, Cause::Wants));
             if let Some(token) = token {
                 let mut own = OwnCall { id, parameters, result: None };
-                (state, now) = self.read_for_reply(link, state, &mut own, now, deadline);
+                (state, now) = self.read_for_reply(link, state, &mut own, now, until);
                 if let Some(result) = own.result {
                     if result.is_err() {
                         // The results may not fit: what the call started is not wanted then.
@@ -168,7 +221,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
             } else {
                 self.settle_at(now, link, state);
-                thread::park_timeout(deadline.since(now).into());
+                thread::park_timeout(until.since(now).into());
                 state = link.lock();
                 now = self.now();
             }
@@ -312,5 +365,7 @@ pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> 
 /// Whether a caller need not read on: the link has ended, or another thread has noted the end of its call.
 fn is_over(state: &LinkState, id: CallId) -> bool {
     let ended = state.session.deadline() == Instant::START || state.session.is_ended();
-    ended || state.waiters.iter().any(|waiter| waiter.id == id && waiter.outcome.is_some())
+    ended
+        || state.details.has_news(id)
+        || state.waiters.iter().any(|waiter| waiter.id == id && waiter.outcome.is_some())
 }

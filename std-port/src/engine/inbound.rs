@@ -99,10 +99,9 @@ impl<T: Send + 'static> Engine<T> {
         mut arguments: Option<&mut ParametersView>,
         own: Option<&mut OwnCall<'_>>,
     ) -> Step {
-        self.make_list_room(state);
         self.make_call_room(state);
         let functions = self.functions();
-        let LinkState { session, waiters, notices, woken, .. } = state;
+        let LinkState { session, waiters, notices, woken, details, .. } = state;
         let receipt = self.with_functions(now, &functions, link, session, |session, cx| {
             session.receive(cx, bytes, arguments.as_deref_mut())
         });
@@ -123,7 +122,18 @@ impl<T: Send + 'static> Engine<T> {
                     Some(arguments) => self.copy_emergency(&functions, link, begun, arguments),
                 }
             }
+            Some(Event::Progress(id, values)) => {
+                let block = session.progress_values(&values, bytes);
+                if block.is_ok_and(|block| details.told(id, &block)) {
+                    state.wake(id);
+                }
+            }
             Some(Event::Reply(id, outcome)) => {
+                if outcome.is_err()
+                    && let Some(failure) = session.failure(bytes)
+                {
+                    details.failed(id, failure);
+                }
                 let outcome = outcome.and_then(|results| session.results(&results, bytes));
                 if let Some(own) = own.filter(|own| own.id == id) {
                     own.result = Some(outcome.and_then(|block| block.read_into(own.parameters)));
@@ -135,11 +145,16 @@ impl<T: Send + 'static> Engine<T> {
             }
             Some(Event::Sample(sample)) => {
                 let block = session.results(&sample.values, bytes);
-                if block.is_ok_and(|block| self.sample_arrived(now, link, sample.age, &block)) {
+                if block.is_ok_and(|block| self.sample_arrived(now, link, sample.age, &block, woken)) {
                     notices.push(Event::Sample(sample));
                 }
             }
             Some(event) => {
+                if let Event::Failed(id, _) = event
+                    && let Some(failure) = session.failure(bytes)
+                {
+                    details.failed(id, failure);
+                }
                 if matches!(event, Event::ListChanged) && !link.is_introduced() {
                     // A node that counts has its place.
                     link.peer.get().into_iter().for_each(|peer| self.peers_mut().introduce(peer));

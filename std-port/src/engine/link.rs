@@ -19,6 +19,7 @@ use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 use core::net::SocketAddr;
 
+use super::details::Details;
 use super::notices::Notices;
 use super::peers::PeerCell;
 use super::reader::{ReadPolicy, Registration};
@@ -86,6 +87,7 @@ pub(crate) struct LinkState {
     pub(crate) notices: Notices,
     /// The state of what functions of the peer move, as far as it has told.
     pub(crate) actuators: BTreeMap<Slot, ActuatorState>,
+    pub(crate) details: Details,
 }
 
 /// Bytes that were read and cannot be looked at yet, because calls that wait leave no room for more.
@@ -144,6 +146,7 @@ impl LinkCell {
             retired: false,
             notices: Notices::default(),
             actuators: BTreeMap::new(),
+            details: Details::default(),
         };
         Self {
             unit_number,
@@ -240,6 +243,13 @@ impl LinkState {
         self.waiters.iter().any(|waiter| matches!(waiter.wake, Wake::Task(_)))
     }
 
+    /// A call has been sent, and its reply is waited for.
+    pub(crate) fn await_reply(&mut self, id: CallId, wake: Wake) {
+        // One at a time is usual, and a list begins with room for four.
+        self.waiters.reserve_exact(usize::from(self.waiters.is_empty()));
+        self.waiters.push(Waiter { id, wake, outcome: None });
+    }
+
     /// Notes how a call ended and wakes what waits for it.
     pub(crate) fn finish(&mut self, id: CallId, outcome: Outcome) {
         if let Some(waiter) = self.waiters.iter_mut().find(|waiter| waiter.id == id) {
@@ -294,6 +304,12 @@ impl LinkState {
         if let Some(index) = self.serving.iter().position(|(known, _)| *known == call) {
             self.woken.push(self.serving.swap_remove(index).1);
         }
+    }
+
+    /// The caller of a call that a task runs has given it up: the task looks again.
+    #[cfg(feature = "async")]
+    pub(crate) fn wake_serving(&mut self, call: Ticket) {
+        self.woken.extend(self.serving.iter().filter(|(known, _)| *known == call).map(|(_, waker)| waker.clone()));
     }
 
     /// The link has ended: whatever waits for that, or for anything else of it, looks again.

@@ -96,6 +96,8 @@ impl<T: Send + 'static> Engine<T> {
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
         let mut session = Session::new(now, config, self.keys().cipher(), storage);
+        let capacities = &self.links.capacities;
+        session.let_list_grow(capacities.their_functions, capacities.their_signature_bytes);
         if let Some(span) = self.key_watch.renews_every() {
             session.renew_every(span);
         }

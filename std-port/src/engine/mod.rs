@@ -26,6 +26,7 @@ mod alarms;
 mod awaiting;
 mod calling;
 mod clock_thread;
+pub(crate) mod details;
 mod driving;
 mod events;
 mod inbound;
@@ -68,7 +69,7 @@ pub(crate) use accounts::{Group, Reading};
 pub(crate) use alarms::Alarm;
 pub(crate) use awaiting::{CallFuture, CallsToAll};
 #[cfg(feature = "async")]
-pub(crate) use awaiting::{PendingCall, Step};
+pub(crate) use awaiting::{PendingCall, Step, Told as CallTold};
 #[cfg(feature = "control")]
 pub(crate) use calling::worth_waiting;
 #[cfg(feature = "async")]
@@ -78,7 +79,7 @@ pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
 #[cfg(feature = "async")]
 pub(crate) use tasks::{GivenUp, Spawned};
-pub(crate) use worker::{arena, arena_bytes};
+pub(crate) use worker::{arena, arena_bytes, room};
 
 use std::path::PathBuf;
 use std::sync::atomic::{self, AtomicU64};
@@ -389,7 +390,10 @@ impl<T: Send + 'static> Engine<T> {
         // No clock sounds them any more, and the task of one may hold the unit.
         self.alarms.clear();
         #[cfg(feature = "async")]
-        self.events.end_queues();
+        {
+            self.events.end_queues();
+            self.end_streams();
+        }
     }
 
     /// Runs `act` with the application's state, when its turn comes.

@@ -11,6 +11,7 @@ use cara_core::services::session::Call;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
+use super::details;
 use super::link::{LinkCell, LinkState};
 use super::state_gate::{Entered, Turn};
 use super::worker::{Worker, arena};
@@ -192,7 +193,8 @@ impl<T: Send + 'static> Engine<T> {
         self.go_on_with_parked();
         let now = self.now();
         // A command that waited for its turn may no longer be wanted.
-        let is_over = now >= call.deadline || !self.is_wanted(now, &call);
+        let is_cancelled = link.lock().session.is_cancelled(call.ticket);
+        let is_over = now >= call.deadline || is_cancelled || !self.is_wanted(now, &call);
         let result = if is_over { Err(Error::Expired) } else { turn.map(drop) };
         let own = std::mem::replace(&mut worker.arguments, arguments);
         let state = match result {
@@ -223,7 +225,7 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn run(&self, link: &LinkCell, begun: Begun, arguments: &mut ParametersView) -> Ran {
+    fn run(&self, link: &Arc<LinkCell>, begun: Begun, arguments: &mut ParametersView) -> Ran {
         let Begun { call, turn } = begun;
         let (run, told) = match self.prepare(link, &call) {
             Ok(prepared) => prepared,
@@ -259,7 +261,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// How a call is run, and what its handler is told.
-    fn prepare(&self, link: &LinkCell, call: &Call) -> Result<(Run<T>, handler::Call), Error> {
+    fn prepare(&self, link: &Arc<LinkCell>, call: &Call) -> Result<(Run<T>, handler::Call), Error> {
         let peer = link.peer.get().ok_or(Error::NotConnected)?;
         let (run, actuator) = {
             let functions = self.functions();
@@ -282,6 +284,7 @@ impl<T: Send + 'static> Engine<T> {
             deadline: call.deadline,
             wants_reply: call.wants_reply,
             lease: moved.map(|(actuator, order)| LeaseWatch::of(order, actuator)),
+            serving: self.serving(link, call.ticket),
             #[cfg(feature = "async")]
             given_up: None,
         };
@@ -298,12 +301,15 @@ impl<T: Send + 'static> Engine<T> {
         result: Result<(), Error>,
         results: &ParametersView,
     ) -> Locked<'l, LinkState> {
+        let failure = state.details.take_failure(call.ticket);
         loop {
             let answer = match result {
                 Ok(()) => Ok(results),
                 Err(error) => Err(error),
             };
-            let kept = self.with_at(now, link, &mut state, |session, cx| session.answer(cx, call.ticket, answer));
+            let kept = self.with_at(now, link, &mut state, |session, cx| {
+                details::answer(session, cx, call.ticket, answer, failure.as_deref())
+            });
             if kept.is_ok() {
                 return state;
             }

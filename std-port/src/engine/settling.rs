@@ -31,6 +31,10 @@ impl<T: Send + 'static> Engine<T> {
             self.poll_session(link, state);
             deadline = state.session.deadline();
         }
+        if state.details.has_progress_to_send() {
+            self.tell_again(now, link, state);
+            deadline = state.session.deadline();
+        }
         self.set_timer(now, deadline, link, state);
         self.set_interest(link, state);
         let woken = std::mem::take(&mut state.woken);
@@ -47,6 +51,8 @@ impl<T: Send + 'static> Engine<T> {
             let event = self.with(link, state, |session, cx| session.poll(cx));
             match event {
                 None => return,
+                #[cfg(feature = "async")]
+                Some(Event::Cancelled(ticket)) => state.wake_serving(ticket),
                 Some(Event::Reply(id, outcome)) => {
                     state.finish(id, outcome.map(|_| Default::default()));
                 }

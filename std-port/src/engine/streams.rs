@@ -5,6 +5,7 @@
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
+use std::task::Waker;
 
 use cara_core::distribution::function_list::Slot;
 use cara_core::error::Error;
@@ -69,6 +70,8 @@ struct WatchedState {
     passed: u64,
     refused: Option<Error>,
     relays: Vec<Weak<OwnStream>>,
+    /// Of the tasks that wait, each with the number of its handle.
+    tasks: Vec<(u64, Waker)>,
 }
 
 /// A value as it came.
@@ -120,8 +123,32 @@ impl Watched {
         state.relays.push(Arc::downgrade(own));
     }
 
-    /// A value has come; whether it is to go on.
-    fn receive(&self, now: Instant, age: Duration, block: &ReplyBlock<'_>) -> bool {
+    /// As [`wait`](Self::wait) for a task, which is woken where there is nothing yet.
+    #[cfg(feature = "async")]
+    pub(crate) fn poll(&self, id: u64, seen: u64, waker: &Waker) -> Option<Result<(Received, u64), Error>> {
+        let mut state = lock(&self.state);
+        match (&state.newest, state.refused) {
+            (_, Some(error)) => return Some(Err(error)),
+            (Some(newest), None) if state.count > seen => return Some(Ok((newest.clone(), state.count))),
+            _ => {}
+        }
+        let earlier =
+            state.tasks.iter().position(|(known, _)| *known == id).map(|index| state.tasks.swap_remove(index));
+        state.tasks.push((id, waker.clone()));
+        // A waker that is dropped may end a task, whose subscription is dropped then.
+        drop(state);
+        drop(earlier);
+        None
+    }
+
+    /// The tasks that wait look again; called without a lock.
+    fn wake_tasks(&self) {
+        let tasks = std::mem::take(&mut lock(&self.state).tasks);
+        tasks.into_iter().for_each(|(_, task)| task.wake());
+    }
+
+    /// A value has come; whether it is to go on. The tasks that wait for it are put into `woken`.
+    fn receive(&self, now: Instant, age: Duration, block: &ReplyBlock<'_>, woken: &mut Vec<Waker>) -> bool {
         let mut state = lock(&self.state);
         let signature = block.signature();
         let known = state.newest.as_ref().map(|newest| &newest.signature);
@@ -132,13 +159,16 @@ impl Watched {
         state.newest = Some(Received { signature, block: block.bytes().into(), age, arrived: now });
         state.count += 1;
         state.refused = None;
+        woken.extend(state.tasks.drain(..).map(|(_, task)| task));
         self.changed.notify_all();
         !state.relays.is_empty()
     }
 
+    /// Called without a lock.
     fn was_answered(&self, answer: Result<GrantedStream, Error>) {
         lock(&self.state).refused = answer.err();
         self.changed.notify_all();
+        self.wake_tasks();
     }
 
     fn interval(&self) -> Option<Duration> {
@@ -157,7 +187,11 @@ impl Watched {
     fn want_no_more(&self, id: u64) -> bool {
         let mut state = lock(&self.state);
         state.wants.retain(|(known, _)| *known != id);
-        state.wants.is_empty()
+        let (is_last, task) = (state.wants.is_empty(), state.tasks.iter().position(|(known, _)| *known == id));
+        let task = task.map(|index| state.tasks.swap_remove(index));
+        drop(state);
+        drop(task);
+        is_last
     }
 
     /// Passes the newest value on; whether there was anything to pass on to.
@@ -239,10 +273,10 @@ impl<T: Send + 'static> Engine<T> {
                 Ok(())
             }
         });
+        self.settle(link, state);
         if let Err(error @ Error::UnknownFunction) = told {
             watched.was_answered(Err(error));
         }
-        self.settle(link, state);
     }
 
     /// A node has told its list: what is read of it is subscribed to.
@@ -252,10 +286,27 @@ impl<T: Send + 'static> Engine<T> {
         all.iter().for_each(|watched| self.tell_on(link, peer, watched));
     }
 
-    /// Whether a value is to go on to a stream of this unit.
-    pub(super) fn sample_arrived(&self, now: Instant, link: &LinkCell, age: Duration, block: &ReplyBlock<'_>) -> bool {
+    /// Whether a value is to go on to a stream of this unit. The tasks that wait for it are put into `woken`.
+    pub(super) fn sample_arrived(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        age: Duration,
+        block: &ReplyBlock<'_>,
+        woken: &mut Vec<Waker>,
+    ) -> bool {
         let watched = link.peer.get().and_then(|peer| peer.watched(block.signature().name()));
-        watched.is_some_and(|watched| watched.receive(now, age, block))
+        watched.is_some_and(|watched| watched.receive(now, age, block, woken))
+    }
+
+    /// The unit has been stopped: tasks that wait for values look again.
+    #[cfg(feature = "async")]
+    pub(super) fn end_streams(&self) {
+        let peers: Vec<_> = self.peers().all().cloned().collect();
+        for peer in peers {
+            let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
+            all.iter().for_each(|watched| watched.wake_tasks());
+        }
     }
 
     pub(super) fn subscription_answered(&self, link: &LinkCell, slot: Slot, answer: Result<GrantedStream, Error>) {

@@ -1,7 +1,7 @@
 //! The tables of a link: short ones when it opens, longer ones when its peer or this unit needs them, up to the
 //! unit's capacities. A manager of a thousand nodes pays for what its nodes offer, not for the most that they could.
 
-use cara_core::config::{LINK_BUFFER_BYTES, SIGNATURE_BYTES};
+use cara_core::config::LINK_BUFFER_BYTES;
 use cara_core::distribution::connection_handler::NodeStorage;
 use cara_core::distribution::function_list::Entry;
 use cara_core::distribution::parameters::ParametersView;
@@ -26,19 +26,12 @@ const FINDINGS: usize = 32;
 const FIRST_CALLS: usize = 4;
 /// Functions of a peer that a link begins with room for.
 const FIRST_FUNCTIONS: usize = 4;
-/// Bytes of their signatures: those of the longest.
-const FIRST_SIGNATURES: usize = SIGNATURE_BYTES;
-/// The room for signatures grows by so many bytes, beyond which there is always some for the longest.
-const SIGNATURES_STEP: usize = 64;
+/// Bytes of signatures of a peer that a link begins with room for.
+const FIRST_SIGNATURES: usize = 512;
 
 /// Slots for calls to begin with: at most [`FIRST_CALLS`], and so many that `most` is a multiple of them.
 fn first_calls(most: usize) -> usize {
     (1..=FIRST_CALLS).rev().find(|slots| most.checked_rem(*slots) == Some(0)).unwrap_or(most).min(most)
-}
-
-/// Half as much again, at least what is `needed`, and not more than `most`; as it is where that much is there.
-fn longer(length: usize, needed: usize, most: usize) -> usize {
-    if length >= needed { length } else { length.saturating_add(length / 2).max(needed).min(most) }
 }
 
 /// The slices of a unit that may be connected to so many nodes, over so many links.
@@ -132,23 +125,6 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Makes room for one more function of the peer, which may be what comes next.
-    pub(super) fn make_list_room(&self, state: &mut LinkState) {
-        let (entries, bytes) = state.session.their_function_list().room();
-        if entries > 0 && bytes >= SIGNATURE_BYTES {
-            return;
-        }
-        let Capacities { their_functions, their_signature_bytes, .. } = self.links.capacities;
-        let (all_entries, all_bytes) = state.session.their_function_list().capacity();
-        let (used_entries, used_bytes) = (all_entries.saturating_sub(entries), all_bytes.saturating_sub(bytes));
-        let entries = longer(all_entries, used_entries.saturating_add(1), their_functions);
-        let needed = used_bytes.saturating_add(SIGNATURE_BYTES).next_multiple_of(SIGNATURES_STEP);
-        let bytes = needed.min(their_signature_bytes).max(all_bytes);
-        if (entries, bytes) != (all_entries, all_bytes) {
-            drop(state.session.lend_functions((filled_with(entries, Entry::empty), filled(bytes, 0))));
-        }
-    }
-
     /// Makes room for all functions of the unit's own list, which may be published next; whether there was too little.
     pub(super) fn make_publication_room(&self, state: &mut LinkState) -> bool {
         let functions = self.own_functions();
@@ -167,8 +143,5 @@ mod tests {
     #[test]
     fn tables_begin_short_and_reach_their_capacity() {
         assert_eq!([64, 20, 7, 1, 0, 11].map(first_calls), [4, 4, 1, 1, 0, 1]);
-        let lengths = [(8, 9, 48), (40, 41, 48), (8, 100, 200), (0, 1, 48), (8, 8, 48), (48, 49, 48), (0, 1, 0)];
-        let longer = lengths.map(|(length, needed, most)| longer(length, needed, most));
-        assert_eq!(longer, [12, 48, 100, 1, 8, 48, 0]);
     }
 }

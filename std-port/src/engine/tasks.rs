@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, Wake, Waker};
 
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::Call;
@@ -15,6 +16,7 @@ use cara_core::services::session::Call;
 use super::Engine;
 use super::alarms::Alarm;
 use super::calling::PAUSE;
+use super::details;
 use super::link::LinkCell;
 use crate::executor::Executor;
 use crate::handler::{self, Begin, Work};
@@ -82,7 +84,8 @@ impl<T: Send + 'static> Engine<T> {
         };
         let alarm = Alarm::new(engine.clone());
         let link = link.clone();
-        let task = Task { engine, link, call, work, result, given_up, to_its_end, lease, alarm, answered: false };
+        let (failure, answered) = (None, false);
+        let task = Task { engine, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered };
         self.spawn(Box::pin(task));
     }
 
@@ -117,6 +120,8 @@ struct Task<T: Send + 'static> {
     to_its_end: bool,
     lease: LeaseEnded,
     alarm: Alarm<T>,
+    /// What it has said of its failure.
+    failure: Option<Box<Failure>>,
     answered: bool,
 }
 
@@ -125,7 +130,7 @@ impl<T: Send + 'static> Task<T> {
     /// task is woken when that changes.
     fn is_given_up(&mut self, cx: &mut Context<'_>) -> bool {
         let mut state = self.link.lock();
-        let is_live = state.session.is_live();
+        let is_live = state.session.is_live() && !state.session.is_cancelled(self.call.ticket);
         if is_live {
             state.await_end(self.call.ticket, cx.waker());
         }
@@ -170,7 +175,12 @@ impl<T: Send + 'static> Task<T> {
         let (now, ticket) = (engine.now(), self.call.ticket);
         let answer = self.result.as_deref().map_err(|error| *error);
         let mut state = link.lock();
-        let kept = engine.with_at(now, link, &mut state, |session, cx| session.answer(cx, ticket, answer));
+        if self.failure.is_none() {
+            self.failure = state.details.take_failure(ticket);
+        }
+        let failure = self.failure.as_deref();
+        let kept =
+            engine.with_at(now, link, &mut state, |session, cx| details::answer(session, cx, ticket, answer, failure));
         match waker.filter(|_| kept.is_err() && now < self.call.deadline) {
             Some(waker) => {
                 state.await_change(waker);

@@ -42,10 +42,21 @@ pub(crate) const fn arena_bytes(message: usize) -> usize {
 }
 
 pub(crate) fn arena(message: usize) -> Box<ParametersView> {
-    match message {
-        0..=2048 => Box::new(Parameters::<{ arena_bytes(0) }>::sized()),
-        2049..=20_000 => Box::new(Parameters::<{ arena_bytes(20_000) }>::sized()),
-        20_001..=40_000 => Box::new(Parameters::<{ arena_bytes(40_000) }>::sized()),
-        _ => Box::new(Parameters::<{ arena_bytes(usize::MAX) }>::sized()),
+    room(arena_bytes(message))
+}
+
+/// Parameters with room for so many bytes, or the most that there are.
+pub(crate) fn room(bytes: usize) -> Box<ParametersView> {
+    const SMALL: usize = arena_bytes(0);
+    const MIDDLE: usize = arena_bytes(20_000);
+    const LARGE: usize = arena_bytes(40_000);
+    if bytes <= SMALL {
+        Box::new(Parameters::<SMALL>::sized())
+    } else if bytes <= MIDDLE {
+        Box::new(Parameters::<MIDDLE>::sized())
+    } else if bytes <= LARGE {
+        Box::new(Parameters::<LARGE>::sized())
+    } else {
+        Box::new(Parameters::<{ arena_bytes(usize::MAX) }>::sized())
     }
 }

@@ -176,6 +176,7 @@ pub(crate) fn call(node: Option<&str>, function: &str, arguments: Vec<Argument>)
         priority: None,
         best_effort: false,
         take_over: false,
+        progress: false,
     }
 }
 

@@ -208,11 +208,14 @@ fn a_handler_changes_nothing_for_an_order_that_has_ended() {
 fn what_cannot_stand_still_at_once_slows_down_and_begins_nothing_meanwhile() {
     let crane = Crane::new();
     let drive = crane.drive.clone().ramp(LEASE.divided_by(20));
+    assert_eq!(drive.watch().left(), None);
     assert_eq!(crane.ask(0, "go"), Ok(()));
     assert_eq!(drive.watch().stage(), Stage::Live);
+    let left = drive.watch().left();
+    assert!(left.is_some_and(|left| left > LEASE.divided_by(2) && left <= LEASE), "{left:?}");
     crane.peer(0).release("go").unwrap();
     until("it slows down", || drive.watch().stage() == Stage::Stopping);
     until("the hook ran", || crane.hooks() == 1);
     assert_eq!(crane.ask(0, "dock"), Err(Error::Busy), "the ramp comes first");
-    assert_eq!(drive.watch().stage(), Stage::Stopping);
+    assert_eq!((drive.watch().stage(), drive.watch().left()), (Stage::Stopping, None));
 }

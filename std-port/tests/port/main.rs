@@ -10,6 +10,8 @@ mod actuators;
 mod asynchronous;
 mod callbacks;
 mod constraints;
+mod details;
+mod growing;
 mod handlers;
 mod hearts;
 mod in_use;

@@ -1,12 +1,14 @@
 //! Typed services between real units.
 
+use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use cara_std::typed::BAD_ARGUMENT;
+use cara_core::distribution::block::{self, SliceWriter};
+use cara_std::typed::{BAD_ARGUMENT, Part};
 use cara_std::{
-    AnyCall, CallError, Definition, Duration, Error, Parameters, Priority, Renew, RequestOptions, ServiceError,
-    ServiceOptions, Variables, interface,
+    AnyCall, CallError, Constraints, Definition, Duration, Error, Explained, Failure, LeaseWatch, LinkCounter,
+    Parameters, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, TypedCall, Variables, interface,
 };
 
 use crate::support::{fleet, meet, system, unit, until};
@@ -16,6 +18,102 @@ enum Mode {
     #[default]
     Idle,
     Driving,
+}
+
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Left {
+    pub(crate) left: u32,
+}
+
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Blocked {
+    pub(crate) at: [i32; 2],
+}
+
+/// What tells how far it is, and does not arrive from 11.
+#[interface]
+pub(crate) trait Dock {
+    fn dock(&mut self, call: &impl TypedCall<Left, Blocked>, from: u32) -> Result<(), ServiceError>;
+}
+
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Metres {
+    left: f32,
+}
+
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Place {
+    at: [i32; 3],
+}
+
+/// Other versions of it: one tells something else, one fails with something else.
+#[interface]
+pub(crate) trait NewerDock {
+    fn dock(&mut self, call: &impl TypedCall<Metres, Blocked>, from: u32) -> Result<(), ServiceError>;
+}
+
+#[interface]
+pub(crate) trait NewestDock {
+    fn dock(&mut self, call: &impl TypedCall<Left, Place>, from: u32) -> Result<(), ServiceError>;
+}
+
+/// How many of its calls have seen that they are given up.
+#[derive(Default)]
+pub(crate) struct Gate {
+    pub(crate) given_up: u32,
+}
+
+impl Dock for Gate {
+    fn dock(&mut self, call: &impl TypedCall<Left, Blocked>, from: u32) -> Result<(), ServiceError> {
+        for left in (0..from).rev() {
+            call.progress(&Left { left })?;
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            if call.is_cancelled() {
+                self.given_up += 1;
+                return Err(ServiceError::Failed(1));
+            }
+            if from == 11 && left < 9 {
+                return Err(call.fail_with(7, "the way is blocked", &Blocked { at: [3, -4] }));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn progress_and_failures_come_typed() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(Gate::default()).build().unwrap();
+    agv.my_function_list().serve(DockServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let shown = peer.function("dock").unwrap().definition.to_string();
+    assert_eq!(shown, "dock(from: int) progress (left: int) fails (at: int[2])");
+    let client = DockClient::at(&peer);
+    let mut told = Vec::new();
+    let outcome = client.watch_dock(3, |Left { left }| {
+        told.push(left);
+        ControlFlow::Continue(())
+    });
+    assert_eq!(outcome, Ok(()));
+    // Which of them are told, depends on time; the first one is sent at once, and none comes twice.
+    assert!(told.first() == Some(&2) && told.is_sorted_by(|one, next| one > next), "{told:?}");
+    let failed = client.watch_dock(11, |_| ControlFlow::Continue(())).unwrap_err();
+    assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(7))));
+    assert_eq!((failed.text.as_str(), failed.values), ("the way is blocked", Some(Blocked { at: [3, -4] })));
+    assert_eq!(failed.to_string(), "the way is blocked (code 7)");
+    let failed = client.watch_dock(500, |_| ControlFlow::Break(())).unwrap_err();
+    assert_eq!(failed, CallError::Call(Error::Cancelled).into());
+    until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 1));
+    assert_eq!(client.dock(1), Ok(()));
+    let told = NewerDockClient::at(&peer).watch_dock(1, |_| unreachable!("nothing is sent")).unwrap_err();
+    assert!(matches!(&told.error, CallError::Mismatch(what) if what.part == Part::Progress), "{told}");
+    assert!(told.to_string().contains("its progress left is int there and float here"), "{told}");
+    let told = NewestDockClient::at(&peer).dock(1).unwrap_err();
+    assert!(matches!(&told, CallError::Mismatch(what) if what.part == Part::Failure), "{told}");
+    assert!(told.to_string().contains("its failure's at is int[2] there and int[3] here"), "{told}");
+    manager.stop();
+    agv.stop();
 }
 
 #[derive(Variables, Clone, Debug, Default, PartialEq)]
@@ -184,4 +282,313 @@ fn a_task_of_any_thread_awaits_a_typed_call() {
     assert_eq!(runtime.block_on(task).unwrap(), Ok(5));
     manager.stop();
     agv.stop();
+}
+
+#[interface]
+trait Door {
+    fn open(&mut self, call: &impl AnyCall, width: u8) -> Result<(), ServiceError>;
+}
+
+struct Stuck;
+
+impl Door for Stuck {
+    fn open(&mut self, call: &impl AnyCall, width: u8) -> Result<(), ServiceError> {
+        if width > 1 { Err(call.fail(Failure::new(4, "something is in the way"))) } else { Ok(()) }
+    }
+}
+
+#[test]
+fn a_typed_service_says_why_it_fails() {
+    let fleet = fleet();
+    let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).state(Stuck).build().unwrap());
+    agv.my_function_list().serve(DoorServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let door = Explained::new(peer.clone());
+    let client = DoorClient::at(&door);
+    let failed = Err(CallError::Call(Error::Service(ServiceError::Failed(4))));
+    assert_eq!(client.open(2), failed);
+    let failure = door.take_failure().expect("it has said why");
+    assert_eq!((failure.code(), failure.text()), (4, "something is in the way"));
+    assert!(door.take_failure().is_none(), "it is told once");
+    // Of a call that succeeds there is none.
+    assert_eq!(client.open(2), failed);
+    assert_eq!(client.open(1), Ok(()));
+    assert!(door.take_failure().is_none());
+    assert_eq!(DoorClient::at(&peer).open(2), failed, "the plain client has the code");
+    manager.stop();
+    agv.stop();
+}
+
+/// What says itself that it is done.
+#[interface]
+trait Mast {
+    #[actuator(motor)]
+    #[lease(ms = 60_000)]
+    fn lift(&mut self, call: &impl TypedCall<Left, (), Order = LeaseWatch>) -> Result<(), ServiceError>;
+
+    fn count(&mut self, call: &impl AnyCall<Order = LeaseWatch>);
+}
+
+impl Mast for Option<LeaseWatch> {
+    fn lift(&mut self, call: &impl TypedCall<Left, (), Order = LeaseWatch>) -> Result<(), ServiceError> {
+        *self = call.order();
+        Ok(())
+    }
+
+    fn count(&mut self, call: &impl AnyCall<Order = LeaseWatch>) {
+        assert!(call.order().is_none());
+    }
+}
+
+#[test]
+fn a_typed_service_knows_its_order_and_ends_it() {
+    let fleet = fleet();
+    let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).state(None).build().unwrap());
+    let motor = agv.my_function_list().actuator(|| ()).unwrap();
+    agv.my_function_list().serve(MastServer { motor }).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let client = MastClient::at(&peer);
+    assert_eq!(client.count(), Ok(()));
+    let held = client.renewing(Renew::Process).hold_lift().unwrap();
+    assert!(held.is_held());
+    let order = agv.with_state(Option::take).unwrap().expect("its lease is told");
+    assert!(order.is_live() && agv.end_order(&order));
+    assert!(!order.is_live() && !agv.end_order(&order));
+    until("its caller is told", || !held.is_held());
+    manager.stop();
+    agv.stop();
+}
+
+/// An order as VDA 5050 has it. There an action has parameters, which would be lists in lists deeper than a signature has them.
+#[derive(Variables, serde::Serialize, serde::Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Order {
+    header_id: u32,
+    #[size(24)]
+    timestamp: String,
+    #[size(36)]
+    order_id: String,
+    order_update_id: u32,
+    #[size(64)]
+    nodes: Vec<Node>,
+    #[size(63)]
+    edges: Vec<Edge>,
+}
+
+#[derive(Variables, serde::Serialize, serde::Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Node {
+    #[size(32)]
+    node_id: String,
+    sequence_id: u32,
+    released: bool,
+    node_position: Option<Position>,
+    #[size(4)]
+    actions: Vec<Action>,
+}
+
+#[derive(Variables, serde::Serialize, serde::Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Position {
+    x: f64,
+    y: f64,
+    theta: f64,
+    #[size(32)]
+    map_id: String,
+}
+
+#[derive(Variables, serde::Serialize, serde::Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Edge {
+    #[size(32)]
+    edge_id: String,
+    sequence_id: u32,
+    released: bool,
+    #[size(32)]
+    start_node_id: String,
+    #[size(32)]
+    end_node_id: String,
+    max_speed: Option<f64>,
+    #[size(4)]
+    actions: Vec<Action>,
+}
+
+#[derive(Variables, serde::Serialize, serde::Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+struct Action {
+    #[size(32)]
+    action_type: String,
+    #[size(36)]
+    action_id: String,
+    blocking_type: Blocking,
+}
+
+#[derive(Variables, serde::Serialize, serde::Deserialize, Clone, Copy, Debug, PartialEq)]
+#[serde(rename_all = "UPPERCASE")]
+enum Blocking {
+    None,
+    Soft,
+    Hard,
+}
+
+#[interface]
+trait Planned {
+    #[returns(count, last)]
+    fn plan(&mut self, #[variables] order: Order) -> Result<(u32, Option<Node>), ServiceError>;
+
+    fn planned(&self) -> Order;
+}
+
+impl Planned for Order {
+    fn plan(&mut self, order: Order) -> Result<(u32, Option<Node>), ServiceError> {
+        *self = order;
+        Ok((u32::try_from(self.nodes.len()).map_err(|_| ServiceError::NotReady)?, self.nodes.last().cloned()))
+    }
+
+    fn planned(&self) -> Order {
+        self.clone()
+    }
+}
+
+impl Order {
+    /// 50 nodes and the 49 edges between them, each with an action.
+    fn of_50_nodes() -> Self {
+        let action = |kind: &str, sequence: u32, blocking_type| Action {
+            action_type: kind.into(),
+            action_id: format!("action-{sequence:04}"),
+            blocking_type,
+        };
+        let node = |index: u32| Node {
+            node_id: format!("node-{index:02}"),
+            sequence_id: 2 * index,
+            released: index < 20,
+            node_position: Some(Position {
+                x: 1.25 * f64::from(index),
+                y: -0.1 * f64::from(index),
+                theta: 1.2508,
+                map_id: "hall-7".into(),
+            }),
+            actions: vec![action("pick", 2 * index, Blocking::Hard)],
+        };
+        let edge = |index: u32| Edge {
+            edge_id: format!("edge-{index:02}"),
+            sequence_id: 2 * index + 1,
+            released: index < 19,
+            start_node_id: format!("node-{index:02}"),
+            end_node_id: format!("node-{:02}", index + 1),
+            max_speed: (index.is_multiple_of(2)).then_some(1.5),
+            actions: vec![action("beep", 2 * index + 1, if index == 7 { Blocking::Soft } else { Blocking::None })],
+        };
+        Self {
+            header_id: 1,
+            timestamp: "2026-11-25T04:45:00.000Z".into(),
+            order_id: "order-000017".into(),
+            order_update_id: 0,
+            nodes: (0..50).map(node).collect(),
+            edges: (0..49).map(edge).collect(),
+        }
+    }
+}
+
+#[test]
+fn an_order_of_50_nodes_comes_as_it_was_sent() {
+    let fleet = fleet();
+    let (manager, agv) =
+        (system(fleet).build().unwrap(), unit("agv", 7, fleet).state(Order::default()).build().unwrap());
+    agv.my_function_list().serve(PlannedServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let client = PlannedClient::at(&peer);
+    let order = Order::of_50_nodes();
+    assert_eq!(client.planned(), Ok(Order::default()));
+    assert_eq!(client.plan(order.clone()), Ok((50, order.nodes.last().cloned())));
+    assert_eq!(client.planned(), Ok(order.clone()));
+    let none = Order { nodes: vec![], ..order };
+    assert_eq!(client.plan(none.clone()), Ok((0, None)));
+    assert_eq!(client.planned(), Ok(none));
+    manager.stop();
+    agv.stop();
+}
+
+/// A board's messages have 1 KiB.
+#[test]
+fn an_order_that_a_peer_has_no_room_for_is_refused_before_it_is_sent() {
+    let fleet = fleet();
+    let small = Constraints { message_size: 1024, ..Constraints::S_UNIT };
+    let agv = unit("agv", 7, fleet).constraints(small).state(Order::default()).build().unwrap();
+    let manager = system(fleet).build().unwrap();
+    agv.my_function_list().serve(PlannedServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let client = PlannedClient::at(&peer);
+    let sent = manager.counted(LinkCounter::MessagesSent);
+    let order = Order::of_50_nodes();
+    assert_eq!(client.plan(order.clone()), Err(CallError::Call(Error::TooLarge { limit: 1024 })));
+    assert_eq!(manager.counted(LinkCounter::MessagesSent), sent);
+    assert_eq!(client.planned(), Ok(Order::default()));
+    let short = Order { nodes: order.nodes[..2].to_vec(), edges: order.edges[..1].to_vec(), ..order };
+    assert_eq!(client.plan(short.clone()), Ok((2, short.nodes.last().cloned())));
+    manager.stop();
+    agv.stop();
+}
+
+/// Bytes of an order's block, of JSON and of postcard. `docs/notes/typed.md` has them.
+#[test]
+fn an_order_of_50_nodes_takes_so_many_bytes() {
+    let order = Order::of_50_nodes();
+    let block = order.with_parameters(|variables| {
+        let order = Definition::new("order").unwrap().arguments(variables).unwrap();
+        block::measure(order.signature().arguments(), variables).unwrap()
+    });
+    let json = serde_json::to_vec(&order).unwrap().len();
+    let postcard = postcard::to_allocvec(&order).unwrap().len();
+    assert_eq!((block, json, postcard), (Ok(13_360), 20_082, 5_546));
+}
+
+/// Prints how long an order takes to be written and read again, in each form, and by a call to another unit and back; with
+/// `--release --nocapture` for `docs/notes/typed.md`.
+#[test]
+fn an_order_of_50_nodes_is_timed() {
+    let order = Order::of_50_nodes();
+    let definition =
+        order.with_parameters(|order| Definition::new("order").unwrap().arguments(order).unwrap()).unwrap();
+    let specs = || definition.signature().arguments();
+    let mut read = Parameters::<100_000>::sized();
+    let forms: [(&str, &mut dyn FnMut() -> Order); 3] = [
+        ("a block", &mut || {
+            let block = order.with_parameters(|order| {
+                let mut bytes = vec![0; block::measure(specs(), order).unwrap()];
+                block::write(specs(), order, &mut SliceWriter::new(&mut bytes));
+                bytes
+            });
+            block::read_arguments(specs(), &block.unwrap(), &mut read).unwrap();
+            Order::from_parameters(&read).unwrap()
+        }),
+        ("JSON", &mut || serde_json::from_slice(&serde_json::to_vec(&order).unwrap()).unwrap()),
+        ("postcard", &mut || postcard::from_bytes(&postcard::to_allocvec(&order).unwrap()).unwrap()),
+    ];
+    for (form, write_and_read) in forms {
+        assert_eq!(write_and_read(), order, "{form}");
+        println!("{form}: {:?}", median(|| drop(write_and_read())));
+    }
+    let fleet = fleet();
+    let (manager, agv) =
+        (system(fleet).build().unwrap(), unit("agv", 7, fleet).state(Order::default()).build().unwrap());
+    agv.my_function_list().serve(PlannedServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let client = PlannedClient::at(&peer);
+    println!("a call with it: {:?}", median(|| assert!(client.plan(order.clone()).is_ok())));
+    println!("a ping: {:?}", median(|| assert!(peer.ping(Duration::from_secs(5)).is_ok())));
+    manager.stop();
+    agv.stop();
+}
+
+fn median(mut act: impl FnMut()) -> std::time::Duration {
+    let mut times: Vec<_> = (0..51)
+        .map(|_| {
+            let began = std::time::Instant::now();
+            act();
+            began.elapsed()
+        })
+        .collect();
+    times.sort_unstable();
+    times[times.len() / 2]
 }

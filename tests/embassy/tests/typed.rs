@@ -1,6 +1,7 @@
 //! Typed services on boards: one serves, the other one calls.
 
 use std::cell::RefCell;
+use std::ops::ControlFlow;
 use std::rc::Rc;
 
 use cara_core::distribution::identity::Identity;
@@ -9,7 +10,8 @@ use cara_core::services::heart::Renew;
 use cara_core::services::lease::Lease;
 use cara_core::time::Duration;
 use cara_embassy::{
-    Actuator, AnyCall, CallError, Config, Handle, Handler, Limits, ServiceOptions, Variables, interface, resources,
+    Actuator, AnyCall, CallError, Config, Handle, Handler, Limits, ServiceOptions, TypedCall, Variables, interface,
+    resources,
 };
 use cara_embassy_host::{Bench, Board, keys};
 
@@ -27,6 +29,16 @@ struct Fork {
 struct Load {
     kilograms: u16,
     label: [u8; 2],
+}
+
+#[derive(Variables, Debug, PartialEq)]
+struct Left {
+    left: f32,
+}
+
+#[derive(Variables, Debug, PartialEq)]
+struct TooHeavy {
+    kilograms: u16,
 }
 
 #[interface]
@@ -48,6 +60,8 @@ trait Lift {
     fn free(&mut self) -> Result<(), ServiceError>;
 
     fn load(&mut self) -> Load;
+
+    fn tilt(&mut self, call: &impl TypedCall<Left, TooHeavy>, degrees: u8) -> Result<(), ServiceError>;
 }
 
 impl Lift for Fork {
@@ -70,9 +84,15 @@ impl Lift for Fork {
     fn load(&mut self) -> Load {
         Load { kilograms: 900, label: [7, 8] }
     }
+
+    fn tilt(&mut self, call: &impl TypedCall<Left, TooHeavy>, degrees: u8) -> Result<(), ServiceError> {
+        call.progress(&Left { left: f32::from(degrees) })?;
+        if degrees > 5 { Err(call.fail_with(3, "it is too heavy", &TooHeavy { kilograms: 900 })) } else { Ok(()) }
+    }
 }
 
 static MOTOR: Lease = Lease::new();
+static TILTED: Lease = Lease::new();
 
 type Unit = Handle<Fork>;
 type Memory = resources!(Fork, LIMITS);
@@ -153,4 +173,21 @@ fn another_version_is_told_before_anything_is_sent() {
     let told = finish(&bench, &board, async move { LiftAsyncClient::at(&peer).lift_to(1.5).await });
     let told = told.unwrap_err().to_string();
     assert!(told.contains("lift_to") && told.contains("height is int there and float here"), "{told}");
+}
+
+/// A service that the runner runs tells no progress, since it has ended before anything can be sent.
+#[test]
+fn a_typed_failure_comes_with_its_text_and_its_values() {
+    let bench = Bench::new(3);
+    let (board, manager, _) = pair(&bench, |unit| {
+        unit.my_function_list().serve(LiftServer { motor: Actuator::new(&TILTED, &|| ()) }).unwrap();
+    });
+    let peer = manager.peer("agv").unwrap();
+    finish(&bench, &board, async move {
+        let client = LiftAsyncClient::at(&peer);
+        let failed = client.watch_tilt(6, |_| unreachable!("nothing is told")).await.unwrap_err();
+        assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(3))));
+        assert_eq!((failed.text.as_str(), failed.values), ("it is too heavy", Some(TooHeavy { kilograms: 900 })));
+        assert_eq!(client.watch_tilt(5, |_| ControlFlow::Continue(())).await, Ok(()));
+    });
 }

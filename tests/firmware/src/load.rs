@@ -59,6 +59,8 @@ fn vehicle(bench: &Bench, board: &Board, cable: &Cable, round: u32) -> Result<()
     }
     manager.system.publish_my_function_list()?;
     let agv = manager.meet(&who)?;
+    // Of an image with streams.
+    let streams = ["pose", "charge"].map(|name| agv.stream(name).map(|stream| stream.subscribe(Duration::ZERO)));
     for x in 1..=2 {
         sets_out(&agv, [x + 2 * i64::from(round), 0])?;
         agv.request("pos_info", &at([0, 0])?)?;
@@ -71,6 +73,9 @@ fn vehicle(bench: &Bench, board: &Board, cable: &Cable, round: u32) -> Result<()
     ensure!(agv.block_request("fly_to", &mut at([0, 0])?).is_err(), "it flies");
     patiently(|| agv.block_request("stop", &mut Parameters::<512>::new()))?;
     reset(&agv)?;
+    for mut stream in streams.into_iter().flatten() {
+        stream.next(LONG)?;
+    }
     drop(manager);
     board.logs_behind(line, "depot has left")?;
     // A list that is full with other functions has no room for the mechanic.

@@ -16,6 +16,7 @@ mod places;
 mod security;
 mod session;
 mod signals;
+mod streams;
 mod trace;
 
 use std::path::PathBuf;
@@ -100,6 +101,8 @@ enum Part {
         #[arg(long, default_value_t = 300)]
         times: u32,
     },
+    /// Calls a board that publishes values meanwhile; for an image with streams.
+    Streams(streams::Streams),
     /// Starts a session: a board, its manager and a prompt for `cara`.
     Session(session::Session),
 }
@@ -149,6 +152,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
         Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
         Some(Part::KeptAway(options)) => kept_away::run(&bench(arguments)?, options),
+        Some(Part::Streams(options)) => streams::run(&bench(arguments)?, options),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),
     }

@@ -52,6 +52,7 @@ impl Blocks {
             slot: Slot(1),
             generation: Generation(1),
             wants_reply: true,
+            wants_progress: false,
             takes_over: false,
             operator: false,
             unknown: 0,

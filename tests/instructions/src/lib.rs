@@ -9,11 +9,13 @@
 mod blocks;
 mod discovery;
 mod pair;
+mod programs;
 mod sealing;
 
 pub use blocks::Blocks;
 pub use discovery::{Discovery, DiscoveryMemory};
 pub use pair::{Pair, PairMemory};
+pub use programs::Programs;
 pub use sealing::Sealing;
 
 /// Counts the instructions of what it runs.

@@ -5,7 +5,7 @@
 
 use cara_core::distribution::parameters::Parameters;
 use cara_core::services::session::buffer_bytes;
-use cara_instructions::{Blocks, Discovery, DiscoveryMemory, Meter, Operation, Pair, PairMemory};
+use cara_instructions::{Blocks, Discovery, DiscoveryMemory, Meter, Operation, Pair, PairMemory, Programs};
 
 const CHARACTERS: u32 = 20_000;
 const ARGUMENTS: usize = CHARACTERS as usize + 64;
@@ -39,6 +39,7 @@ fn main() {
     on(&mut number, chosen, Pair::operations(CHARACTERS), || {
         Pair::new(leaked(PairMemory::<BUFFER, ARGUMENTS>::new()), CHARACTERS)
     });
+    on(&mut number, chosen, Programs::operations(), Programs::new);
     on(&mut number, chosen, Discovery::operations(NODES as u32), || {
         Discovery::new(leaked(DiscoveryMemory::<{ NODES + Discovery::SPARE }>::new()))
     });

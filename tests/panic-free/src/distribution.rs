@@ -1,5 +1,8 @@
 //! Distribution: parameters, functions, lists, identities.
 
+use core::ops::ControlFlow;
+
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec};
 use cara_core::distribution::function_list::{Entry, FunctionList, TheirFunctionList};
 use cara_core::distribution::identity::Identity;
@@ -70,15 +73,23 @@ entry!(parameters_placed, {
 
 entry!(typed_signatures, {
     let (arguments, results) = (unknown_slice::<VariableSpec<'static>>(), unknown_slice::<VariableSpec<'static>>());
-    keep(typed::encoded_bytes(unknown_text(), arguments, results));
+    let (progress, fails) = (unknown_slice::<VariableSpec<'static>>(), unknown_slice::<VariableSpec<'static>>());
+    let declared = typed::Declared { arguments, results, progress, fails };
+    keep(declared.encoded_bytes(unknown_text()));
     keep(typed::parameters_bytes(arguments, results));
     keep(typed::place(&typed::places_of_results(arguments, results), *unknown()));
-    if let Ok(encoded) = typed::Encoded::<64>::new(unknown_text(), arguments, results) {
+    if let Ok(encoded) = typed::Encoded::<64>::new(unknown_text(), declared) {
         keep(encoded.signature().name());
     }
     if let Err(mismatch) = typed::Mismatch::check(*unknown::<Signature<'static>>(), *unknown::<Signature<'static>>()) {
         show(&mismatch);
     }
+});
+
+entry!(typed_details, {
+    keep(typed::hand(parameters(), |()| ControlFlow::Break(())));
+    let failed = typed::Failed::<()>::new(*unknown(), Some(unknown::<Failure>()));
+    show(&failed);
 });
 
 entry!(typed_values, {
@@ -89,14 +100,14 @@ entry!(typed_values, {
     keep(typed::argument::<typed::heapless::Vec<u8, 8>>(parameters, *unknown()));
     keep(typed::borrowed::<&str>(parameters, *unknown()));
     keep(typed::refused(*unknown()));
-    if let Ok(target) = parameters.target_of(*unknown()) {
-        keep(unknown::<typed::heapless::String<8>>().to_field(target));
+    if let Ok(slot) = parameters.slot_of(*unknown()) {
+        keep(unknown::<typed::heapless::String<8>>().to_field(slot));
     }
-    if let Ok(target) = parameters.target_of(*unknown()) {
-        keep(unknown::<typed::heapless::Vec<u8, 8>>().to_field(target));
+    if let Ok(slot) = parameters.slot_of(*unknown()) {
+        keep(unknown::<typed::heapless::Vec<u8, 8>>().to_field(slot));
     }
-    if let Ok(target) = parameters.target_of(*unknown()) {
-        keep(unknown::<[i8; 3]>().to_field(target));
+    if let Ok(slot) = parameters.slot_of(*unknown()) {
+        keep(unknown::<[i8; 3]>().to_field(slot));
     }
 });
 
@@ -181,10 +192,11 @@ entry!(their_list, {
     keep(TheirFunctionList::<Lent>::new(unknown_slice(), unknown_slice()));
     let list: &mut TheirFunctionList<Lent> = unknown();
     list.keep_only(*unknown());
+    list.let_grow(*unknown(), *unknown());
     keep(list.insert(*unknown(), *unknown(), *unknown(), unknown_slice()));
     keep(list.remove(*unknown()));
     keep((list.find(unknown_text()), list.named(unknown_text()), list.function(*unknown())));
-    keep((list.len(), list.is_empty(), list.skipped(), list.room(), list.capacity()));
+    keep((list.len(), list.is_empty(), list.skipped()));
     drain(list.iter());
     list.clear();
 });

@@ -12,6 +12,7 @@ mod distribution;
 mod foundation;
 mod host;
 mod messages;
+mod nested;
 mod node;
 mod secure;
 mod services;

@@ -23,7 +23,7 @@ use cara_core::services::stream::{Newest, Source};
 use cara_core::services::{Context, OwnFunctions, Port, slots_for};
 use cara_core::storage::{Lent, Pool};
 
-use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+use crate::linkage::{keep, unknown, unknown_slice, unknown_text};
 use crate::secure::AnyCipher;
 
 /// A handler that may have a lease.
@@ -105,7 +105,7 @@ entry!(session_grown, {
     let session = session();
     keep((session.call_slots(), session.running_slots(), session.publication_slots()));
     keep(session.lend_calls(unknown_slice()));
-    keep(session.lend_functions((unknown_slice(), unknown_slice())));
+    session.let_list_grow(*unknown(), *unknown());
     keep(session.lend_running(unknown_slice()));
     keep(session.lend_publications(unknown_slice()));
 });
@@ -136,7 +136,16 @@ entry!(session_asked, {
         session.has_call_room(),
         session.is_acknowledged(*unknown()),
     ));
-    keep(session.constraints());
+    keep((session.constraints(), session.silent_for(*unknown()), session.bytes_queued()));
+});
+
+entry!(session_details, {
+    keep(session().answer_failed(context(), *unknown(), unknown()));
+    keep(session().progress(context(), *unknown(), parameters()));
+    keep((session().failure(unknown_slice()), session().is_cancelled(*unknown())));
+    if let Event::Progress(_, values) = unknown::<Event>() {
+        keep(session().progress_values(values, unknown_slice()).map(|block| block.bytes().len()));
+    }
 });
 
 entry!(streams, {

@@ -66,6 +66,11 @@ impl Process {
         Ok(Self { name: name.to_owned(), child, input, output, passed: 0 })
     }
 
+    /// Its number on this host.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Its name in messages.
     pub fn name(&self) -> &str {
         &self.name

@@ -34,4 +34,4 @@ pub use service::{Asked, CallLog, Service};
 pub use spec::{Spec, SpecRole};
 pub use unknown_client::UnknownClient;
 pub use values::{boxed, millis, number, numbers, position, secs, text, variable};
-pub use world::{Fault, Heart, Node, Pending, PendingAll, Port, Seen, Unit, Unsupported, World};
+pub use world::{Fault, Heart, Node, Pending, PendingAll, Port, Seen, Unit, Unsupported, Watched, World};

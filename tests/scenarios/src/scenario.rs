@@ -45,11 +45,13 @@ pub enum Need {
     Choice,
     /// A unit that publishes streams, and reads those of others.
     Streams,
+    /// A unit whose services tell why they fail and how far they are, and a caller that watches its calls.
+    Details,
 }
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 21] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -70,6 +72,7 @@ impl Need {
         Self::Panics,
         Self::Choice,
         Self::Streams,
+        Self::Details,
     ];
 
     /// Why a port lacks it; `None` where it does not.
@@ -108,6 +111,7 @@ impl Need {
             Self::Panics
             | Self::Choice
             | Self::Streams
+            | Self::Details
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader
@@ -128,6 +132,7 @@ impl Need {
             Self::ManyUnits => "more nodes than a board has links for",
             Self::Panics => "a panic restarts a board",
             Self::Streams => "its nodes are those of boards without the feature `streams`",
+            Self::Details => "its nodes are those of boards without the feature `details`",
             Self::Choice => "a board that is an m_unit has few links, and meets every m_unit",
             _ => return None,
         })

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use cara_core::config::Priority;
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
@@ -29,6 +30,8 @@ pub struct Service {
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
     pub(crate) in_turns: bool,
+    pub(crate) tells: i64,
+    pub(crate) failure: Option<Failure>,
     log: Arc<CallLog>,
 }
 
@@ -44,6 +47,8 @@ impl Service {
             priority: Priority::Normal,
             lease: None,
             in_turns: false,
+            tells: 0,
+            failure: None,
             log: Arc::new(CallLog::default()),
         }
     }
@@ -88,9 +93,20 @@ impl Service {
         Self { in_turns: true, ..self }
     }
 
+    /// Before it answers it tells so many values of its progress `left`, from 1 on, one in each millisecond, for as long as its
+    /// call is not given up. The log notes how many.
+    pub fn tells(self, count: i64) -> Self {
+        Self { tells: count, ..self }
+    }
+
+    /// It fails, and says why.
+    pub fn fails(self, failure: Failure) -> Self {
+        Self { failure: Some(failure), ..self }
+    }
+
     /// Whether its handler waits for anything, so that one that must not wait cannot serve it.
     pub(crate) fn awaits(&self) -> bool {
-        self.takes > Duration::ZERO || self.calls_back.is_some() || self.moves_every.is_some()
+        self.takes > Duration::ZERO || self.calls_back.is_some() || self.moves_every.is_some() || self.tells > 0
     }
 
     /// Moves once, if the call of these parameters is wanted; the pause until the next move.

@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cara_core::config::Constraints;
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
@@ -172,6 +173,15 @@ impl<T> Pending<T> {
     }
 }
 
+/// What the caller of a call that was watched has learned.
+#[derive(Debug)]
+pub struct Watched {
+    /// The values of its progress `left`, as they came.
+    pub told: Vec<i64>,
+    /// How it ended.
+    pub outcome: Result<(), CallFailure>,
+}
+
 /// A heart of a loop, as its port has it.
 pub struct Heart {
     renew: Renew,
@@ -242,6 +252,20 @@ pub trait Node {
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending;
     /// The synchronous request to all, likewise, in a task of its own.
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll;
+    /// The synchronous request, made in a task of its own that watches it, and gives it up once its progress has reached
+    /// `enough`.
+    fn watch(
+        &self,
+        _peer: &str,
+        _function: &str,
+        _parameters: &ParametersView,
+        _options: RequestOptions,
+        _enough: i64,
+    ) -> Pending<Watched> {
+        let pending = Pending::new();
+        pending.end(Err(Error::Unsupported), Instant::START);
+        pending
+    }
     /// Publishes a new value of a stream.
     fn put(&self, _stream: &str, _values: &ParametersView) -> Result<(), Error> {
         Err(Error::Unsupported)

@@ -44,7 +44,7 @@ pub use events::{LogEvent, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
-pub use requests::Hold;
+pub use requests::{Hold, Watched};
 pub use service::{BoxedParameters, Call, LeaseWatch, Outcome, Service, boxed_parameters};
 pub use streams::Sample;
 

@@ -255,6 +255,7 @@ fn header(id: u32, slot: u16) -> RequestHeader {
         slot: Slot(slot),
         generation: Generation(0),
         wants_reply: true,
+        wants_progress: false,
         takes_over: false,
         operator: false,
         unknown: 0,

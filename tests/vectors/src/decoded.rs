@@ -3,11 +3,13 @@
 use cara_core::config::{Mode, Priority, Versions};
 use cara_core::distribution::block;
 use cara_core::distribution::datagram::{Announce, Datagram, DatagramError, WhoHas};
-use cara_core::distribution::function::{Attributes, Signature};
+use cara_core::distribution::function::{Attributes, Signature, VariableSpec};
 use cara_core::distribution::hello::{Hello, HelloError, Manager};
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::distribution::items::{Item, Items, Malformed};
-use cara_core::distribution::message::{Control, Message, SampleHeader, SessionBody, SubscriptionRefusal};
+use cara_core::distribution::message::{
+    Control, FailureDetails, Message, SampleHeader, SessionBody, SubscriptionRefusal,
+};
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::secure::Plain;
@@ -80,6 +82,7 @@ pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
             "slot": header.slot.0,
             "generation": header.generation.0,
             "wants_reply": header.wants_reply,
+            "wants_progress": header.wants_progress,
             "takes_over": header.takes_over,
             "operator": header.operator,
             "unknown": header.unknown,
@@ -89,13 +92,23 @@ pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
             "block": hex(block),
         }}),
         Message::Reply(id, Ok(block)) => json!({ "reply": { "id": id, "block": hex(block) } }),
-        Message::Reply(id, Err(error)) => json!({ "reply": { "id": id, "error": self::error(error) } }),
-        Message::Failure(id, error) => json!({ "failure": { "id": id, "error": self::error(error) } }),
+        Message::Reply(id, Err(error)) => json!({ "reply": failed(id, error, bytes) }),
+        Message::Failure(id, error) => json!({ "failure": failed(id, error, bytes) }),
+        Message::Progress(id, block) => json!({ "progress": { "id": id, "block": hex(block) } }),
         Message::Sample(SampleHeader { slot, generation, made }, block) => json!({ "sample": {
             "slot": slot.0, "generation": generation.0, "made": made, "block": hex(block),
         }}),
         Message::Control(items) => json!({ "control": controls(items)? }),
     })
+}
+
+/// An error, with what its service has said where that can be read.
+fn failed(id: u32, error: Error, bytes: &[u8]) -> Value {
+    let mut value = json!({ "id": id, "error": self::error(error) });
+    if let Some(FailureDetails { text, values }) = FailureDetails::of(bytes) {
+        value["details"] = json!({ "text": text, "values": hex(values) });
+    }
+    value
 }
 
 /// The errors that have a code of their own; all others read as malformed.
@@ -181,15 +194,35 @@ fn control(control: &Control<'_>) -> Value {
 }
 
 fn signature(signature: Signature<'_>) -> Value {
-    let variables = |specs: cara_core::distribution::function::VariableSpecs<'_>| -> Value {
-        specs.map(|spec| json!({ "name": spec.name, "type": spec.kind.word(), "size": spec.size })).collect()
-    };
-    json!({
+    let variables =
+        |specs: cara_core::distribution::function::VariableSpecs<'_>| -> Value { specs.map(self::spec).collect() };
+    let mut value = json!({
         "name": signature.name(),
         "arguments": variables(signature.arguments()),
         "results": variables(signature.results()),
         "text": signature.to_string(),
-    })
+    });
+    for (name, specs) in [("progress", signature.progress()), ("failure", signature.failure())] {
+        if { specs }.next().is_some() {
+            value[name] = variables(specs);
+        }
+    }
+    value
+}
+
+/// A variable, or an element, which has no name.
+fn spec(spec: VariableSpec<'_>) -> Value {
+    let mut shown = json!({ "type": spec.kind.word(), "size": spec.size });
+    let more = match spec.kind {
+        Type::List => spec.element().map(|element| ("element", self::spec(element))),
+        Type::Record => Some(("fields", spec.fields().map(self::spec).collect())),
+        _ => None,
+    };
+    let name = (!spec.name.is_empty()).then(|| ("name", spec.name.into()));
+    for (key, value) in more.into_iter().chain(name) {
+        shown[key] = value;
+    }
+    shown
 }
 
 fn attributes(attributes: &Attributes) -> Value {
@@ -221,6 +254,8 @@ fn variable(value: Variable<'_>) -> Value {
         Type::String => value.text().into(),
         Type::Bool => value.bools().collect(),
         Type::Bytes => hex(value.raw()).into(),
+        Type::List => value.elements().map(variable).collect(),
+        Type::Record => value.fields().map(|field| (field.name.to_owned(), variable(field.value))).collect(),
     }
 }
 
@@ -239,6 +274,9 @@ pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
         SessionBody::Renewed(call) => json!({ "renewed": { "call": call } }),
         SessionBody::Release(release) => {
             json!({ "release": { "class": release.class.word(), "call": release.call } })
+        }
+        SessionBody::Cancel(release) => {
+            json!({ "cancel": { "class": release.class.word(), "call": release.call } })
         }
         SessionBody::ReleaseAll(slot, call) => json!({ "release_all": { "slot": slot.0, "call": call } }),
         SessionBody::Message(byte, message) => json!({ "message": {

@@ -5,7 +5,7 @@ use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::message::{
     Control, LastOrder, Latch, LeaseEnd, Release, Renewal, RequestHeader, SampleHeader, SessionBody,
-    SubscriptionRefusal, encode_failure, encode_reply,
+    SubscriptionRefusal, encode_failure, encode_progress, encode_reply,
 };
 use cara_core::error::{Error, ServiceError};
 use cara_core::time::Duration;
@@ -27,6 +27,7 @@ fn request(wants_reply: bool, block: &[u8]) -> Vec<u8> {
         slot: Slot(5),
         generation: Generation(0x0203),
         wants_reply,
+        wants_progress: false,
         takes_over: false,
         operator: false,
         unknown: 0,
@@ -45,7 +46,7 @@ fn messages() -> Vec<Vector> {
     let block = arguments(GO_TO, &motion().unwrap_or_default());
     let fields = |wants_reply: bool, block: &[u8]| {
         json!({ "request": {
-            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "takes_over": false, "operator": false,
+            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "wants_progress": false, "takes_over": false, "operator": false,
             "unknown": 0,
             "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": hex(block),
         }})
@@ -59,6 +60,8 @@ fn messages() -> Vec<Vector> {
     critical["request"]["unknown"] = json!(0xA0);
     let mut taking_over = fields(true, &[]);
     taking_over["request"]["takes_over"] = json!(true);
+    let mut watching = fields(true, &[]);
+    watching["request"]["wants_progress"] = json!(true);
     let mut operators = fields(true, &[]);
     operators["request"]["operator"] = json!(true);
     let mut longer = request(true, &[0xEE; 4]);
@@ -80,6 +83,12 @@ fn messages() -> Vec<Vector> {
     let sampled = json!({ "sample": {
         "slot": 3, "generation": 2, "made": -1_500, "block": "0102030405060708090a0b0c0d0e0f10",
     }});
+    let failed = Error::Service(ServiceError::Failed(7));
+    let details = [&[7, 0, 0, 0, 0, 0, 0, 0][..], b"blocked\0", &results].concat();
+    let told = json!({
+        "id": 0x0102_0304, "error": { "service_failed": { "code": 7 } },
+        "details": { "text": "blocked", "values": "0102030405060708090a0b0c0d0e0f10" },
+    });
     vec![
         message(("request", "a blocking request with arguments"), &request(true, &block), &fields(true, &block)),
         message(("request_one_way", "an asynchronous request without any"), &request(false, &[]), &fields(false, &[])),
@@ -90,7 +99,8 @@ fn messages() -> Vec<Vector> {
         )
         .lossy(),
         message(("request_shorter_header", "refused: 7 words"), &shorter, &Value::Null),
-        message(("request_flags", "flags that may be passed over"), &flags(0x0A), &fields(true, &[])).lossy(),
+        message(("request_flags", "flags that may be passed over"), &flags(0x08), &fields(true, &[])).lossy(),
+        message(("request_wants_progress", "the caller wants to be told progress"), &flags(0x02), &watching),
         message(("request_critical_flags", "flags that must be understood"), &flags(0xA0), &critical),
         message(("request_takes_over", "it takes over what another caller moves"), &flags(0x10), &taking_over),
         message(("request_of_operator", "an operator made it, and not the program"), &flags(0x04), &operators),
@@ -101,6 +111,28 @@ fn messages() -> Vec<Vector> {
         message(("sample_longer_header", "a later version has more in front of the block"), &longer_sample, &sampled)
             .lossy(),
         message(("sample_shorter_header", "refused: 3 words"), &shorter_sample, &Value::Null),
+        message(
+            ("progress", "what a running call tells"),
+            &[&encode_progress(0x0102_0304)[..], &results].concat(),
+            &json!({ "progress": { "id": 0x0102_0304, "block": "0102030405060708090a0b0c0d0e0f10" } }),
+        ),
+        message(("progress_shorter_header", "refused: 1 word"), &[5, 0, 0, 1, 7, 0, 0, 0], &Value::Null),
+        message(
+            ("reply_with_details", "why a service failed, in words and values"),
+            &[&encode_reply(0x0102_0304, Err(failed))[..], &details].concat(),
+            &json!({ "reply": told }),
+        ),
+        message(
+            ("failure_with_details", "the same of a request that nothing waits for"),
+            &[&encode_failure(0x0102_0304, failed)[..], &details].concat(),
+            &json!({ "failure": told }),
+        ),
+        message(
+            ("reply_with_cut_details", "what cannot be read leaves the code"),
+            &[&encode_reply(0x0102_0304, Err(failed))[..], &[9, 0, 0, 0, 0, 0, 0, 0, b'x']].concat(),
+            &json!({ "reply": { "id": 0x0102_0304, "error": { "service_failed": { "code": 7 } } } }),
+        )
+        .lossy(),
         message(("message_of_no_kind", "refused: there is no kind 7"), &[7; 16], &Value::Null),
         message(("request_cut", "refused: a header of 31 bytes"), &request(true, &[])[..31], &Value::Null),
         message(
@@ -394,6 +426,11 @@ fn session_bodies() -> Vec<Vector> {
             &json!({ "release": { "class": "low", "call": 0x0102_0304 } }),
         ),
         body(
+            ("cancel", "the caller waits for a call no longer"),
+            &SessionBody::cancel(&release),
+            &json!({ "cancel": { "class": "low", "call": 0x0102_0304 } }),
+        ),
+        body(
             ("release_all", "nor any call of a function up to this one"),
             &SessionBody::release_all(Slot(5), 0x0102_0304),
             &json!({ "release_all": { "slot": 5, "call": 0x0102_0304 } }),
@@ -405,12 +442,12 @@ fn session_bodies() -> Vec<Vector> {
             &json!({ "release": { "class": "low", "call": 0x0102_0304 } }),
         )
         .lossy(),
-        body(("session_body_unknown", "refused: there is no kind 9"), &[9, 9], &Value::Null),
+        body(("session_body_unknown", "refused: there is no kind 10"), &[10, 9], &Value::Null),
         body(
             ("session_message", "an emergency's second copy"),
             &emergency,
             &json!({ "message": { "priority": "emergency", "message": { "request": {
-                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "takes_over": false, "operator": false,
+                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "wants_progress": false, "takes_over": false, "operator": false,
                 "unknown": 0, "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
             }}}}),
         ),

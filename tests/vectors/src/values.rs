@@ -13,11 +13,13 @@ use crate::vector::{Context, Kind, Vector, definition};
 
 /// Every vector of this file.
 pub(crate) fn all() -> Vec<Vector> {
-    [signatures(), attributes(), blocks()].concat()
+    [signatures(), nested_signatures(), attributes(), blocks(), nested_blocks()].concat()
 }
 
 pub(crate) const GO_TO: &str = "go_to(position: int[2], speed: float) -> (position: int[2], arrived: bool)";
 const REPORT: &str = "report(text: string[40], data: bytes[5], flags: bool[3], level: float[2])";
+const ORDER: &str = "order(nodes: {id: string[8], x: float}[..4], path: int[..3][..2])";
+const MOVE: &str = "move() progress (left: float) fails (at: int[2])";
 const HI: &str = "hi(name: string[8])";
 
 fn signatures() -> Vec<Vector> {
@@ -49,6 +51,25 @@ fn signatures() -> Vec<Vector> {
             }),
         ),
         Vector::new(
+            ("signature_move", "what a call tells while it runs, and the values of its failures"),
+            Kind::Signature,
+            Context::default(),
+            definition(MOVE).as_bytes(),
+            &json!({
+                "name": "move", "arguments": [], "results": [],
+                "progress": [{ "name": "left", "type": "float", "size": 1 }],
+                "failure": [{ "name": "at", "type": "int", "size": 2 }],
+                "text": MOVE,
+            }),
+        ),
+        Vector::new(
+            ("signature_empty_section", "refused: a section without variables"),
+            Kind::Signature,
+            Context::default(),
+            &[definition("stop()").as_bytes(), &[1, 0]].concat(),
+            &Value::Null,
+        ),
+        Vector::new(
             ("signature_report", "the other types"),
             Kind::Signature,
             Context::default(),
@@ -75,6 +96,52 @@ fn signatures() -> Vec<Vector> {
             Kind::Signature,
             Context::default(),
             &[1, b'f', 1, 0, 1, 1, 0, 0, 0, b'a', 1, 0, 1, 2, 0, 0, 0, b'a'],
+            &Value::Null,
+        ),
+    ]
+}
+
+fn nested_signatures() -> Vec<Vector> {
+    let order = json!({
+        "name": "order",
+        "arguments": [
+            { "name": "nodes", "type": "list", "size": 4, "element": { "type": "record", "size": 2, "fields": [
+                { "name": "id", "type": "string", "size": 8 }, { "name": "x", "type": "float", "size": 1 },
+            ] } },
+            { "name": "path", "type": "list", "size": 2, "element": { "type": "list", "size": 3, "element": {
+                "type": "int", "size": 1,
+            } } },
+        ],
+        "results": [],
+        "text": ORDER,
+    });
+    let made =
+        |names, bytes: &[u8], value: &Value| Vector::new(names, Kind::Signature, Context::default(), bytes, value);
+    let list_of = |inner: &[u8]| [&[1, b'f', 1, 5, 1, 8, 0, 0, 0, b'a'][..], inner, &[0]].concat();
+    let lists = |depth| [&[5, 8, 0, 0, 0].repeat(depth)[..], &[0, 1, 0, 0, 0]].concat();
+    let mut deepest = json!({ "type": "int", "size": 1 });
+    for _ in 0..4 {
+        deepest = json!({ "type": "list", "size": 8, "element": deepest });
+    }
+    deepest["name"] = "a".into();
+    let deepest = json!({
+        "name": "f", "arguments": [deepest], "results": [], "text": "f(a: int[..8][..8][..8][..8])",
+    });
+    vec![
+        made(("signature_order", "a list of records, and a list of lists"), definition(ORDER).as_bytes(), &order),
+        made(("signature_deepest", "four lists in each other"), &list_of(&lists(3)), &deepest),
+        made(("signature_too_deep", "refused: five lists in each other"), &list_of(&lists(4)), &Value::Null),
+        made(("signature_no_element", "refused: a list of nothing"), &list_of(&[]), &Value::Null),
+        made(("signature_empty_element", "refused: elements take no bytes"), &list_of(&[0, 0, 0, 0, 0]), &Value::Null),
+        made(("signature_empty_record", "refused: a record without fields"), &list_of(&[6, 0, 0, 0, 0]), &Value::Null),
+        made(
+            ("signature_field_taken", "refused: two fields of one name"),
+            &list_of(&[6, 2, 0, 0, 0, 0, 1, 1, 0, 0, 0, b'b', 1, 1, 1, 0, 0, 0, b'b']),
+            &Value::Null,
+        ),
+        made(
+            ("signature_field_missing", "refused: a record with fewer fields than it says"),
+            &list_of(&[6, 2, 0, 0, 0, 0, 1, 1, 0, 0, 0, b'b']),
             &Value::Null,
         ),
     ]
@@ -173,6 +240,77 @@ fn report() -> Result<Parameters, Error> {
     parameters.add_float("level", 2)?;
     parameters.set_value("level", [0.25, f64::NEG_INFINITY])?;
     Ok(parameters)
+}
+
+fn order() -> Result<Parameters, Error> {
+    let mut parameters = Parameters::new();
+    for argument in definition(ORDER).signature().arguments() {
+        parameters.add_spec(argument)?;
+    }
+    parameters.set_list("nodes", |nodes| {
+        for (id, x) in [("dock", 1.5), ("", -2.0)] {
+            nodes.push_record(|node| {
+                node.set("id", id)?;
+                node.set("x", x)
+            })?;
+        }
+        Ok(())
+    })?;
+    parameters.set_list("path", |path| {
+        path.push_list(|part| {
+            part.push(1)?;
+            part.push(2)
+        })?;
+        path.push_list(|_| Ok(()))
+    })?;
+    Ok(parameters)
+}
+
+fn nested_blocks() -> Vec<Vector> {
+    let order = arguments(ORDER, &order().unwrap_or_default());
+    let refused =
+        |names, bytes: &[u8]| Vector::new(names, Kind::Block, Context::block(ORDER, "arguments"), bytes, &Value::Null);
+    // `nodes` begins at byte 0 and has a body of 40 bytes; `path` begins at 48.
+    let with = |at: usize, byte: u8| {
+        let mut bytes = order.clone();
+        bytes[at] = byte;
+        bytes
+    };
+    vec![
+        Vector::new(
+            ("block_order", "a list of two records, and a list of two lists, one of them empty"),
+            Kind::Block,
+            Context::block(ORDER, "arguments"),
+            &order,
+            &json!({
+                "nodes": [{ "id": "dock", "x": ["3ff8000000000000"] }, { "id": "", "x": ["c000000000000000"] }],
+                "path": [[[1], [2]], []],
+            }),
+        ),
+        Vector::new(
+            ("block_empty_lists", "empty lists take 8 bytes each"),
+            Kind::Block,
+            Context::block(ORDER, "arguments"),
+            &[0; 16],
+            &json!({ "nodes": [], "path": [] }),
+        ),
+        refused(("block_list_more", "refused: the list has fewer elements than it says"), &with(0, 3)),
+        refused(("block_list_fewer", "refused: the body has more elements than the list says"), &with(0, 1)),
+        refused(
+            ("block_list_long", "refused: more elements than the list may have"),
+            &[&[5, 0, 0, 0, 16, 0, 0, 0][..], &[0; 16], &[0; 8]].concat(),
+        ),
+        refused(
+            ("block_list_lies", "refused: a count that the body cannot hold"),
+            &[&[0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, 0][..], &[0; 8]].concat(),
+        ),
+        refused(("block_list_body_short", "refused: the body is shorter than its elements"), &with(4, 32)),
+        refused(("block_list_body_odd", "refused: the body is no multiple of 8"), &with(4, 39)),
+        refused(("block_list_body_long", "refused: the body ends behind the block"), &with(4, 200)),
+        refused(("block_inner_text", "refused: a text in a list is no UTF-8"), &with(16, 0xFF)),
+        refused(("block_inner_padding", "refused: the padding in a list is not zero"), &with(21, 1)),
+        refused(("block_inner_list", "refused: an inner list has more elements than it may"), &with(56, 4)),
+    ]
 }
 
 fn blocks() -> Vec<Vector> {

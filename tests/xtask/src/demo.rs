@@ -14,8 +14,10 @@ use crate::{binaries, workspace};
 
 mod listing;
 mod stage;
+mod warehouse;
 
 use stage::{STEP, Stage};
+pub(crate) use warehouse::{Options, check as check_warehouse, run as warehouse};
 
 /// How long after the manager the last AGV starts.
 const LATE: Duration = Duration::from_secs(5);

@@ -19,7 +19,7 @@ use crate::binaries;
 use crate::command::Run;
 use crate::groups::Outcome;
 use crate::{install, msrv};
-use boards::{BOARDS, Board};
+use boards::{BOARDS, Board, Image};
 pub(crate) use boards::{built, find, image_build};
 pub(crate) use faults::{Faults, check as check_faults, faults};
 pub(crate) use flash::flash;
@@ -62,7 +62,7 @@ pub(crate) fn test() -> Outcome {
 }
 
 /// What came of a test on the emulated board, which ends with an exit code.
-fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
+pub(crate) fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
     if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
         return Outcome::Skipped(reason);
     }
@@ -77,7 +77,12 @@ fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
 fn tested() -> Result<Option<i32>> {
     let image = tested_image()?;
     let constant = boards::find(TESTED)?.build(&boards::CONSTANT)?;
-    tests(&image)?.args(["--constant".as_ref(), constant.as_os_str()]).code()
+    let checked = tests(&image)?.args(["--constant".as_ref(), constant.as_os_str()]).code()?;
+    if checked != Some(0) {
+        return Ok(checked);
+    }
+    let streams = boards::find(TESTED)?.build(&boards::STREAMS)?;
+    tests(&streams)?.args(["streams", "--rounds", "1"]).code()
 }
 
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.
@@ -104,9 +109,19 @@ fn attacked(arguments: &[&OsStr]) -> Result<Option<String>> {
 
 /// The AGV's image of the emulated board.
 fn tested_image() -> Result<PathBuf> {
+    let Some(image) = boards::find(TESTED)?.images.first() else { bail!("{TESTED} has no image") };
+    emulated_image(image)
+}
+
+/// The image of a vehicle of the warehouse.
+pub(crate) fn warehouse_image() -> Result<PathBuf> {
+    emulated_image(&boards::WAREHOUSE)
+}
+
+/// Builds an image of the emulated board.
+fn emulated_image(image: &Image) -> Result<PathBuf> {
     let board = boards::find(TESTED)?;
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
-    let Some(image) = board.images.first() else { bail!("{TESTED} has no image") };
     board.build(image)
 }
 

@@ -32,7 +32,7 @@ struct Purpose {
 }
 
 /// A layer talks to its neighbour. These are the exceptions of services; everything else of host goes through distribution.
-const HOST_FOR_SERVICES: [Purpose; 18] = [
+const HOST_FOR_SERVICES: [Purpose; 19] = [
     Purpose {
         what: "the cipher's trait, over which all of a session is generic",
         places: &["services"],
@@ -63,6 +63,11 @@ const HOST_FOR_SERVICES: [Purpose; 18] = [
         what: "whether the peer is still there decides how long a session lasts",
         places: &["services/session/mod.rs", "services/session/proving.rs"],
         items: &["connections::Liveness"],
+    },
+    Purpose {
+        what: "where the details of a failure and progress lie, and their frames",
+        places: &["services/session/details.rs"],
+        items: &["connections::Place", "frame::Frame"],
     },
     Purpose { what: "hello and farewell", places: &["services/session/mod.rs"], items: &["frame::Frame"] },
     Purpose { what: "a ping", places: &["services/session/pinging.rs"], items: &["frame::Frame"] },

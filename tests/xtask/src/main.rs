@@ -47,8 +47,8 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Task {
-    /// Runs a manager and three AGVs as processes, shows the paper's listing line by line, then breaks things.
-    Demo,
+    /// Runs a manager and three AGVs as processes, shows the paper's listing line by line, then breaks things; or a warehouse.
+    Demo(demo::Options),
     /// Runs the groups of checks; without names, those of the default run.
     Test {
         /// Groups to run; `--list` shows them.
@@ -140,7 +140,8 @@ enum Task {
 
 fn main() -> ExitCode {
     let finished = match Arguments::parse().task {
-        Task::Demo => demo::run(),
+        Task::Demo(options) if options.warehouse => demo::warehouse(&options),
+        Task::Demo(_) => demo::run(),
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { board, json, write } => firmware::sizes(board.as_deref(), json.as_deref(), write),

@@ -18,12 +18,12 @@ use crate::distribution::parameters::Parameters;
 /// Any valid definition of a few variables, some of them both argument and result.
 pub(crate) fn definition() -> impl Strategy<Value = Definition> {
     let size = prop_oneof![0..4_u32, any::<u32>()];
-    let variable = ("[a-z0-9_./-]{1,8}", prop::sample::select(&Type::ALL[..]), size, 0..3_u8);
+    let variable = ("[a-z0-9_./-]{1,8}", prop::sample::select(&Type::FLAT[..]), size, 0..3_u8);
     ("[A-Za-z0-9_./-]{1,32}", prop::collection::vec(variable, 0..8)).prop_map(|(name, variables)| {
         let mut builder = Builder::new(&name).unwrap();
         let spec = |at: usize| {
             let (name, kind, size, _) = &variables[at];
-            VariableSpec { name, kind: *kind, size: *size }
+            VariableSpec::flat(name, *kind, *size)
         };
         for at in (0..variables.len()).filter(|&at| variables[at].3 != 1) {
             let _ = builder.argument(spec(at));
@@ -41,9 +41,9 @@ fn definition_of(
     results: &[(&str, Type, u32)],
 ) -> Result<Definition, Error> {
     let specs = |list: &'_ [_]| -> Vec<_> {
-        list.iter().map(|&(name, kind, size)| VariableSpec { name, kind, size }).collect()
+        list.iter().map(|&(name, kind, size)| VariableSpec::flat(name, kind, size)).collect()
     };
-    Definition::build(name, specs(arguments).into_iter(), specs(results).into_iter())
+    Builder::of(name, specs(arguments).into_iter(), specs(results).into_iter()).map(Builder::finish)
 }
 
 #[test]
@@ -53,7 +53,7 @@ fn the_encoding_is_as_documented() {
     assert_eq!(definition.as_bytes(), bytes);
     let signature = Signature::decode(&bytes).unwrap();
     assert_eq!(signature.name(), "go");
-    assert_eq!(signature.arguments().collect::<Vec<_>>(), [VariableSpec { name: "x", kind: Type::Float, size: 2 }]);
+    assert_eq!(signature.arguments().collect::<Vec<_>>(), [VariableSpec::flat("x", Type::Float, 2)]);
     assert_eq!(format!("{signature}"), "go(x: float[2]) -> (ok: bool[258])");
 }
 
@@ -95,21 +95,16 @@ fn arguments_and_results_fit_one_parameters() {
 
 #[test]
 fn a_signature_is_bounded() {
-    let names: Vec<String> = (0..11).map(|index| format!("{index:0>32}")).collect();
+    let names: Vec<String> = (0..16).map(|index| format!("{index:0>32}")).collect();
     let variables: Vec<_> = names.iter().map(|name| (name.as_str(), Type::Bool, 1)).collect();
-    assert_eq!(definition_of("f", &variables, &[]), Err(Error::Full(Limit::SignatureBytes)));
-    // 1 + name + 1 + 9 * 38 + 1 bytes: the longest name that fits, with the number of results at the very end.
-    let name = |length| format!("{:0>1$}", 1, length);
-    assert_eq!(definition_of(&name(32), &variables[..9], &[]).unwrap().as_bytes().len(), 377);
-    let last = [("1", Type::Bool, 1)];
-    let mut all = variables[..9].to_vec();
-    all.extend(last);
-    assert_eq!(definition_of(&name(32), &all, &[]).unwrap().as_bytes().len(), SIGNATURE_BYTES);
-    assert_eq!(definition_of(&name(32), &variables[..9], &last).unwrap().as_bytes().len(), SIGNATURE_BYTES);
-    let longer = [("12", Type::Bool, 1)];
-    assert_eq!(definition_of(&name(32), &variables[..9], &longer), Err(Error::Full(Limit::SignatureBytes)));
-    all[9] = longer[0];
-    assert_eq!(definition_of(&name(32), &all, &[]), Err(Error::Full(Limit::SignatureBytes)));
+    assert_eq!(definition_of("f", &variables, &variables), Err(Error::Full(Limit::SignatureBytes)));
+    // 1 + name + 1 + variables of 38 bytes + 1, and a last result that fills it, with a name of its own.
+    let fitting = (SIGNATURE_BYTES - 4 - 7) / 38;
+    let (arguments, results) = (&variables[..fitting.min(15)], &variables[..fitting.saturating_sub(15)]);
+    let name = "a".repeat(SIGNATURE_BYTES - 4 - 38 * fitting - 6);
+    let results = [results, &[(&*name, Type::Bool, 1)]].concat();
+    assert_eq!(definition_of("f", arguments, &results).unwrap().as_bytes().len(), SIGNATURE_BYTES);
+    assert_eq!(definition_of("fg", arguments, &results), Err(Error::Full(Limit::SignatureBytes)));
 }
 
 #[test]
@@ -163,4 +158,27 @@ proptest! {
             prop_assert_eq!(parsed.as_bytes(), &bytes[..]);
         }
     }
+}
+
+/// A unit without the feature passes them over all the same.
+#[test]
+fn what_follows_the_results_is_sections_whose_numbers_rise() {
+    let plain = [1, b'f', 0, 0];
+    let section = |number: u8| [number, 1, 0, 1, 1, 0, 0, 0, b'x'];
+    let of = |sections: &[&[u8]]| Signature::decode(&[&plain[..], &sections.concat()].concat()).map(|_| ());
+    assert_eq!(of(&[&section(1), &section(2), &section(9)]), Ok(()));
+    let wrong: [&[&[u8]]; 6] = [
+        &[&section(0)],
+        &[&section(2), &section(1)],
+        &[&section(1), &section(1)],
+        &[&[1, 0]],
+        &[&[1]],
+        &[&section(1)[..8]],
+    ];
+    for sections in wrong {
+        assert_eq!(of(sections), Err(Error::Malformed), "{sections:?}");
+    }
+    let many: std::vec::Vec<_> = (1..200).map(section).collect();
+    let many: std::vec::Vec<&[u8]> = many.iter().map(|section| &section[..]).collect();
+    assert_eq!(of(&many), Err(Error::Malformed), "longer than any definition");
 }

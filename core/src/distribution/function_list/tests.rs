@@ -72,29 +72,29 @@ fn replacing_makes_old_requests_stale() {
 }
 
 #[test]
-fn a_peers_list_keeps_its_functions_in_longer_slices() {
-    let mut list = theirs(2, 8);
+fn a_peers_list_grows_with_its_functions_and_up_to_what_it_may_have() {
+    let mut list = theirs(1, 8);
     let tell = |list: &mut Theirs, slot: u16, text: &str| {
         list.insert(Slot(slot), Generation(7), usual(), parse(text).as_bytes())
     };
     tell(&mut list, 0, "a()").unwrap();
-    assert_eq!(list.room(), (1, 8 - parse("a()").as_bytes().len()));
-    assert!(tell(&mut list, 1, "b(position: int[2])").is_err());
-    let slices = |functions: usize, bytes: usize| {
-        ((0..functions).map(|_| Entry::empty()).collect::<Vec<_>>().into_boxed_slice(), vec![0; bytes].into())
-    };
-    let (entries, bytes) = slices(1, 100);
-    assert_eq!(list.grow(entries, bytes).0.len(), 1, "shorter ones are given back");
-    let (entries, bytes) = slices(8, 100);
-    assert_eq!(list.grow(entries, bytes).0.len(), 2);
+    assert_eq!(tell(&mut list, 1, "b()").err(), Some(Error::Full(Limit::Functions)), "it may not grow");
+    list.let_grow(4, 60);
     tell(&mut list, 1, "b(position: int[2])").unwrap();
+    assert_eq!(list.table.entries.len(), 2, "half as many again, or those that are needed");
     tell(&mut list, 9, "c()").unwrap();
     assert_eq!(format!("{}", list.show_functions()), "a()\nb(position: int[2])\nc()\n");
     assert!(list.iter().all(|function| function.generation == Generation(7)));
+    let long = "d(wwwwwwwwwwwwwwwwwwwwwwwwwwwwww: int, xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx: int)";
+    assert_eq!(tell(&mut list, 2, long).err(), Some(Error::Full(Limit::SignatureBytes)));
+    tell(&mut list, 2, "d()").unwrap();
+    assert_eq!(tell(&mut list, 3, "e()").err(), Some(Error::Full(Limit::Functions)));
+    assert_eq!((list.table.entries.len(), list.table.bytes.len()), (4, 60));
     assert!(list.remove(Slot(0)));
-    assert_eq!((list.room().0, list.len(), list.skipped()), (6, 2, 1));
+    tell(&mut list, 3, "e()").unwrap();
+    assert_eq!((list.table.entries.len(), list.len(), list.skipped()), (4, 4, 3));
     list.clear();
-    assert_eq!(list.room(), (8, 100));
+    assert!(list.is_empty());
 }
 
 #[test]

@@ -7,7 +7,7 @@ use crate::distribution::function::Definition;
 use crate::distribution::parameters::Parameters;
 
 const fn spec(name: &'static str, kind: Type, size: u32) -> VariableSpec<'static> {
-    VariableSpec { name, kind, size }
+    VariableSpec::flat(name, kind, size)
 }
 
 const POSITION: VariableSpec<'static> = spec("position", Type::Int, 2);
@@ -16,8 +16,15 @@ const DONE: VariableSpec<'static> = spec("done", Type::Bool, 1);
 
 const ARGUMENTS: &[VariableSpec<'static>] = &[TEXT, POSITION];
 const RESULTS: &[VariableSpec<'static>] = &[DONE, POSITION, spec("left", Type::Float, 1)];
-const BYTES: usize = encoded_bytes("go-to", ARGUMENTS, RESULTS);
-const GO_TO: Result<Encoded<BYTES>, &str> = Encoded::new("go-to", ARGUMENTS, RESULTS);
+const PROGRESS: &[VariableSpec<'static>] = &[spec("left", Type::Float, 1)];
+const FAILS: &[VariableSpec<'static>] = &[spec("at", Type::Int, 2)];
+const DECLARED: Declared<'static> = declared(ARGUMENTS, RESULTS);
+const BYTES: usize = DECLARED.encoded_bytes("go-to");
+const GO_TO: Result<Encoded<BYTES>, &str> = Encoded::new("go-to", DECLARED);
+
+const fn declared<'a>(arguments: &'a [VariableSpec<'a>], results: &'a [VariableSpec<'a>]) -> Declared<'a> {
+    Declared { arguments, results, progress: &[], fails: &[] }
+}
 
 fn parsed(text: &str) -> Definition {
     Definition::parse(text).unwrap()
@@ -31,8 +38,39 @@ fn what_is_encoded_when_compiling_is_what_is_parsed_at_run_time() {
     assert_eq!(Signature::decode(encoded.signature().as_bytes()).unwrap().to_string(), text);
     let bytes = parameters_bytes(ARGUMENTS, RESULTS);
     assert_eq!(bytes as u32, encoded.signature().parameters_bytes());
-    assert_eq!(encoded_bytes("f", &[], &[]), parsed("f()").as_bytes().len());
+    assert_eq!(declared(&[], &[]).encoded_bytes("f"), parsed("f()").as_bytes().len());
     assert_eq!(parameters_bytes(&[], &[]), 0);
+}
+
+#[cfg(feature = "details")]
+#[test]
+fn sections_are_encoded_when_compiling() {
+    const TOLD: Declared<'static> = Declared { progress: PROGRESS, fails: FAILS, ..DECLARED };
+    const NO_PROGRESS: Declared<'static> = Declared { progress: &[], ..TOLD };
+    let text = "go-to(text: string[200], position: int[2]) -> (done: bool, position: int[2], left: float)";
+    let told = Encoded::<{ TOLD.encoded_bytes("go-to") }>::new("go-to", TOLD).unwrap();
+    let whole = std::format!("{text} progress (left: float) fails (at: int[2])");
+    assert_eq!(told.signature().as_bytes(), parsed(&whole).as_bytes());
+    let told = Encoded::<{ NO_PROGRESS.encoded_bytes("go-to") }>::new("go-to", NO_PROGRESS).unwrap();
+    assert_eq!(told.signature().as_bytes(), parsed(&std::format!("{text} fails (at: int[2])")).as_bytes());
+}
+
+#[cfg(feature = "details")]
+#[test]
+fn a_peer_may_leave_sections_out_and_has_them_alike() {
+    let ours = parsed("go() progress (left: float, at: int[2]) fails (at: int[2])");
+    let differs = |theirs: &str| {
+        let theirs = parsed(theirs);
+        Mismatch::check(ours.signature(), theirs.signature()).err().map(|mismatch| mismatch.to_string())
+    };
+    assert_eq!(differs("go()"), None);
+    assert_eq!(differs("go() progress (at: int[2], left: float, more: int)"), None);
+    let told = differs("go() progress (at: int[2], left: int)").unwrap();
+    assert!(told.contains("its progress left is int there and float here"), "{told}");
+    let told = differs("go() fails (at: int[3])").unwrap();
+    assert!(told.contains("its failure's at is int[3] there and int[2] here"), "{told}");
+    let told = differs("go() progress (left: float)").unwrap();
+    assert!(told.contains("its progress at is missing there"), "{told}");
 }
 
 #[test]
@@ -55,7 +93,7 @@ fn places_are_those_of_a_view_made_from_the_signature() {
 #[test]
 fn every_rule_of_a_definition_holds_when_compiling() {
     let refused = |name: &str, arguments: &[VariableSpec<'_>], results: &[VariableSpec<'_>]| {
-        Encoded::<BYTES>::new(name, arguments, results).err().unwrap_or_default()
+        Encoded::<BYTES>::new(name, declared(arguments, results)).err().unwrap_or_default()
     };
     assert_eq!(refused("go-to", ARGUMENTS, RESULTS), "");
     assert!(refused("go to", ARGUMENTS, RESULTS).contains("a function's name"));
@@ -73,10 +111,28 @@ fn every_rule_of_a_definition_holds_when_compiling() {
     assert!(refused("f", &many, &[]).contains("at most 16"));
     assert!(refused("f", &many[..16], &many[16..]).contains("at most 16"));
     assert_eq!(refused("f", &many[..16], &many[..16]), "the signature has another length");
-    let names: std::vec::Vec<_> = (0..11).map(|index| std::format!("{index:030}")).collect();
+    let names: std::vec::Vec<_> = (0..16).map(|index| std::format!("{index:032}")).collect();
     let long: std::vec::Vec<_> = names.iter().map(|name| VariableSpec { name, ..DONE }).collect();
-    assert!(refused("f", &long, &[]).contains("384 bytes"));
+    assert!(refused("f", &long, &long).contains("`SIGNATURE_BYTES`"));
     assert_eq!(refused("f", &[], &[]), "the signature has another length");
+}
+
+#[test]
+fn every_rule_of_sections_holds_when_compiling() {
+    let refused = |progress: &[VariableSpec<'_>], fails: &[VariableSpec<'_>]| {
+        let declared = Declared { arguments: &[], results: &[], progress, fails };
+        Encoded::<12>::new("f", declared).err().unwrap_or_default()
+    };
+    assert!(refused(&[VariableSpec { name: "a b", ..DONE }], &[]).contains("has a name of 1 to 32"));
+    assert!(refused(&[], &[VariableSpec { name: "", ..DONE }]).contains("has a name of 1 to 32"));
+    assert!(refused(&[DONE, DONE], &[]).contains("two values"));
+    assert!(refused(&[], &[POSITION, POSITION]).contains("two values"));
+    assert_eq!(refused(&[], &[spec("text", Type::String, 252)]), "the signature has another length");
+    assert!(refused(&[], &[spec("text", Type::String, 253)]).contains("FAILURE_VALUES_BYTES"));
+    let names: std::vec::Vec<_> = (0..17).map(|number| std::format!("n{number}")).collect();
+    let many: std::vec::Vec<_> = names.iter().map(|name| VariableSpec { name, ..DONE }).collect();
+    assert!(refused(&many, &[]).contains("at most 16"));
+    assert!(refused(&[], &many).contains("at most 16"));
 }
 
 #[test]
@@ -126,8 +182,13 @@ impl Variables for Pose {
     }
 
     fn write_places(&self, parameters: &mut ParametersView, places: &[u8]) -> Result<(), Error> {
-        parameters.target_of(place(places, 0)).and_then(|target| self.at.to_field(target))?;
-        parameters.target_of(place(places, 1)).and_then(|target| self.photo.to_field(target))
+        parameters.slot_of(place(places, 0)).and_then(|slot| self.at.to_field(slot))?;
+        parameters.slot_of(place(places, 1)).and_then(|slot| self.photo.to_field(slot))
+    }
+
+    fn with_parameters<R>(&self, look: impl FnOnce(&ParametersView) -> R) -> Result<R, Error> {
+        let mut parameters = Parameters::<64>::sized();
+        self.to_parameters(&mut parameters).map(|()| look(&parameters))
     }
 }
 
@@ -144,7 +205,7 @@ fn a_struct_is_found_by_its_names_in_any_parameters() {
     assert_eq!(parameters.variable::<[i64; 2]>("at"), Ok([1, -2]));
     let text = heapless::String::<3>::try_from("abc").unwrap();
     parameters.add_string("text", 5).unwrap();
-    text.to_field(parameters.target_of(3).unwrap()).unwrap();
+    text.to_field(parameters.slot_of(3).unwrap()).unwrap();
     assert_eq!(heapless::String::<3>::from_field(parameters.value_of(3).unwrap()), Ok(text));
     assert_eq!(heapless::String::<2>::from_field(parameters.value_of(3).unwrap()), Err(Error::OutOfRange));
     assert_eq!(argument::<u8>(&parameters, 2), Err(ServiceError::Failed(BAD_ARGUMENT)), "a bool");

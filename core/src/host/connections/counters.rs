@@ -83,6 +83,24 @@ crate::counters::counters! {
         RenewalsStopped,
         /// Leases of calls of this unit that it released because the peer answered no renewal for the length of the lease.
         RenewalsUnanswered,
+        /// Texts or values of failures that were cut or dropped, because they were too long or did not fit the signature.
+        #[cfg(feature = "details")]
+        DetailsDropped,
+        /// Progress of calls sent.
+        #[cfg(feature = "details")]
+        ProgressSent,
+        /// Progress of calls received.
+        #[cfg(feature = "details")]
+        ProgressReceived,
+        /// Progress received of calls that have ended, or that could not be read.
+        #[cfg(feature = "details")]
+        ProgressDropped,
+        /// Calls of the peer that it gave up while they ran.
+        #[cfg(feature = "details")]
+        RunningCancelled,
+        /// Cancellations of calls that had ended already.
+        #[cfg(feature = "details")]
+        CancelsIgnored,
         /// Values of streams sent to a subscriber.
         #[cfg(feature = "streams")]
         SamplesSent,

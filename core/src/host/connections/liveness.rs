@@ -62,6 +62,12 @@ impl Liveness {
         self.datagrams_pass
     }
 
+    /// How long ago the peer was last heard. Late looks make it too short by as much as they were late.
+    pub fn silent_for(&self, now: Instant) -> Duration {
+        let missed = (0..self.missed).fold(Duration::ZERO, |missed, _| missed + self.period);
+        now.since(self.next_check - missed - self.period - self.period.divided_by(2))
+    }
+
     /// When to look again.
     #[inline]
     pub fn deadline(&self) -> Instant {
@@ -164,6 +170,17 @@ mod tests {
             assert_eq!(liveness.deadline(), at(second * 1_000 + 1_500));
             assert_eq!(liveness.poll(at(second * 1_000 + 999)), NOTHING);
         }
+    }
+
+    #[test]
+    fn the_time_since_the_last_sign_goes_on_while_keep_alives_are_missed() {
+        let mut liveness = Liveness::new(at(0), PERIOD);
+        liveness.heard(at(1_000));
+        assert_eq!(liveness.silent_for(at(1_200)), Duration::from_millis(200));
+        assert!(liveness.poll(at(2_500)).missed);
+        assert_eq!(liveness.silent_for(at(2_700)), Duration::from_millis(1_700));
+        liveness.heard(at(3_000));
+        assert_eq!(liveness.silent_for(at(3_000)), Duration::ZERO);
     }
 
     #[test]

@@ -15,6 +15,16 @@ use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Ticket};
 use crate::services::{Context, Port};
 
+/// What goes with an error to its caller.
+#[cfg(feature = "details")]
+type Details<'a> = Option<&'a crate::distribution::failure::Failure>;
+#[cfg(feature = "details")]
+const NO_DETAILS: Details<'static> = None;
+#[cfg(not(feature = "details"))]
+type Details<'a> = core::marker::PhantomData<&'a ()>;
+#[cfg(not(feature = "details"))]
+const NO_DETAILS: Details<'static> = core::marker::PhantomData;
+
 impl<P: Port> Session<P> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
     /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`, and
@@ -110,6 +120,17 @@ impl<P: Port> Session<P> {
         ticket: Ticket,
         result: Result<&ParametersView, Error>,
     ) -> Result<(), Error> {
+        self.answer_with(cx, ticket, result, NO_DETAILS)
+    }
+
+    /// One piece of code for answers with and without details.
+    pub(super) fn answer_with(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        ticket: Ticket,
+        result: Result<&ParametersView, Error>,
+        details: Details<'_>,
+    ) -> Result<(), Error> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
         // Before the answer leaves: one that says it was reset is true.
         let result = if head.resets {
@@ -125,7 +146,7 @@ impl<P: Port> Session<P> {
             let sent = match result {
                 Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
                 Ok(_) => Ok(()),
-                Err(error) => self.send_error(cx, head.id, head.priority, head.wants_reply, error),
+                Err(error) => self.send_failure(cx, &head, error, details),
             };
             // Returned before the call is closed: the port tries again, and the lease goes on meanwhile.
             if let Err(error @ Error::Full(_)) = sent {
@@ -181,7 +202,18 @@ impl<P: Port> Session<P> {
         }
     }
 
-    fn send_error(
+    #[cfg(not(feature = "details"))]
+    fn send_failure(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        head: &CallHead,
+        error: Error,
+        _: Details<'_>,
+    ) -> Result<(), Error> {
+        self.send_error(cx, head.id, head.priority, head.wants_reply, error)
+    }
+
+    pub(super) fn send_error(
         &mut self,
         cx: &mut Context<'_, P>,
         id: u32,

@@ -8,7 +8,7 @@ use crate::distribution::identity::Identity;
 use crate::distribution::message::{Control, Release, Renewal, RequestHeader};
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
-use crate::services::calls::CallHead;
+use crate::services::calls::{CallHead, Cancelled};
 use crate::services::lease::{Claim, Granted, Latch, Lease, LeaseEnd, Order, Service};
 use crate::services::{Context, Port};
 use crate::storage::take_at;
@@ -156,7 +156,7 @@ impl<P: Port> Session<P> {
     #[inline(never)]
     pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
         // Its caller has been told that it failed, and may not know that anything may move again.
-        if head.deadline <= cx.now {
+        if head.deadline <= cx.now || head.cancelled != Cancelled::No {
             return Err(Error::Expired);
         }
         let mut latched = None;

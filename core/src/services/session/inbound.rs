@@ -6,7 +6,7 @@ use super::publishing::Told;
 use super::timing::sent_at_earliest;
 use super::{Event, Phase, Session, close_reason};
 use crate::config::{EMERGENCY_BYTES, Priority};
-use crate::distribution::function::{Attributes, Signature};
+use crate::distribution::function::{Attributes, Signature, VariableSpecs};
 use crate::distribution::function_list::{Function, Generation, Slot};
 use crate::distribution::items::{Items, Malformed};
 use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeader, SessionBody};
@@ -17,7 +17,7 @@ use crate::host::connections::{Incoming, LinkCounter, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
-use crate::services::calls::{CallHead, Seen};
+use crate::services::calls::{CallHead, Cancelled, Seen};
 use crate::services::lease::ActuatorState;
 use crate::services::lease::Service;
 use crate::services::requests::{CallId, Pending};
@@ -55,19 +55,27 @@ pub struct Results {
 /// The results of a call, still in the buffer that they came in.
 #[derive(Clone, Copy, Debug)]
 pub struct ReplyBlock<'b> {
-    signature: Signature<'b>,
-    bytes: &'b [u8],
+    pub(super) signature: Signature<'b>,
+    pub(super) specs: VariableSpecs<'b>,
+    pub(super) bytes: &'b [u8],
 }
 
 impl<'b> ReplyBlock<'b> {
     /// Updates `parameters` with the results; on an error they are unchanged.
     pub fn read_into(&self, parameters: &mut ParametersView) -> Result<(), Error> {
-        block::read(self.signature.results(), self.bytes, parameters)
+        block::read(self.specs, self.bytes, parameters)
     }
 
     /// The function that answered.
     pub const fn signature(&self) -> Signature<'b> {
         self.signature
+    }
+
+    /// Bytes of a `Parameters` that holds all of its values. What lists hold is not known from the signature: it is no more than
+    /// the block.
+    pub fn parameters_bytes(&self) -> u32 {
+        let block = u32::try_from(self.bytes.len()).unwrap_or(u32::MAX);
+        self.specs.parameters_bytes().saturating_add(block)
     }
 
     /// The encoded block.
@@ -160,7 +168,7 @@ impl<P: Port> Session<P> {
         let function = self.theirs.function(results.slot).filter(|function| function.generation == results.generation);
         match function {
             Some(Function { signature, .. }) if results.step == self.step => {
-                Ok(ReplyBlock { signature, bytes: self.link.view(results.block, lent) })
+                Ok(ReplyBlock { signature, specs: signature.results(), bytes: self.link.view(results.block, lent) })
             }
             _ => Err(Error::ResultLost),
         }
@@ -251,6 +259,8 @@ impl<P: Port> Session<P> {
                 None
             }
             Some(SessionBody::Release(release)) => self.released(cx, release),
+            #[cfg(feature = "details")]
+            Some(SessionBody::Cancel(release)) => self.cancel_arrived(cx, release),
             Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
             Some(SessionBody::Message(priority, message)) => {
                 match (Priority::from_wire(priority), Message::decode(message)) {
@@ -286,6 +296,8 @@ impl<P: Port> Session<P> {
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
+        #[cfg(feature = "details")]
+        self.note_failure(place, lent);
         match Message::decode(self.link.view(place, lent)) {
             Some(Message::Request(header, block)) => {
                 let block = place.last(block.len());
@@ -303,6 +315,11 @@ impl<P: Port> Session<P> {
             Some(Message::Sample(header, block)) => {
                 let block = place.last(block.len());
                 self.sample_arrived(cx.now, &header, block, lent)
+            }
+            #[cfg(feature = "details")]
+            Some(Message::Progress(id, block)) => {
+                let block = place.last(block.len());
+                self.progress_arrived(CallId(id), block, lent)
             }
             Some(Message::Control(items)) => {
                 let items = place.last(items.len());
@@ -531,6 +548,8 @@ impl<P: Port> Session<P> {
             generation: header.generation,
             priority,
             wants_reply: header.wants_reply,
+            wants_progress: header.wants_progress,
+            cancelled: Cancelled::No,
             takes_over: header.takes_over,
             operator: header.operator,
             resets: false,

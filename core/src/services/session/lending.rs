@@ -2,12 +2,9 @@
 //! its peer needs and no more.
 
 use super::publishing::Publication;
-use super::{CallHead, Entry, Pending, Session};
+use super::{CallHead, Pending, Session};
 use crate::services::Port;
 use crate::storage::Storage;
-
-/// A peer's list: one entry per function, and the bytes of their signatures.
-pub type ListSlices<S> = (<S as Storage>::Slice<Entry>, <S as Storage>::Slice<u8>);
 
 impl<P: Port> Session<P> {
     /// How many calls of this unit may be in flight.
@@ -38,10 +35,9 @@ impl<P: Port> Session<P> {
         self.calls.grow(running)
     }
 
-    /// Lends more room for the peer's list; functions that were skipped before stay so until the peer tells them again.
-    /// Returns the slices that are not needed any more: the new ones if one of them is shorter than before.
-    pub fn lend_functions(&mut self, (entries, bytes): ListSlices<P::Storage>) -> ListSlices<P::Storage> {
-        self.theirs.grow(entries, bytes)
+    /// Lets the peer's list grow to so many functions, and so many bytes of signatures, where the storage has an allocator.
+    pub const fn let_list_grow(&mut self, functions: usize, bytes: usize) {
+        self.theirs.let_grow(functions, bytes);
     }
 
     /// Functions of this unit's own list that the peer can be told of.

@@ -17,6 +17,8 @@
 
 mod answering;
 mod consulting;
+#[cfg(feature = "details")]
+mod details;
 mod granting;
 mod holding;
 mod inbound;
@@ -32,7 +34,6 @@ mod streaming;
 mod timing;
 
 pub use inbound::{Receipt, ReplyBlock, Results};
-pub use lending::ListSlices;
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
 #[cfg(feature = "streams")]
@@ -142,6 +143,12 @@ pub enum Event {
         /// Its state.
         state: ActuatorState,
     },
+    /// What a call of this unit tells while it runs; [`Session::progress_values`] shows the values.
+    #[cfg(feature = "details")]
+    Progress(CallId, Results),
+    /// The caller has given up a call that runs: its handler is to be told, and the answer reaches no one.
+    #[cfg(feature = "details")]
+    Cancelled(Ticket),
     /// A value of a stream of the peer.
     #[cfg(feature = "streams")]
     Sample(Sample),
@@ -228,6 +235,8 @@ pub struct Session<P: Port> {
     releases: holding::Releases,
     #[cfg(feature = "streams")]
     streaming: streaming::Streaming,
+    #[cfg(feature = "details")]
+    details: details::Details,
     /// The newest call that was to move something.
     last_order: Option<(Slot, CallId)>,
     /// How often something was received, by which [`Results`] are known to be the last ones.
@@ -277,6 +286,8 @@ impl<P: Port> Session<P> {
             releases: holding::Releases::new(),
             #[cfg(feature = "streams")]
             streaming: streaming::Streaming::new(),
+            #[cfg(feature = "details")]
+            details: details::Details::new(),
             last_order: None,
             step: 0,
         }
@@ -392,6 +403,16 @@ impl<P: Port> Session<P> {
     /// Calls of the peer that run or wait here.
     pub const fn calls_held(&self) -> u16 {
         self.calls.held()
+    }
+
+    /// How long ago the peer was last heard.
+    pub fn silent_for(&self, now: Instant) -> Duration {
+        self.liveness.silent_for(now)
+    }
+
+    /// Bytes of messages and frames that the network has not taken yet.
+    pub fn bytes_queued(&self) -> usize {
+        self.link.queued()
     }
 
     /// Bytes wait for the stream to become writable. Those that gather do not: they have a deadline.

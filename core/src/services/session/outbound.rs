@@ -43,6 +43,9 @@ pub struct RequestOptions {
     pub take_over: bool,
     /// An operator makes it, and not the unit's program: each of them holds for itself what it moves.
     pub operator: bool,
+    /// Tell what the call tells while it runs, if its function declares that.
+    #[cfg(feature = "details")]
+    pub progress: bool,
 }
 
 impl RequestOptions {
@@ -55,6 +58,8 @@ impl RequestOptions {
             renew: Renew::Never,
             take_over: false,
             operator: false,
+            #[cfg(feature = "details")]
+            progress: false,
         }
     }
 
@@ -166,11 +171,16 @@ impl<P: Port> Session<P> {
         }
         let (stamp, since) = self.clock.tell(cx.now);
         let remaining = options.timeout.unwrap_or(self.constraints.request_timeout);
+        #[cfg(feature = "details")]
+        let wants_progress = wants_reply && options.progress && function.signature.progress().next().is_some();
+        #[cfg(not(feature = "details"))]
+        let wants_progress = false;
         let header = RequestHeader {
             id: 0,
             slot: function.slot,
             generation: function.generation,
             wants_reply,
+            wants_progress,
             takes_over: options.take_over,
             operator: options.operator,
             unknown: 0,
@@ -198,8 +208,8 @@ impl<P: Port> Session<P> {
     fn take_id(&mut self, cx: &mut Context<'_, P>, checked: &Checked, wants_reply: bool) -> Result<CallId, Error> {
         let header = &checked.header;
         let id = if wants_reply {
-            let leased = checked.lease.map(|_| checked.priority);
-            self.requests.open(header.slot, header.generation, cx.now + header.remaining, leased)?
+            let (deadline, class) = (cx.now + header.remaining, checked.priority);
+            self.requests.open(header.slot, header.generation, deadline, class, checked.lease.is_some())?
         } else {
             self.requests.next_id()
         };

@@ -1,12 +1,13 @@
 //! Which of this unit's functions one peer has been told of, and what it is still to be told.
 
+use super::LEAST_MESSAGE_BYTES;
 use super::{Phase, Session};
 use crate::config::{Priority, SIGNATURE_BYTES};
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::hello::Limits;
 use crate::distribution::identity::Identity;
-use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
+use crate::distribution::message::{CONTROL_BYTES, Control, LONGEST_HEADER_BYTES, PUBLISH_BYTES};
 use crate::host::secure::Secure;
 use crate::services::access::Bucket;
 use crate::services::lease::{ActuatorState, LastOrder};
@@ -311,11 +312,14 @@ impl<P: Port> Session<P> {
                 None => self.send_control(cx, &Control::Withdraw { slot: slot.0 }),
                 Some(function) => {
                     let actuator = self.actuator_of(cx, function.handler);
+                    let signature = function.signature.as_bytes();
                     let control = Control::Publish {
                         slot: slot.0,
                         generation: function.generation.0,
                         attributes: &Attributes { actuator, ..*function.attributes }.encode(),
-                        signature: function.signature.as_bytes(),
+                        // One that the peer has no buffer for would end the link. It counts as not kept there, as any that
+                        // it cannot read.
+                        signature: if self.may_hold(signature.len()) { signature } else { &[] },
                     };
                     self.send_control(cx, &control)
                 }
@@ -332,6 +336,14 @@ impl<P: Port> Session<P> {
             }
         }
         true
+    }
+
+    /// Whether the peer takes a message with a signature of this length.
+    fn may_hold(&self, length: usize) -> bool {
+        let theirs = self.hello().map_or(0, |hello| hello.limits.message_size);
+        let limit = (theirs as usize).saturating_add(LONGEST_HEADER_BYTES).max(LEAST_MESSAGE_BYTES);
+        CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES <= LEAST_MESSAGE_BYTES
+            || length.saturating_add(CONTROL_BYTES + PUBLISH_BYTES) <= limit
     }
 
     /// Sends a control message; `false` when there is no room, or nobody to send it to.

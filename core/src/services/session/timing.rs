@@ -109,6 +109,8 @@ impl<P: Port> Session<P> {
                 let own = own.min(self.renewal.deadline(self.dialed));
                 #[cfg(feature = "streams")]
                 let own = own.min(self.streaming.deadline(self.link.queued()));
+                #[cfg(feature = "details")]
+                let own = own.min(self.details.deadline());
                 own.min(self.requests.deadline()).min(self.liveness.deadline())
             }
         }
@@ -139,9 +141,15 @@ impl<P: Port> Session<P> {
         }
         if let Some(pending) = self.requests.expire(cx.now) {
             let id = pending.id;
+            #[cfg(feature = "details")]
+            self.send_cancel(cx, &pending);
             self.release_call(cx, id, Some(pending));
             self.link.counters.count(LinkCounter::CallsTimedOut);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
+        }
+        #[cfg(feature = "details")]
+        if let Some(event) = self.poll_details(cx.now) {
+            return Some(event);
         }
         // From here on only frames are sent; what the port has to do for others was returned above, one event a call.
         if self.has_news() {

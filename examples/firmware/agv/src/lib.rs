@@ -15,10 +15,14 @@ pub mod least;
 pub mod led;
 mod log;
 pub mod provision;
+#[cfg(feature = "streams")]
+mod streams;
 #[cfg(feature = "tasks")]
 pub mod tasks;
 #[cfg(feature = "secure")]
 mod terms;
+#[cfg(feature = "warehouse")]
+pub mod warehouse;
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
@@ -27,7 +31,7 @@ use cara_apps::mechanic;
 use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
-use cara_core::services::lease::{Latch, Lease};
+use cara_core::services::lease::{Latch, Lease, Stage};
 use cara_embassy::{
     Config, Handle, Handler, Hook, LeaseWatch, Limits, Runner, Security, ServiceOptions, now, resources,
 };
@@ -68,10 +72,11 @@ pub fn bumper(pressed: bool) {
     }
 }
 
-/// Whether the motors may run now: the vehicle has a target and a live lease. The interrupt of a board's motors asks
-/// this each time and cuts them off otherwise, so that they stop in time even if no task runs any more.
+/// Whether the motors may run now: the vehicle has a target, and its lease is live or, where it has a ramp to brake on, has
+/// ended a moment ago. The interrupt of a board's motors asks this each time and cuts them off otherwise, so that they stop in
+/// time even if no task runs any more.
 pub fn may_move() -> bool {
-    HAS_TARGET.load(Ordering::Acquire) && DRIVING.is_live(now())
+    HAS_TARGET.load(Ordering::Acquire) && DRIVING.stage(now()) != Stage::Dead
 }
 
 /// Why there is no vehicle.
@@ -184,6 +189,8 @@ fn tell_stop(place: Place) {
 
 /// The motors' loop: drives while the lease is live.
 pub async fn drive(vehicle: Vehicle) -> ! {
+    #[cfg(feature = "streams")]
+    let streams = streams::Streams::add(vehicle).inspect_err(|_| error!("no room for the streams")).ok();
     let mut ticker = Ticker::every(Duration::from_micros(TICK.as_micros()));
     loop {
         ticker.next().await;
@@ -193,6 +200,8 @@ pub async fn drive(vehicle: Vehicle) -> ! {
             HAS_TARGET.store(agv.target().is_some(), Ordering::Release);
             (progress, agv.finished())
         });
+        #[cfg(feature = "streams")]
+        streams.as_ref().into_iter().for_each(|streams| streams.publish(vehicle));
         let Ok((progress, finished)) = progress else { continue };
         if let Some(order) = finished {
             vehicle.end_order(&order);

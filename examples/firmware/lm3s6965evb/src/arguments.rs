@@ -8,8 +8,10 @@
 //!   do, because a list of the host's processes shows arguments;
 //! - `boots=PATH`: the file of the host that stands for the two pages of flash of the board's boot counter and its
 //!   term;
+//! - `at=X,Y`: the cell in which a vehicle of the warehouse stands;
 //! - `seed=N` replaces the hardware's noise, for tests in which each boot has the same.
 
+use cara_apps::warehouse::Cell;
 use cara_settings::{Settings, TextError};
 #[cfg(not(feature = "secure"))]
 use cara_vehicle::provision::{Provision, halves};
@@ -26,6 +28,8 @@ const WORDS: usize = 1024;
 pub struct Told {
     /// The settings.
     pub settings: Settings,
+    /// Where a vehicle of the warehouse stands.
+    pub at: Option<Cell>,
     /// What makes random numbers differ.
     pub noise: u64,
     #[cfg(feature = "secure")]
@@ -59,6 +63,7 @@ impl ArgumentError {
 struct Words {
     text: Vec<u8, WORDS>,
     seed: Option<u64>,
+    at: Option<Cell>,
     file: Path,
     boots: Path,
 }
@@ -70,6 +75,7 @@ impl Words {
     fn add(&mut self, word: &str) -> Result<(), ()> {
         match word.split_once('=') {
             Some(("seed", number)) => self.seed = Some(number.parse().map_err(drop)?),
+            Some(("at", cell)) => self.at = Some(cell.parse()?),
             Some(("file", path)) => self.file = String::try_from(path).map_err(drop)?,
             Some(("boots", path)) => self.boots = String::try_from(path).map_err(drop)?,
             _ => [word.as_bytes(), b" "].iter().try_for_each(|part| self.text.extend_from_slice(part)).map_err(drop)?,
@@ -94,6 +100,7 @@ pub fn read() -> Result<Told, ArgumentError> {
     let noise = words.seed.unwrap_or_else(clock);
     Ok(Told {
         settings,
+        at: words.at,
         noise,
         #[cfg(feature = "secure")]
         secrets: secured::Secrets::of(&words),
@@ -163,7 +170,7 @@ mod secured {
         #[inline(never)]
         pub fn security(self) -> Option<(Settings, Security, u64)> {
             static BOOTS: StaticCell<boots::File> = StaticCell::new();
-            let Self { settings, noise, secrets: Secrets { keys, boots } } = self;
+            let Self { settings, noise, secrets: Secrets { keys, boots }, .. } = self;
             let Provision { settings, proof } = Provision::of(settings, || keys)?;
             let security = if cfg!(feature = "constant-random") {
                 proof.begin_constant()

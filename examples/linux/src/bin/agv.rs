@@ -4,12 +4,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use cara_apps::agv::{BATTERY, BUMPER, CHARGE, GO_TO, GO_TO_LEASE, POS_INFO, POSE, Progress, RESET, STOP, TICK};
+use cara_apps::agv::{
+    BATTERY, BUMPER, CHARGE, Charge, GO_TO, GO_TO_LEASE, POS_INFO, POSE, Pose, Progress, RESET, STOP, TICK,
+};
 use cara_apps::mechanic;
 use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
 use cara_std::{
-    Actuator, Call, Definition, Error, LeaseWatch, Parameters, ParametersView, Priority, ServiceOptions, Stream, Unit,
-    UnitEvent,
+    Actuator, Call, Definition, Error, LeaseWatch, ParametersView, Priority, Publisher, ServiceOptions, Unit, UnitEvent,
 };
 use clap::Parser;
 
@@ -39,7 +40,7 @@ fn main() -> Result<()> {
     let builder = network.place(Unit::builder(&name, id, &manager.name, manager.id)?);
     let unit = builder.build()?;
     let agv = Arc::new(Mutex::new(Agv::new([0, 0])));
-    let (drive, mut streams) = (offer(&unit, &agv)?, Streams::of(&unit)?);
+    let (drive, streams) = (offer(&unit, &agv)?, Streams::of(&unit)?);
     unit.publish_my_function_list()?;
     let (bumped, motors) = (agv.clone(), drive.clone());
     let stop = Stop::hearing(network.attended, move |line| bumper(line, &bumped, &motors))?;
@@ -47,7 +48,7 @@ fn main() -> Result<()> {
     follow(&unit);
     unit.start()?;
     say!("started {name}/{id}, {}, at {}", unit.mode().as_str(), lock(&agv).place());
-    run_motors(&unit, &agv, &drive, &mut streams, &stop)?;
+    run_motors(&unit, &agv, &drive, &streams, &stop)?;
     unit.stop();
     say!("ended at {}", lock(&agv).place());
     Ok(())
@@ -92,29 +93,22 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     Ok(drive)
 }
 
-/// What the AGV tells of itself, with the newest values.
+/// What the AGV tells of itself.
 struct Streams {
-    pose: (Stream, Parameters),
-    charge: (Stream, Parameters),
+    pose: Publisher<Pose>,
+    charge: Publisher<Charge>,
 }
 
 impl Streams {
     fn of(unit: &Unit) -> Result<Self> {
-        let add = |text, least| {
-            unit.my_function_list().add_stream(&Definition::stream(text)?, least).map_err(anyhow::Error::from)
-        };
-        let (mut position, mut percent) = (Parameters::new(), Parameters::new());
-        position.add_float("position", 2)?;
-        percent.add_float("percent", 1)?;
-        Ok(Self { pose: (add(POSE, TICK)?, position), charge: (add(CHARGE, POSITION_EVERY.into())?, percent) })
+        let functions = unit.my_function_list();
+        let pose = functions.add_stream_of(POSE, TICK)?;
+        Ok(Self { pose, charge: functions.add_stream_of(CHARGE, POSITION_EVERY)? })
     }
 
-    fn publish(&mut self, position: [f64; 2], percent: f64) -> Result<(), Error> {
-        let Self { pose: (pose, at), charge: (charge, left) } = self;
-        at.set_value("position", position)?;
-        left.set_value("percent", percent)?;
-        pose.publish(at)?;
-        charge.publish(left)
+    fn publish(&self, position: [f64; 2], percent: f64) -> Result<(), Error> {
+        self.pose.publish(&Pose { position })?;
+        self.charge.publish(&Charge { percent })
     }
 }
 
@@ -135,7 +129,7 @@ fn bumper(line: &str, agv: &Mutex<Agv>, drive: &Actuator) {
 }
 
 /// The motors' loop: drives while an order is live.
-fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, streams: &mut Streams, stop: &Stop) -> Result<()> {
+fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, streams: &Streams, stop: &Stop) -> Result<()> {
     let (order, mut last, mut said) = (drive.watch(), Instant::now(), Instant::now());
     loop {
         if let Some(outcome) = stop.wait_for(TICK.into()) {

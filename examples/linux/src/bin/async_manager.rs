@@ -1,5 +1,6 @@
 //! A manager on tokio: its vehicles join, it hears events as a stream, calls all vehicles at once, drives each in a task of
-//! its own, and releases them. The runtime has one thread, which nothing here blocks.
+//! its own, which follows the positions that the vehicle publishes, and releases them. The runtime has one thread, which
+//! nothing here blocks.
 
 use std::time::Duration;
 
@@ -8,10 +9,10 @@ use cara_examples::{Network, Stop, log_to_stderr, say};
 use cara_std::{CommunicationSystem, EventStream, Parameters, Peer, RequestOptions, UnitEvent};
 use clap::Parser;
 
-/// Each vehicle drives for so many looks at where it is, so far apart.
+/// Each vehicle drives for so many of its positions, so far apart.
 const LOOKS: u32 = 10;
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// The loop of a drive comes round at least this often, or its vehicle stops.
+/// A vehicle that tells no position for so long stops.
 const HEART: Duration = Duration::from_millis(200);
 /// Longest wait for a vehicle to tell that it has stopped.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -47,7 +48,9 @@ async fn manage(options: Options) -> Result<()> {
     let mut agvs = Vec::new();
     for name in &options.agvs {
         let agv = manager.wait_for_s_unit_async(name).await?;
-        agv.wait_for_function_async("go_to").await?;
+        for wanted in ["go_to", "pose"] {
+            agv.wait_for_function_async(wanted).await?;
+        }
         say!("{agv:?} is there, {} us away", agv.ping_async(PATIENCE).await?.as_micros());
         agvs.push(agv);
     }
@@ -76,11 +79,12 @@ async fn drive(manager: CommunicationSystem, agv: Peer) -> Result<()> {
     let wanted = RequestOptions::renewing(heart.renew());
     let order = agv.hold_async("go_to", &mut position([50, 0])?, &wanted).await?;
     say!("{agv:?} drives");
+    let mut pose = agv.stream("pose")?.subscribe_async(LOOK_EVERY);
     for _ in 0..LOOKS {
+        let Some(sample) = pose.next().await else { break };
         heart.beat();
-        let mut at = position([0, 0])?;
-        agv.request_async("pos_info", &mut at, &RequestOptions::default())?.await?;
-        tokio::time::sleep(LOOK_EVERY).await;
+        let [x, y]: [f64; 2] = sample?.value("position")?;
+        say!("{agv:?} is at {x:.2}, {y:.2}");
     }
     let end = order.release_async(PATIENCE).await?;
     say!("{agv:?} stands, its order is over: {}", end.word());

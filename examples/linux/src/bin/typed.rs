@@ -1,15 +1,22 @@
 //! The paper's listing in typed form: the AGV and its manager share the traits, and no name of a function or variable stands in
 //! a text. Both run in one process here.
 
+use std::ops::ControlFlow;
 use std::thread::sleep;
 use std::time::Duration;
 
 use anyhow::Result;
 use cara_examples::{Network, Stop, log_to_stderr, say};
 use cara_std::keys::FleetKeys;
-use cara_std::{AnyCall, CommunicationSystem, Identity, Renew, ServiceError, Unit, interface};
+use cara_std::{CommunicationSystem, Identity, Renew, ServiceError, TypedCall, Unit, Variables, interface};
 use clap::Parser;
 
+/// How long a step of the AGV takes.
+const STEP: Duration = Duration::from_millis(50);
+/// The hall reaches this far from its middle.
+const HALL: i64 = 100;
+/// The code of the failure for a position that is out of it.
+const OUT_OF_THE_HALL: u16 = 1;
 /// How long the AGV may take to call its mechanic.
 const PATIENCE: Duration = Duration::from_secs(10);
 
@@ -21,11 +28,23 @@ trait Agv {
     #[returns(position)]
     fn pos_info(&mut self) -> [i64; 2];
 
-    /// Drives there, while its caller wants it.
+    /// Drives there, while its caller wants it, and tells how far it is.
     #[actuator(drive)]
     #[lease(ms = 400)]
     #[unit(position = "m")]
-    fn go_to(&mut self, call: &impl AnyCall, position: [i64; 2]) -> Result<(), ServiceError>;
+    fn go_to(&mut self, call: &impl TypedCall<Left, Blocked>, position: [i64; 2]) -> Result<(), ServiceError>;
+}
+
+/// What it has to go, in metres.
+#[derive(Variables)]
+struct Left {
+    left: i64,
+}
+
+/// Where it is when it cannot go on.
+#[derive(Variables, Debug)]
+struct Blocked {
+    at: [i64; 2],
 }
 
 /// What a manager offers to its AGVs.
@@ -36,9 +55,19 @@ trait Mechanic {
     fn call_mechanic(&mut self, #[size(64)] fault: &str) -> i64;
 }
 
-/// The AGV of this example is where it was last sent.
+/// The AGV's state.
 struct Vehicle {
     position: [i64; 2],
+}
+
+impl Vehicle {
+    fn step(&mut self, to: [i64; 2]) {
+        self.position.iter_mut().zip(to).for_each(|(at, to)| *at += (to - *at).signum());
+    }
+
+    fn left(&self, to: [i64; 2]) -> i64 {
+        self.position.iter().zip(to).map(|(at, to)| (to - at).abs()).max().unwrap_or(0)
+    }
 }
 
 impl Agv for Vehicle {
@@ -46,9 +75,17 @@ impl Agv for Vehicle {
         self.position
     }
 
-    fn go_to(&mut self, call: &impl AnyCall, position: [i64; 2]) -> Result<(), ServiceError> {
-        call.commit(|| self.position = position)?;
+    fn go_to(&mut self, call: &impl TypedCall<Left, Blocked>, position: [i64; 2]) -> Result<(), ServiceError> {
+        if position.iter().any(|side| side.abs() > HALL) {
+            return Err(call.fail_with(OUT_OF_THE_HALL, "the hall ends before", &Blocked { at: self.position }));
+        }
         say!("driving to {position:?}");
+        while self.position != position {
+            sleep(STEP);
+            // No step is made once the order has ended.
+            call.commit(|| self.step(position))?;
+            call.progress(&Left { left: self.left(position) })?;
+        }
         Ok(())
     }
 }
@@ -102,6 +139,16 @@ fn run(network: Network) -> Result<()> {
     agv_manager.publish_my_function_list()?;
     // The listing ends.
     call_mechanic(&agv)?;
+    for position in [[4, 6], [400, 6]] {
+        let arrived = client.watch_go_to(position, |Left { left }| {
+            say!("{left} m to go");
+            ControlFlow::Continue(())
+        });
+        match arrived {
+            Ok(()) => say!("arrived at {position:?}"),
+            Err(failed) => say!("{failed}: {:?}", failed.values),
+        }
+    }
     say!("ended at {:?}", client.pos_info()?);
     agv_manager.stop();
     agv.stop();

@@ -48,6 +48,11 @@ pub struct Arguments {
     listen: Duration,
 }
 
+/// What is strange on this host and its network, as the object of `--json`.
+pub fn examine(listen: Duration, global: &Global) -> anyhow::Result<serde_json::Value> {
+    look::look(None, listen, global).map(|looked| report::object(&looked))
+}
+
 /// Does what the command line asks, and prints it.
 pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     if global.act_as.is_some() {

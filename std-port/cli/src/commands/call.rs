@@ -19,13 +19,15 @@ use cara_tools::units::{parse_time, show_micros};
 /// Calls a function and prints its results in the form of a call.
 ///
 /// A call is written with its arguments by name, as 'go_to(position: [1, 2])', and checked against what the node has
-/// published before anything is sent. Texts go in double quotes, bytes are written as 0x01ff, several numbers in brackets.
+/// published before anything is sent. Texts go in double quotes, bytes are written as 0x01ff, several numbers and lists in
+/// brackets, records in braces: 'order(nodes: [{id: "a", x: 1.5}])'. Arguments may be a JSON object of their own as well:
+/// order '{"nodes": [{"id": "a", "x": 1.5}]}'.
 #[derive(clap::Args)]
-#[command(override_usage = "cara call [OPTIONS] <NODE> <CALL>\n       cara call [OPTIONS] --all <CALL>")]
+#[command(override_usage = "cara call [OPTIONS] <NODE> <CALL> [JSON]\n       cara call [OPTIONS] --all <CALL> [JSON]")]
 pub(crate) struct Arguments {
     /// The node (NAME, NAME/ID or #ID), unless all are called; and the call, as 'go_to(position: [1, 2])', or the name
-    /// alone where there are no arguments.
-    #[arg(required = true, num_args = 1..=2, value_names = ["NODE", "CALL"])]
+    /// alone where there are no arguments, or where they follow as a JSON object.
+    #[arg(required = true, num_args = 1..=3, value_names = ["NODE", "CALL", "JSON"])]
     words: Vec<String>,
     /// Call every node, with an outcome for each s_unit of the roster; it fails where one is missing.
     #[arg(long)]
@@ -52,10 +54,14 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     /// Options may stand between the two, so they are told apart here and not by their places.
-    fn node_and_call(&self) -> anyhow::Result<(Option<&str>, &str)> {
+    fn node_and_call(&self) -> anyhow::Result<(Option<&str>, String)> {
         match (self.all, self.words.as_slice()) {
-            (true, [call]) => Ok((None, call)),
-            (false, [node, call]) => Ok((Some(node), call)),
+            (true, [call]) => Ok((None, call.clone())),
+            (false, [node, call]) => Ok((Some(node), call.clone())),
+            (true, [call, json]) if json.trim_start().starts_with('{') => Ok((None, format!("{call} {json}"))),
+            (false, [node, call, json]) if json.trim_start().starts_with('{') => {
+                Ok((Some(node), format!("{call} {json}")))
+            }
             (true, _) => Err(Ended::usage("with --all no node is named: cara call --all 'go_to(position: [1, 2])'")),
             (false, _) => Err(Ended::usage("name the node and the call: cara call agv-1 'go_to(position: [1, 2])'")),
         }
@@ -64,6 +70,7 @@ impl Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let (node, text) = arguments.node_and_call()?;
+    let text = text.as_str();
     let written = read(text).map_err(|mistake| wrong(&mistake, text, None))?;
     let function = written.function.value;
     let need = node.map_or(Need::Offering(function), |node| Need::Function(node, function));
@@ -88,8 +95,11 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         priority: arguments.priority,
         best_effort: arguments.best_effort,
         take_over: arguments.take_over,
+        progress: tells_progress(&published),
     };
-    if arguments.hold {
+    let question = CallQuestion { progress: question.progress && question.node.is_some(), ..question };
+    // At the end of this command its unit gives up the call, and a manager whose client has gone does so as well.
+    if arguments.hold || !arguments.asynchronous {
         interrupt::end_at_signals()?;
     }
     let lease = published.attributes.lease.filter(|_| !arguments.hold).map(|lease| lease.as_micros());
@@ -112,6 +122,9 @@ fn call(
             worst = if expired { Exit::Failed } else { worst };
             return Ok(show_end(expired, global)?);
         }
+        if let Answer::Progress { node, id, values: told } = answer {
+            return Ok(show_progress(&format!("{node}/{id}"), &told, global)?);
+        }
         let Answer::Called { node, id, results, call, error, took_us, .. } = answer else { return Ok(()) };
         // The lease counts from when the call was made, and its end is on its way like any answer.
         let ended = not_kept_us.filter(|lease| took_us >= lease / 4 * 3);
@@ -129,7 +142,7 @@ fn call(
 }
 
 /// Why a service failed that went on for longer than a lease which nothing has kept.
-fn of_its_lease(failure: Failure, function: &str, ended_us: Option<u64>) -> Failure {
+pub(super) fn of_its_lease(failure: Failure, function: &str, ended_us: Option<u64>) -> Failure {
     let Some(lease) = ended_us.filter(|_| failure.error == "Service") else { return failure };
     let text = format!(
         "the lease of `{function}` ({}) ended before it had finished, which stops it: a call keeps it with --hold. It said: {}",
@@ -188,8 +201,10 @@ fn show(
 ) -> std::io::Result<()> {
     let before = if one { String::new() } else { format!("{node}  ") };
     match (error, call) {
-        (Some(Failure { error, text, .. }), _) => {
-            output::line(format_args!("{BAD}{node}: {error}:{BAD:#} {}", Shown(text)))
+        (Some(Failure { error, text, said, .. }), _) => {
+            let values = said.as_ref().map_or(&[][..], |said| &said.values);
+            let values = if values.is_empty() { String::new() } else { format!(" {}", show_call("", values)) };
+            output::line(format_args!("{BAD}{node}: {error}:{BAD:#} {}{values}", Shown(text)))
         }
         (None, Some(call)) => {
             output::line(format_args!("{before}accepted as call {call}; `cara watch` tells if it fails"))
@@ -202,6 +217,19 @@ fn show(
     }
 }
 
+/// What the call tells while it runs.
+fn show_progress(node: &str, told: &[Argument], global: &Global) -> std::io::Result<()> {
+    match global.json {
+        true => output::object(&json!({ "node": node, "progress": values(told) })),
+        false => output::line(show_call("…", told)),
+    }
+}
+
+/// Whether its calls tell how far they are.
+fn tells_progress(function: &FunctionInfo) -> bool {
+    Definition::parse(&function.signature).is_ok_and(|function| function.signature().progress().next().is_some())
+}
+
 /// How what the call started has ended.
 fn show_end(expired: bool, global: &Global) -> std::io::Result<()> {
     match (global.json, expired) {
@@ -212,7 +240,7 @@ fn show_end(expired: bool, global: &Global) -> std::io::Result<()> {
 }
 
 /// The function as a node has published it.
-fn of_node(operator: &mut Operator, node: &str, function: &str) -> anyhow::Result<FunctionInfo> {
+pub(super) fn of_node(operator: &mut Operator, node: &str, function: &str) -> anyhow::Result<FunctionInfo> {
     let functions = nodes::functions(operator, node)?;
     let found = functions.iter().find(|info| info.name == function).cloned();
     found.ok_or_else(|| nodes::no_such_function(node, function, &functions))
@@ -245,7 +273,7 @@ fn offered_by_none(operator: &mut Operator, function: &str, global: &Global) -> 
 }
 
 /// The arguments as the signature asks for them.
-fn bound(written: &Written, published: &FunctionInfo) -> anyhow::Result<Vec<Argument>> {
+pub(super) fn bound(written: &Written, published: &FunctionInfo) -> anyhow::Result<Vec<Argument>> {
     let signature = &published.signature;
     let definition = Definition::parse(signature).map_err(|error| {
         Ended::failed("Malformed", format!("the published signature `{signature}` cannot be read: {error}"))
@@ -253,6 +281,6 @@ fn bound(written: &Written, published: &FunctionInfo) -> anyhow::Result<Vec<Argu
     bind(written, &definition.signature()).map_err(|mistake| wrong(&mistake, written.text, Some(signature)))
 }
 
-fn wrong(mistake: &Mistake, text: &str, signature: Option<&str>) -> anyhow::Error {
+pub(super) fn wrong(mistake: &Mistake, text: &str, signature: Option<&str>) -> anyhow::Error {
     Ended::usage(mistake.show(text, signature))
 }

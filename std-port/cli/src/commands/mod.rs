@@ -15,4 +15,6 @@ pub(crate) mod scan;
 pub(crate) mod set;
 pub(crate) mod stop;
 pub(crate) mod stream;
+pub(crate) mod top;
 pub(crate) mod watch;
+pub(crate) mod web;

@@ -5,11 +5,12 @@ mod own;
 mod running;
 
 use std::ops::ControlFlow;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use cara_std::CommunicationSystem;
 use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
-use cara_std::control::{Client, execute};
+use cara_std::control::{Client, Closer, execute, execute_while};
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
@@ -43,6 +44,42 @@ enum Unit {
     Running(Client),
     /// In this process.
     Own(CommunicationSystem),
+}
+
+/// How a unit is reached; see [`Operator::way`].
+#[derive(Clone)]
+pub(crate) enum Way {
+    /// Its control socket.
+    Socket(PathBuf),
+    /// It is in this process.
+    Own(CommunicationSystem),
+}
+
+impl Way {
+    /// A connection of its own.
+    pub(crate) fn open(&self) -> anyhow::Result<Operator> {
+        self.open_with(Client::connect)
+    }
+
+    /// Likewise, for a question that is answered also where all connections of the unit are in use.
+    pub(crate) fn open_to_stop(&self) -> anyhow::Result<Operator> {
+        self.open_with(Client::connect_to_stop)
+    }
+
+    /// A unit of this process stops.
+    pub(crate) fn end(&self) {
+        if let Self::Own(system) = self {
+            system.stop();
+        }
+    }
+
+    fn open_with(&self, connect: running::Connect) -> anyhow::Result<Operator> {
+        let unit = match self {
+            Self::Socket(path) => Unit::Running(running::at(path, connect)?),
+            Self::Own(system) => Unit::Own(system.clone()),
+        };
+        Ok(Operator { unit, waited: None })
+    }
 }
 
 /// What becomes of an answer; `false` when no more are wanted.
@@ -160,13 +197,40 @@ impl Operator {
         self.converse(question, &mut each)
     }
 
-    /// A second way to the same unit, for questions that are answered at the same time.
+    /// A second connection to the same unit, for questions that are answered at the same time.
     pub(crate) fn another(&self) -> anyhow::Result<Self> {
-        let unit = match &self.unit {
-            Unit::Running(client) => Unit::Running(running::again(client)?),
-            Unit::Own(system) => Unit::Own(system.clone()),
-        };
-        Ok(Self { unit, waited: self.waited })
+        Ok(Self { waited: self.waited, ..self.way().open()? })
+    }
+
+    /// How the same unit is reached again, also by other threads and after its restart.
+    pub(crate) fn way(&self) -> Way {
+        match &self.unit {
+            Unit::Running(client) => Way::Socket(client.unit().path.clone()),
+            Unit::Own(system) => Way::Own(system.clone()),
+        }
+    }
+
+    /// Asks, and passes on each answer, a failure too, until that says `Break`; of a unit of this process also until `wanted`
+    /// says `false`.
+    pub(crate) fn pass_on(
+        &mut self,
+        question: &Question,
+        each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
+        wanted: &dyn Fn() -> bool,
+    ) -> anyhow::Result<()> {
+        match &mut self.unit {
+            Unit::Own(system) => execute_while(system, question, each, wanted),
+            Unit::Running(client) => running::pass_on(client, question, each)?,
+        }
+        Ok(())
+    }
+
+    /// What closes the connection to a unit of another process, from another thread.
+    pub(crate) fn closer(&self) -> anyhow::Result<Option<Closer>> {
+        match &self.unit {
+            Unit::Own(_) => Ok(None),
+            Unit::Running(client) => Ok(Some(client.closer()?)),
+        }
     }
 
     /// Requests that were accepted leave this process before it ends.

@@ -89,10 +89,9 @@ pub(super) fn runs(identity: &NameAndId, fleet: u32) -> anyhow::Result<bool> {
     Ok(all.iter().any(|unit| unit.unit == identity.to_string() && unit.fleet == fleet))
 }
 
-/// A second connection to the same unit.
-pub(super) fn again(client: &Client) -> anyhow::Result<Client> {
-    let path: &Path = &client.unit().path;
-    Client::connect(path).map_err(error)
+/// The unit of a socket.
+pub(super) fn at(path: &Path, connect: Connect) -> anyhow::Result<Client> {
+    connect(path).map_err(error)
 }
 
 /// Asks, and has each answer looked at until it says `Break`.
@@ -106,6 +105,28 @@ pub(super) fn ask(
             break;
         }
     }
+    Ok(())
+}
+
+/// As [`ask`], with the end as an answer: what the unit failed is none of this function's errors.
+pub(super) fn pass_on(
+    client: &mut Client,
+    question: &Question,
+    each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
+) -> anyhow::Result<()> {
+    let mut end = Answer::Done;
+    for answer in client.ask(question).map_err(error)? {
+        match answer {
+            Ok(answer) => {
+                if each(answer).is_break() {
+                    return Ok(());
+                }
+            }
+            Err(ControlError::Failed(failure)) => end = Answer::Failed(failure),
+            Err(broken) => return Err(error(broken)),
+        }
+    }
+    let _ = each(end);
     Ok(())
 }
 

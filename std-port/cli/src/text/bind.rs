@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use cara_std::control::protocol::{Argument, ArgumentValue, Number};
 use cara_std::{Signature, Type, VariableSpec};
+use serde_json::Value as Json;
 
 use super::read::{Literal, Placed, Value, Written};
 use super::{Mistake, print};
@@ -55,6 +56,11 @@ fn bound(value: &Placed<Value>, spec: VariableSpec) -> Result<ArgumentValue, Mis
             _ => return Err(wrong_type(at, spec)),
         },
         Type::Bytes => match &value.value {
+            // As it stands in JSON.
+            Value::One(Literal::Text(digits)) if hexadecimal(&format!("0x{digits}")).is_some() => {
+                check_length(digits.len() / 2, at, spec)?;
+                ArgumentValue::Bytes(digits.to_ascii_lowercase())
+            }
             Value::One(Literal::Number(digits)) => {
                 let digits = hexadecimal(digits).ok_or_else(|| wrong_type(at, spec))?;
                 check_length(digits.len() / 2, at, spec)?;
@@ -62,7 +68,62 @@ fn bound(value: &Placed<Value>, spec: VariableSpec) -> Result<ArgumentValue, Mis
             }
             _ => return Err(wrong_type(at, spec)),
         },
+        Type::List => ArgumentValue::List(nested(value, spec)?),
+        Type::Record => ArgumentValue::Record(nested(value, spec)?),
     })
+}
+
+/// A value inside a list or record, whose name is its path: `nodes[3].x`.
+fn nested(value: &Placed<Value>, spec: VariableSpec) -> Result<Json, Mistake> {
+    Ok(match (spec.kind, &value.value) {
+        (Type::List, Value::Several(several)) => {
+            let Some(element) = spec.element() else { return Err(wrong_type(&value.at, spec)) };
+            if several.len() > spec.size as usize {
+                let most = print::plural(spec.size as usize, "element");
+                let what = format!("`{}` takes at most {most}, and this has {}", spec.name, several.len());
+                return Err(Mistake::new(value.at.clone(), what, describe(spec)));
+            }
+            let elements = several.iter().enumerate().map(|(index, value)| {
+                nested(value, VariableSpec { name: &format!("{}[{index}]", spec.name), ..element })
+            });
+            elements.collect::<Result<_, _>>()?
+        }
+        (Type::Record, Value::Fields(written)) => {
+            let names = || spec.fields().map(|field| field.name);
+            for (index, (name, _)) in written.iter().enumerate() {
+                if !names().any(|known| known == name.value) {
+                    let what = format!("`{}` has no field `{}`", spec.name, name.value);
+                    return Err(Mistake::new(name.at.clone(), what, close_names::either(name.value, names())));
+                }
+                if written.iter().take(index).any(|(earlier, _)| earlier.value == name.value) {
+                    let what = format!("`{}.{}` is there twice", spec.name, name.value);
+                    return Err(Mistake::new(name.at.clone(), what, "each field once"));
+                }
+            }
+            let fields = spec.fields().map(|field| {
+                let path = format!("{}.{}", spec.name, field.name);
+                let Some((_, value)) = written.iter().find(|(name, _)| name.value == field.name) else {
+                    let end = value.at.end.saturating_sub(1)..value.at.end;
+                    return Err(Mistake::new(end, format!("`{path}` is missing"), describe(field)));
+                };
+                Ok((field.name.to_owned(), nested(value, VariableSpec { name: &path, ..field })?))
+            });
+            Json::Object(fields.collect::<Result<_, _>>()?)
+        }
+        (Type::List | Type::Record, _) => return Err(wrong_type(&value.at, spec)),
+        _ => match bound(value, spec)? {
+            ArgumentValue::Int(ints) => several(ints, spec),
+            ArgumentValue::Float(floats) => several(floats.iter().map(print::json_of).collect(), spec),
+            ArgumentValue::Bool(truths) => several(truths, spec),
+            ArgumentValue::String(text) | ArgumentValue::Bytes(text) => text.into(),
+            ArgumentValue::List(json) | ArgumentValue::Record(json) => json,
+        },
+    })
+}
+
+fn several<T: Into<Json>>(values: Vec<T>, spec: VariableSpec) -> Json {
+    let mut values: Vec<Json> = values.into_iter().map(Into::into).collect();
+    if spec.size == 1 { values.pop().unwrap_or_default() } else { Json::Array(values) }
 }
 
 /// Text and bytes have at most the signature's size.
@@ -83,8 +144,13 @@ fn elements<T>(
     let (count, read) = match &value.value {
         Value::One(literal) => (1, element(literal, &value.at, spec).map(|one| vec![one])),
         Value::Several(several) => {
-            (several.len(), several.iter().map(|one| element(&one.value, &one.at, spec)).collect())
+            let each = several.iter().map(|one| match &one.value {
+                Value::One(literal) => element(literal, &one.at, spec),
+                _ => Err(wrong_type(&one.at, spec)),
+            });
+            (several.len(), each.collect())
         }
+        Value::Fields(_) => return Err(wrong_type(&value.at, spec)),
     };
     let read = read?;
     if count == spec.size as usize {
@@ -115,7 +181,12 @@ fn int(literal: &Literal, at: &Range<usize>, spec: VariableSpec) -> Result<i64, 
 }
 
 fn float(literal: &Literal, at: &Range<usize>, spec: VariableSpec) -> Result<Number, Mistake> {
-    let Literal::Number(text) = literal else { return Err(wrong_type(at, spec)) };
+    let text = match literal {
+        Literal::Number(text) => *text,
+        // As it stands in JSON.
+        Literal::Text(text) if matches!(text.as_str(), "NaN" | "inf" | "-inf") => text,
+        _ => return Err(wrong_type(at, spec)),
+    };
     let value: f64 = match text.parse() {
         Ok(value) => value,
         // Hexadecimal is for whole numbers, which a float takes as well.
@@ -153,6 +224,8 @@ const fn article(kind: Type) -> &'static str {
         Type::String => "a string",
         Type::Bool => "a bool",
         Type::Bytes => "of the type bytes",
+        Type::List => "a list",
+        Type::Record => "a record",
     }
 }
 
@@ -172,6 +245,8 @@ fn describe(spec: VariableSpec) -> String {
         }
         Type::String => format!("text of at most {}", print::plural(size, "byte")),
         Type::Bytes => format!("at most {}, two hexadecimal digits each", print::plural(size, "byte")),
+        Type::List => format!("at most {}", print::plural(size, "element")),
+        Type::Record => print::plural(size, "field"),
     };
     format!("{takes}, as in {}: {}", spec.name, example(spec))
 }
@@ -183,6 +258,13 @@ fn example(spec: VariableSpec) -> String {
         Type::Bool => "true",
         Type::String => return "\"text\"".into(),
         Type::Bytes => return "0x01ff".into(),
+        Type::List => {
+            return spec.element().map_or_else(String::new, |element| format!("[{}]", self::example(element)));
+        }
+        Type::Record => {
+            let fields = spec.fields().map(|field| format!("{}: {}", field.name, self::example(field)));
+            return format!("{{{}}}", fields.collect::<Vec<_>>().join(", "));
+        }
     };
     match spec.size as usize {
         1 => one.into(),

@@ -1,9 +1,9 @@
-//! The functions of a node as the trait that `#[interface]` takes.
+//! The functions of a node as the trait that `#[interface]` takes, and the values of its streams as structs.
 
 use std::fmt::{self, Write};
 
 use cara_std::control::protocol::FunctionInfo;
-use cara_std::{Attributes, Definition, Priority, Type, VariableSpec};
+use cara_std::{Attributes, Definition, Priority, Type, VariableSpec, VariableSpecs};
 
 /// Words that cannot be names of Rust, not even behind `r#`.
 const NEVER: [&str; 5] = ["self", "Self", "super", "crate", "_"];
@@ -15,26 +15,72 @@ const KEYWORDS: [&str; 46] = [
     "unsafe", "unsized", "use", "virtual", "where",
 ];
 
-/// The source of the trait, or the first function whose signature cannot be read.
+/// The source of the trait and of the structs in it and of streams, or the first function whose signature cannot be read.
 pub(crate) fn interface(node: &str, functions: &[FunctionInfo]) -> Result<String, String> {
-    let mut source = String::from("use cara_std::{ServiceError, interface};\n\n#[interface]\n");
-    let mut write = || -> Result<(), String> {
-        let told = |_: fmt::Error| String::from("the source cannot be written");
-        writeln!(source, "pub trait {} {{", trait_name(node)).map_err(told)?;
-        let mut taken = Vec::new();
-        for (index, function) in functions.iter().enumerate() {
-            let definition: Definition =
-                function.signature.parse().map_err(|error| format!("{}: {error}", function.signature))?;
-            if index > 0 {
-                source.push('\n');
-            }
-            method(&mut source, &definition, &function.attributes, &mut taken).map_err(told)?;
+    let name = trait_name(node);
+    // A record is made of something, so it is none of these.
+    let known = [&*name, "ServiceError", "TypedCall"].map(|taken| (Vec::new(), taken.to_owned())).to_vec();
+    let (mut methods, mut taken, mut structs) = (String::new(), Vec::new(), Structs { known, source: String::new() });
+    let mut streams = String::new();
+    for function in functions {
+        let definition: Definition =
+            function.signature.parse().map_err(|error| format!("{}: {error}", function.signature))?;
+        if function.attributes.stream.is_some() {
+            let values = structs.of(definition.signature().results(), definition.name());
+            streams += &format!("// Values of the stream `{}` are a `{values}`.\n", definition.name());
+            continue;
         }
-        source.push_str("}\n");
-        Ok(())
-    };
-    write()?;
-    Ok(source)
+        if !methods.is_empty() {
+            methods.push('\n');
+        }
+        method(&mut methods, &definition, &function.attributes, &mut taken, &mut structs)
+            .map_err(|_| String::from("the source cannot be written"))?;
+    }
+    let source = structs.source;
+    let call = if methods.contains("TypedCall<") { "TypedCall, " } else { "" };
+    let derive = if source.is_empty() { "" } else { "Variables, " };
+    Ok(format!(
+        "use cara_std::{{ServiceError, {call}{derive}interface}};\n\n{source}{streams}#[interface]\npub trait {name} {{\n{methods}}}\n"
+    ))
+}
+
+/// The structs that records, progress and values of failures are printed as.
+struct Structs {
+    /// What each is made of, and its name. Other names that are taken are made of nothing.
+    known: Vec<(Vec<u8>, String)>,
+    source: String,
+}
+
+impl Structs {
+    /// The struct with these fields: a new one, called like the way to it, or the one that has the same.
+    fn of(&mut self, fields: VariableSpecs<'_>, way: &str) -> String {
+        let key = key(fields);
+        if let Some((_, name)) = self.known.iter().find(|(known, _)| *known == key) {
+            return name.clone();
+        }
+        let mut name = camel_case(way);
+        if !name.starts_with(|first: char| first.is_ascii_alphabetic()) {
+            name.insert_str(0, "Record");
+        }
+        while self.known.iter().any(|(_, taken)| *taken == name) {
+            name.push('_');
+        }
+        self.known.push((key, name.clone()));
+        let (mut source, mut taken) = (String::new(), Vec::new());
+        for field in fields {
+            let ident = identifier(field.name, &mut taken);
+            if plain(&ident) != field.name {
+                source += &format!("    #[name = \"{}\"]\n", field.name);
+            }
+            if let Some(size) = size(&field) {
+                source += &format!("    {size}\n");
+            }
+            let rust = rust_type(&field, false, &format!("{way} {}", field.name), self);
+            source += &format!("    pub {ident}: {rust},\n");
+        }
+        self.source += &format!("#[derive(Variables, Clone, Debug, PartialEq)]\npub struct {name} {{\n{source}}}\n\n");
+        name
+    }
 }
 
 fn method(
@@ -42,6 +88,7 @@ fn method(
     definition: &Definition,
     attributes: &Attributes,
     taken: &mut Vec<String>,
+    structs: &mut Structs,
 ) -> fmt::Result {
     let (name, signature) = (definition.name(), definition.signature());
     let ident = identifier(name, taken);
@@ -74,13 +121,20 @@ fn method(
         inputs.push(String::from("&mut self"));
     }
     let mut arguments = Vec::new();
+    let (progress, failure) = (signature.progress(), signature.failure());
+    if progress.clone().next().is_some() || failure.clone().next().is_some() {
+        arguments.push(String::from("call"));
+        inputs.push(format!("call: &impl TypedCall<{}>", told(structs, name, progress, failure)));
+    }
+    let way = |variable: &VariableSpec<'_>| format!("{name} {}", variable.name);
     for argument in signature.arguments() {
         let ident = identifier(argument.name, &mut arguments);
         let name =
             if plain(&ident) == argument.name { String::new() } else { format!("#[name = \"{}\"] ", argument.name) };
-        inputs.push(format!("{name}{}{ident}: {}", size(&argument), rust_type(&argument, true)));
+        let rust = rust_type(&argument, true, &way(&argument), structs);
+        inputs.push(format!("{name}{}{ident}: {rust}", sized(&argument)));
     }
-    let types: Vec<String> = results.iter().map(|result| rust_type(result, false)).collect();
+    let types: Vec<String> = results.iter().map(|result| rust_type(result, false, &way(result), structs)).collect();
     let returned = match types.as_slice() {
         [only] => only.clone(),
         several => format!("({})", several.join(", ")),
@@ -88,17 +142,58 @@ fn method(
     writeln!(source, "    fn {ident}({}) -> Result<{returned}, ServiceError>;", inputs.join(", "))
 }
 
+/// The types of what a call tells, and of its failures.
+fn told(structs: &mut Structs, name: &str, progress: VariableSpecs<'_>, failure: VariableSpecs<'_>) -> String {
+    let mut of = |specs: VariableSpecs<'_>, what: &str| match specs.clone().next() {
+        Some(_) => structs.of(specs, &format!("{name} {what}")),
+        None => String::from("()"),
+    };
+    let progress = of(progress, "progress");
+    match of(failure, "failure").as_str() {
+        "()" => progress,
+        failure => format!("{progress}, {failure}"),
+    }
+}
+
+/// What two structs have in common that are the same.
+fn key(fields: VariableSpecs<'_>) -> Vec<u8> {
+    let mut key = Vec::new();
+    for VariableSpec { name, kind, size, inner } in fields {
+        key.extend([kind as u8, name.len() as u8]);
+        key.extend(size.to_le_bytes());
+        key.extend(name.as_bytes());
+        key.extend(inner);
+    }
+    key
+}
+
 fn result_name(result: &VariableSpec<'_>) -> String {
     let ident = identifier(result.name, &mut Vec::new());
     let name = if plain(&ident) == result.name { ident } else { format!("\"{}\"", result.name) };
-    format!("{}{name}", size(result))
+    format!("{}{name}", sized(result))
 }
 
-fn size(spec: &VariableSpec<'_>) -> String {
-    if spec.kind.is_fixed() { String::new() } else { format!("#[size({})] ", spec.size) }
+/// The attribute of what has a bound, and a space.
+fn sized(spec: &VariableSpec<'_>) -> String {
+    size(spec).map_or_else(String::new, |size| size + " ")
 }
 
-fn rust_type(spec: &VariableSpec<'_>, is_argument: bool) -> String {
+/// `#[size(50, 32)]` of a list of 50 texts of 32 bytes. That of one at most is an `Option`, which has no size.
+fn size(spec: &VariableSpec<'_>) -> Option<String> {
+    let (mut sizes, mut spec) = (Vec::new(), *spec);
+    while let Some(element) = spec.element() {
+        if spec.size != 1 {
+            sizes.push(spec.size.to_string());
+        }
+        spec = element;
+    }
+    if matches!(spec.kind, Type::String | Type::Bytes) {
+        sizes.push(spec.size.to_string());
+    }
+    if sizes.is_empty() { None } else { Some(format!("#[size({})]", sizes.join(", "))) }
+}
+
+fn rust_type(spec: &VariableSpec<'_>, is_argument: bool, way: &str, structs: &mut Structs) -> String {
     let element = match (spec.kind, is_argument) {
         (Type::Int, _) => "i64",
         (Type::Float, _) => "f64",
@@ -107,6 +202,12 @@ fn rust_type(spec: &VariableSpec<'_>, is_argument: bool) -> String {
         (Type::String, false) => "String",
         (Type::Bytes, true) => "&[u8]",
         (Type::Bytes, false) => "Vec<u8>",
+        (Type::Record, _) => return structs.of(spec.fields(), way),
+        (Type::List, _) => {
+            let holder = if spec.size == 1 { "Option" } else { "Vec" };
+            let element = spec.element().map(|element| rust_type(&element, false, way, structs));
+            return format!("{holder}<{}>", element.unwrap_or_default());
+        }
     };
     if spec.kind.is_fixed() && spec.size != 1 { format!("[{element}; {}]", spec.size) } else { element.to_owned() }
 }
@@ -114,12 +215,16 @@ fn rust_type(spec: &VariableSpec<'_>, is_argument: bool) -> String {
 /// `agv-17` as `Agv17`.
 fn trait_name(node: &str) -> String {
     let name = node.split('/').next().unwrap_or_default();
+    let joined = camel_case(name);
+    if joined.starts_with(|first: char| first.is_ascii_alphabetic()) { joined } else { format!("Node{joined}") }
+}
+
+fn camel_case(name: &str) -> String {
     let words = name.split(|character: char| !character.is_ascii_alphanumeric()).map(|word| {
         let mut letters = word.chars();
         letters.next().map_or(String::new(), |first| first.to_ascii_uppercase().to_string() + letters.as_str())
     });
-    let joined: String = words.collect();
-    if joined.starts_with(|first: char| first.is_ascii_alphabetic()) { joined } else { format!("Node{joined}") }
+    words.collect()
 }
 
 /// A name of Rust that is like the name of a function or variable, and no other one's.

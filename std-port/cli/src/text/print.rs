@@ -3,6 +3,7 @@
 use cara_std::control::protocol::{Argument, ArgumentValue, Number};
 
 use cara_tools::output::json;
+use serde_json::Value;
 
 /// A call, or results in the form of one: `go_to(position: [1, 2])`.
 pub(crate) fn show_call(function: &str, arguments: &[Argument]) -> String {
@@ -22,6 +23,28 @@ fn value(value: &ArgumentValue) -> String {
         ArgumentValue::Bool(truths) => elements(truths.iter().map(bool::to_string)),
         ArgumentValue::String(text) => quoted(text),
         ArgumentValue::Bytes(digits) => format!("0x{digits}"),
+        ArgumentValue::List(json) | ArgumentValue::Record(json) => nested(json),
+    }
+}
+
+/// JSON without quotes around names.
+fn nested(value: &Value) -> String {
+    match value {
+        Value::Array(elements) => format!("[{}]", elements.iter().map(nested).collect::<Vec<_>>().join(", ")),
+        Value::Object(fields) => {
+            let fields = fields.iter().map(|(name, value)| format!("{name}: {}", nested(value)));
+            format!("{{{}}}", fields.collect::<Vec<_>>().join(", "))
+        }
+        Value::String(text) => quoted(text),
+        other => other.to_string(),
+    }
+}
+
+/// A float as JSON has it.
+pub(super) fn json_of(number: &Number) -> Value {
+    match number {
+        Number::Finite(value) => (*value).into(),
+        Number::Other(word) => word.as_str().into(),
     }
 }
 

@@ -2,9 +2,15 @@
 
 use std::ops::Range;
 
+use cara_std::DEPTH;
+
 use super::Mistake;
 
-const A_VALUE: &str = "a number, true, false, \"text\", 0x… or [ … ]";
+const A_VALUE: &str = "a number, true, false, \"text\", 0x…, [ … ] or { … }";
+
+/// Lists and records inside each other that are read: one more than a signature has, for the arguments themselves and for
+/// arrays of a fixed size.
+const DEEPEST: usize = DEPTH + 2;
 const A_NAME: &str = "a name of letters, digits, '_', '-', '.' or '/'";
 
 /// A piece of the text.
@@ -24,14 +30,15 @@ pub(crate) struct Written<'t> {
     pub(crate) end: usize,
 }
 
-/// An argument's name and value.
-type Argument<'t> = (Placed<&'t str>, Placed<Value<'t>>);
+/// A name and its value.
+pub(crate) type Argument<'t> = (Placed<&'t str>, Placed<Value<'t>>);
 
 /// An argument's value.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Value<'t> {
     One(Literal<'t>),
-    Several(Vec<Placed<Literal<'t>>>),
+    Several(Vec<Placed<Value<'t>>>),
+    Fields(Vec<Argument<'t>>),
 }
 
 /// A single value. Whether a number is whole, has a fraction or is a row of bytes is the signature's to say.
@@ -44,13 +51,16 @@ pub(crate) enum Literal<'t> {
 
 /// Reads a call.
 pub(crate) fn read(text: &str) -> Result<Written<'_>, Mistake> {
-    let mut reader = Reader { text, at: 0 };
+    let mut reader = Reader { text, at: 0, depth: 0 };
     let function = reader.name("the function's name is missing")?;
     let mut arguments = Vec::new();
     let mut end = text.len();
-    if reader.takes('(') {
-        arguments = reader.arguments()?;
-        end = reader.at - 1;
+    for (opening, closing) in [('(', ')'), ('{', '}')] {
+        if reader.takes(opening) {
+            arguments = reader.arguments(closing)?;
+            end = reader.at - 1;
+            break;
+        }
     }
     match reader.peek() {
         None => Ok(Written { text, function, arguments, end }),
@@ -61,6 +71,8 @@ pub(crate) fn read(text: &str) -> Result<Written<'_>, Mistake> {
 struct Reader<'t> {
     text: &'t str,
     at: usize,
+    /// Brackets and braces that are open.
+    depth: usize,
 }
 
 impl<'t> Reader<'t> {
@@ -95,21 +107,26 @@ impl<'t> Reader<'t> {
         Placed { at, value }
     }
 
+    /// A name, which may stand in quotes, as in JSON.
     fn name(&mut self, missing: &str) -> Result<Placed<&'t str>, Mistake> {
+        if self.peek() == Some('"') {
+            let Placed { at, .. } = self.string()?;
+            return Ok(Placed { value: &self.text[at.start + 1..at.end - 1], at });
+        }
         let name = self.word(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | '/'));
         if name.value.is_empty() { Err(Mistake::new(self.here(), missing, A_NAME)) } else { Ok(name) }
     }
 
-    /// What follows the opening parenthesis, up to and with the closing one.
-    fn arguments(&mut self) -> Result<Vec<Argument<'t>>, Mistake> {
+    /// What follows the opening parenthesis or brace, up to and with the closing one.
+    fn arguments(&mut self, closing: char) -> Result<Vec<Argument<'t>>, Mistake> {
         let mut arguments = Vec::new();
-        while !self.takes(')') {
+        while !self.takes(closing) {
             let name = self.name("an argument begins with its name")?;
             if !self.takes(':') {
                 return Err(Mistake::new(self.here(), "an argument's name and value are parted by a colon", "':'"));
             }
             arguments.push((name, self.value()?));
-            self.next_or(')', "',' or ')'")?;
+            self.next_or(closing, if closing == ')' { "',' or ')'" } else { "',' or '}'" })?;
         }
         Ok(arguments)
     }
@@ -126,16 +143,24 @@ impl<'t> Reader<'t> {
 
     fn value(&mut self) -> Result<Placed<Value<'t>>, Mistake> {
         let start = self.here().start;
+        if matches!(self.peek(), Some('[' | '{')) && self.depth >= DEEPEST {
+            let expected = format!("at most {DEPTH} lists and records inside each other");
+            return Err(Mistake::new(self.here(), "this is too deep inside others", expected));
+        }
+        self.depth += 1;
         let value = if self.takes('[') {
             let mut several = Vec::new();
             while !self.takes(']') {
-                several.push(self.literal()?);
+                several.push(self.value()?);
                 self.next_or(']', "',' or ']'")?;
             }
             Value::Several(several)
+        } else if self.takes('{') {
+            Value::Fields(self.arguments('}')?)
         } else {
             Value::One(self.literal()?.value)
         };
+        self.depth -= 1;
         Ok(Placed { at: start..self.at, value })
     }
 
@@ -145,9 +170,6 @@ impl<'t> Reader<'t> {
         }
         let word = self.word(|c| c.is_alphanumeric() || matches!(c, '_' | '-' | '.' | '+' | '/'));
         let value = match word.value {
-            "" if self.peek() == Some('[') => {
-                return Err(Mistake::new(self.here(), "arrays do not hold arrays", "a number, true or false"));
-            }
             "" => return Err(Mistake::new(self.here(), "a value is missing", A_VALUE)),
             "true" => Literal::Truth(true),
             "false" => Literal::Truth(false),

@@ -20,6 +20,9 @@ fn a_scan_shows_who_is_there() {
     assert_eq!(told["unit"]["name"], "manager");
     let names: Vec<_> = told["nodes"].as_array().unwrap().iter().map(|node| node["name"].as_str().unwrap()).collect();
     assert!(names.len() == 2 && names.contains(&"agv-1") && names.contains(&"agv-2"), "{names:?}");
+    let link = &told["nodes"][0]["link"];
+    let numbers = ["silent_ms", "calls", "calls_here", "queued_bytes"].map(|number| link[number].as_u64());
+    assert!(numbers.iter().all(Option::is_some) && numbers[0] < Some(30_000), "{link}");
     assert_eq!(stage.ends(0, &["scan", "--offering", "go_to", "--json"]).json()["nodes"].as_array().unwrap().len(), 2);
     stage.ends(0, &["scan", "--offering", "fly"]).says("no such node");
     stage.ends(0, &["scan", "--search", "--listen", "10ms"]).says("agv-2");

@@ -1,5 +1,7 @@
 //! `cara stream`.
 
+use cara_std::control::Client;
+use cara_std::control::protocol::{Answer, ArgumentValue, Question};
 use cara_std::{Definition, Duration, Parameters};
 
 use crate::support::{PATIENCE, Running, Stage};
@@ -65,4 +67,32 @@ fn what_is_no_stream_is_said() {
     stage.ends(2, &["stream", "agv-1", "pose", "--rate", "0"]);
     stage.ends(2, &["stream", "agv-1", "--rate", "1"]);
     agv.stop();
+}
+
+#[test]
+fn one_connection_gets_the_streams_of_all_nodes_also_of_later_ones() {
+    let (stage, _agv, _pose) = stage();
+    let mut client = Client::find_in(stage.control(), Some("manager/1")).unwrap();
+    let closer = client.closer().unwrap();
+    let mut answers = client.ask(&Question::Streams { interval_ms: 0 }).unwrap();
+    let mut next = || match answers.next() {
+        Some(Ok(Answer::Value { node, stream, values, .. })) => Some((node, stream, values)),
+        _ => None,
+    };
+    let first = next().unwrap();
+    assert_eq!(
+        (&*first.0, &*first.1, &first.2[0].value),
+        ("agv-1/11", "pose() -> (x: int)", &ArgumentValue::Int(vec![7]))
+    );
+    stage.know("agv-2", 12);
+    let later = stage.vehicle("agv-2", 12).build().unwrap();
+    let place =
+        later.my_function_list().add_stream(&Definition::stream("pose(x: int)").unwrap(), Duration::ZERO).unwrap();
+    put(&place, 9);
+    later.publish_my_function_list().unwrap();
+    later.start().unwrap();
+    let second = next().unwrap();
+    assert_eq!((&*second.0, &second.2[0].value), ("agv-2/12", &ArgumentValue::Int(vec![9])));
+    closer.close();
+    assert_eq!(next(), None, "the connection was closed from elsewhere");
 }

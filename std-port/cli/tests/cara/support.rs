@@ -102,7 +102,12 @@ impl Stage {
 
     /// Makes the keys of an s_unit, before the manager starts or while it runs.
     pub(crate) fn know(&self, name: &str, id: u32) {
-        self.keys.add(&[&format!("{name}/{id}")]).unwrap();
+        self.know_all(&[&format!("{name}/{id}")]);
+    }
+
+    /// Likewise of several, as `NAME/ID`.
+    pub(crate) fn know_all(&self, nodes: &[&str]) {
+        self.keys.add(nodes).unwrap();
     }
 
     /// The builder of an s_unit that is [known](Self::know).

@@ -1,7 +1,9 @@
 //! The asynchronous face, on tokio.
 
+mod details;
 mod services;
 mod starving;
+mod streams;
 mod waiting;
 
 use std::future::Future;

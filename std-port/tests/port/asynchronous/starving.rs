@@ -15,7 +15,7 @@ use crate::support::{Gate, fleet, held, meet, number, pair, retire_absent, servi
 const LIMIT: Duration = Duration::from_secs(8);
 
 /// Runs `waits` on one thread with a second task that ticks a few times and then does what ends the wait.
-fn beside<R>(waits: impl Future<Output = R>, brings_about: impl FnOnce() + Send + 'static) -> R {
+pub(super) fn beside<R>(waits: impl Future<Output = R>, brings_about: impl FnOnce() + Send + 'static) -> R {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
     let ticks = Arc::new(AtomicUsize::new(0));
     let ticked = ticks.clone();

@@ -28,6 +28,16 @@ pub(crate) enum Question {
     Block { node: Option<u32>, calls: usize },
     /// How often `touch` ran on each node: fewest and most.
     Runs,
+    /// Vehicles publish values, or no more.
+    Publish { on: bool },
+    /// Answers when a value of each stream has come: `bool`, whether they have in time.
+    Subscribe,
+    /// What was seen of ages since this was asked before.
+    Ages,
+    /// The manager makes so many calls of the vehicles in turn: how long each took, in microseconds.
+    Calls { function: String, calls: u32 },
+    /// Bytes that have left the manager's host, and that have come to it.
+    Wire,
 }
 
 /// The first line of a child.

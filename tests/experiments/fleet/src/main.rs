@@ -14,6 +14,7 @@ mod parent;
 mod phases;
 mod proc;
 mod report;
+mod streams;
 mod units;
 
 use std::path::PathBuf;
@@ -51,6 +52,17 @@ pub(crate) struct Plan {
 
 #[derive(Subcommand)]
 enum Role {
+    /// Measures streams of many vehicles over a slow cable, beside calls; needs root.
+    Streams(streams::Plan),
+    /// The manager's process of that; started by the others.
+    #[command(hide = true)]
+    StreamsManager(streams::Part),
+    /// The vehicles' process; started by the others.
+    #[command(hide = true)]
+    StreamsUnits(streams::Part),
+    /// The process of another m_unit; started by the others.
+    #[command(hide = true)]
+    StreamsReader(streams::Part),
     /// The manager's process; started by the others.
     #[command(hide = true)]
     Manager(Manager),
@@ -108,6 +120,10 @@ pub(crate) struct Floor {
 fn main() -> Result<ExitCode> {
     let arguments = Arguments::parse();
     match arguments.role {
+        Some(Role::Streams(plan)) => streams::run(&plan).map(|()| ExitCode::SUCCESS),
+        Some(Role::StreamsManager(part)) => streams::manager(&part).map(|()| ExitCode::SUCCESS),
+        Some(Role::StreamsUnits(part)) => streams::units(&part).map(|()| ExitCode::SUCCESS),
+        Some(Role::StreamsReader(part)) => streams::reader(&part).map(|()| ExitCode::SUCCESS),
         Some(Role::Manager(manager)) => manager::run(&manager).map(|()| ExitCode::SUCCESS),
         Some(Role::Units(units)) => units::run(&units).map(|()| ExitCode::SUCCESS),
         Some(Role::FloorServer(floor)) => floor::serve(floor.port, floor.count).map(|()| ExitCode::SUCCESS),

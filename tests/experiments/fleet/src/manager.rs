@@ -40,7 +40,7 @@ fn answer(manager: &CommunicationSystem, question: Question) -> Result<serde_jso
         }
         Question::CallAll => json!(call_all(manager)?),
         Question::Block { node, calls } => json!(block(manager, node, calls)?),
-        Question::Runs => anyhow::bail!("a manager has no runs"),
+        question => anyhow::bail!("a manager does not answer {question:?}"),
     })
 }
 

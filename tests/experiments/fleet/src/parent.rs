@@ -42,6 +42,14 @@ impl Place {
     }
 }
 
+impl Place {
+    /// Keys for further m_units.
+    pub(crate) fn add_m_units(&self, m_units: &[(&str, u32)]) -> Result<()> {
+        let nodes: Vec<_> = m_units.iter().map(|(name, id)| format!("{name}/{id}@m_unit")).collect();
+        self.keys.add(&nodes.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+}
+
 impl Child {
     pub(crate) fn manager(place: &Place, nodes: u16) -> Result<Self> {
         Self::start("manager", place, &["--nodes", &nodes.to_string()])
@@ -57,7 +65,8 @@ impl Child {
         Self::start(role, place, &["--count", &count.to_string()])
     }
 
-    fn start(role: &str, place: &Place, more: &[&str]) -> Result<Self> {
+    /// A process of this role.
+    pub(crate) fn start(role: &str, place: &Place, more: &[&str]) -> Result<Self> {
         let (fleet, port) = (place.fleet.to_string(), place.port.to_string());
         let (keys, program) = (format!("CARA_KEYS={}", place.keys.path().display()), std::env::current_exe()?);
         let program = program.to_str().context("this program's path is no text")?;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::ops::ControlFlow;
 use std::rc::Rc;
 use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -12,6 +13,7 @@ use std::thread;
 use cara_core::config::{Constraints, Mode, PLAIN_PORT};
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function::Definition;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
@@ -33,7 +35,7 @@ use super::relay::{Relay, Way};
 use crate::run::Report;
 use crate::{
     Asked, Fault, Heart, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, UnknownClient,
-    Unsupported, World, boxed,
+    Unsupported, Watched, World, boxed, number,
 };
 
 /// How often a waiting scenario looks.
@@ -418,11 +420,23 @@ fn serve(
         peer.block_request(function, parameters).map_err(|_| ServiceError::NotReady)?;
     }
     (service.body)(&Asked { caller: call.caller.clone(), at: node.now() }, parameters)?;
+    while let Some(pause) = service.moves_on(call.lease.as_ref().is_some_and(LeaseWatch::is_live), parameters) {
+        thread::sleep(pause.into());
+    }
+    if service.tells > 0 {
+        let mut told = 0;
+        while told < service.tells && !call.is_cancelled() {
+            told += 1;
+            call.progress(&number("left", told)).map_err(|_| ServiceError::BadResults)?;
+            thread::sleep(LOOK);
+        }
+        service.log().note(told);
+    }
     if service.takes > Duration::ZERO {
         thread::sleep(service.takes.into());
     }
-    while let Some(pause) = service.moves_on(call.lease.as_ref().is_some_and(LeaseWatch::is_live), parameters) {
-        thread::sleep(pause.into());
+    if let Some(failure) = &service.failure {
+        return Err(call.fail(failure.clone()));
     }
     service.log().end(node.now());
     Ok(())
@@ -600,6 +614,32 @@ impl Node for Handle {
             let outcomes = system.map(|system| system.block_request_all(&function, &copy, &RequestOptions::default()));
             let short = |(peer, outcome): (Peer, Result<_, Error>)| (peer.identity().clone(), outcome.map(drop));
             told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
+        });
+        pending
+    }
+
+    fn watch(
+        &self,
+        peer: &str,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+        enough: i64,
+    ) -> Pending<Watched> {
+        let pending = Pending::new();
+        let (node, ended, mut parameters) = (Arc::clone(&self.node), pending.share(), boxed(parameters));
+        let (peer, function) = (peer.to_owned(), function.to_owned());
+        thread::spawn(move || {
+            let mut told = Vec::new();
+            let mut listen = |progress: &ParametersView| {
+                let left = progress.variable("left").expect("it is declared so");
+                told.push(left);
+                if left < enough { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            };
+            let asked = node.peer(&peer).map_err(|error| Box::new(CallFailure::from(error)));
+            let outcome = asked
+                .and_then(|peer| peer.block_request_with_progress(&function, &mut parameters, &options, &mut listen));
+            ended.end(Ok(Watched { told, outcome: outcome.map_err(|failed| *failed) }), node.now());
         });
         pending
     }

@@ -23,7 +23,7 @@ use super::lent;
 use crate::run::Report;
 use crate::{
     Asked, Fault, FaultProfile, Heart, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit,
-    UnknownClient, Unsupported, World, boxed, millis, secs,
+    UnknownClient, Unsupported, Watched, World, boxed, millis, number, secs,
 };
 
 /// How long the fault profile of a run lasts: longer than any run.
@@ -359,6 +359,9 @@ fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
             kept.log().begin(call.unit.now());
             begins(call);
             let result = (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, parameters);
+            if let Some(failure) = &kept.failure {
+                return Err(call.fail(failure.clone()));
+            }
             kept.log().end(call.unit.now());
             result
         })
@@ -375,10 +378,22 @@ fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
                     called.map_err(|_| ServiceError::NotReady)?;
                 }
                 (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, &mut parameters)?;
-                call.unit.sleep(kept.takes).await;
                 while let Some(pause) = kept.moves_on(call.lease.as_ref().is_none_or(LeaseWatch::is_live), &parameters)
                 {
                     call.unit.sleep(pause).await;
+                }
+                if kept.tells > 0 {
+                    let mut told = 0;
+                    while told < kept.tells && !call.is_cancelled() {
+                        told += 1;
+                        call.progress(&number("left", told)).map_err(|_| ServiceError::BadResults)?;
+                        call.unit.sleep(millis(1)).await;
+                    }
+                    kept.log().note(told);
+                }
+                call.unit.sleep(kept.takes).await;
+                if let Some(failure) = &kept.failure {
+                    return Err(call.fail(failure.clone()));
                 }
                 kept.log().end(call.unit.now());
                 Ok(parameters)
@@ -489,6 +504,42 @@ impl Node for SimNode {
             let outcomes = unit.block_request_all(&function, &parameters).await;
             let outcomes = outcomes.into_iter().map(|(peer, outcome)| (peer, outcome.map(drop))).collect();
             told.end(Ok(outcomes), unit.now());
+        });
+        pending
+    }
+
+    fn watch(
+        &self,
+        peer: &str,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+        enough: i64,
+    ) -> Pending<Watched> {
+        let pending = Pending::new();
+        let (unit, ended) = (self.handle.clone(), pending.share());
+        let call = match unit.watch(peer, function, parameters, options) {
+            Ok(call) => call,
+            Err(error) => {
+                pending.end(Err(error), unit.now());
+                return pending;
+            }
+        };
+        self.handle.spawn(async move {
+            let (mut call, mut told) = (call, Vec::new());
+            let mut is_enough = false;
+            while !is_enough && let Some(progress) = call.progress().await {
+                let left = progress.variable("left").expect("it is declared so");
+                told.push(left);
+                is_enough = left >= enough;
+            }
+            let outcome = if is_enough {
+                drop(call);
+                Err(Error::Cancelled.into())
+            } else {
+                call.results().await.map(drop).map_err(|failed| *failed)
+            };
+            ended.end(Ok(Watched { told, outcome }), unit.now());
         });
         pending
     }

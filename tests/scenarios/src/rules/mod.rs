@@ -7,6 +7,7 @@ mod at_most_once;
 mod bad_input;
 mod best_effort;
 mod deadlines;
+mod details;
 mod emergency;
 mod everybody;
 mod fleets;
@@ -55,6 +56,7 @@ pub fn all() -> Vec<Scenario> {
         slow::SCENARIOS,
         everybody::SCENARIOS,
         streams::SCENARIOS,
+        details::SCENARIOS,
         anything::SCENARIOS,
     ]
     .concat()

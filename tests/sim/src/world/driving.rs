@@ -1,11 +1,13 @@
 //! Events go to the machine of their unit, and what comes of them is done, as the front page of `cara_core::services` says.
 
+use std::cell::RefCell;
 use std::net::SocketAddr;
 use std::rc::Rc;
 
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::connection_handler::{Command, NewerTerm, NodeCounter};
 use cara_core::distribution::datagram;
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
@@ -14,7 +16,8 @@ use cara_core::services::session::Event;
 
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
-use super::service::{BoxedParameters, Call, Handler, LeaseWatch};
+use super::replies::Promise;
+use super::service::{BoxedParameters, Call, Handler, LeaseWatch, Serving};
 use super::state::NODE_TIMER;
 use super::streams::Sample;
 use super::tasks::Owner;
@@ -314,7 +317,11 @@ impl Inner {
         let Some(caller) = link.session.peer().cloned() else { return };
         let (ticket, stream) = (call.ticket, link.stream);
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
+        let (failure, cancelled) = (RefCell::default(), Promise::new());
+        let running = Rc::new(Serving { stream, ticket, failure, cancelled });
+        machine.links.runs(index, &running);
         let told = Call {
+            running: running.clone(),
             caller: caller.clone(),
             priority: call.priority,
             deadline: self.network.time_of(host, call.deadline),
@@ -325,7 +332,9 @@ impl Inner {
         let owner = Owner { host, life: unit.life };
         let job = async move {
             let outcome = service.run(told, parameters).await;
-            handle.answer(stream, ticket, outcome.map_err(Error::Service));
+            let failure = running.failure.take();
+            let failed = |error| Box::new(CallFailure { error: Error::Service(error), failure });
+            handle.answer(stream, ticket, outcome.map_err(failed));
         };
         self.spawned.push((owner, Box::pin(job)));
         self.log(shared, host, LogEvent::Called { function: function.to_string(), caller });

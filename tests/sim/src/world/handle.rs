@@ -5,8 +5,10 @@ use std::future::Future;
 use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::Ticket;
 use cara_core::term::Term;
@@ -282,7 +284,25 @@ impl UnitHandle {
 
     // --- helpers
 
-    pub(super) fn answer(&self, stream: StreamId, ticket: Ticket, outcome: Result<BoxedParameters, Error>) {
+    pub(super) fn progress(&self, stream: StreamId, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
+        let told = self.machine(|machine, network| {
+            let index = machine.links.of_stream(stream)?;
+            Some((index, machine.links.progress(network, index, ticket, values)))
+        })?;
+        let Some((index, told)) = told else { return Ok(()) };
+        self.work(index);
+        told
+    }
+
+    pub(super) fn is_cancelled(&self, stream: StreamId, ticket: Ticket) -> bool {
+        let cancelled = self.machine(|machine, _| {
+            let link = machine.links.of_stream(stream).and_then(|index| machine.links.link(index));
+            link.is_none_or(|link| link.session.is_cancelled(ticket))
+        });
+        cancelled.unwrap_or(true)
+    }
+
+    pub(super) fn answer(&self, stream: StreamId, ticket: Ticket, outcome: Result<BoxedParameters, Box<CallFailure>>) {
         let answered = self.machine(|machine, network| {
             let index = machine.links.of_stream(stream)?;
             machine.links.answer(network, index, ticket, outcome);

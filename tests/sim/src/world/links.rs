@@ -1,8 +1,10 @@
 //! The links of one unit: sessions over streams, read and written as a port does.
 
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
 use cara_core::distribution::connection_handler::Directive;
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -17,7 +19,7 @@ use super::audited::Audited;
 use super::keys::Keys;
 use super::mail::{LazyPool, SimMailman};
 use super::replies::{Promise, Waiting};
-use super::service::{BoxedParameters, Handler};
+use super::service::{BoxedParameters, Handler, Serving};
 use super::streams::Reading;
 use crate::event::{HostId, StreamId};
 use crate::network::Network;
@@ -47,7 +49,11 @@ pub(super) struct Link {
     unread: Vec<u8>,
     waiting: BTreeMap<CallId, Waiting>,
     acknowledgements: Vec<(u32, Promise<bool>)>,
-    unanswered: Vec<(Ticket, Result<BoxedParameters, Error>)>,
+    unanswered: Vec<(Ticket, Result<BoxedParameters, Box<CallFailure>>)>,
+    /// Calls of the peer that run.
+    running: Vec<Rc<Serving>>,
+    /// The newest progress of those that could not be sent.
+    progress: Vec<(Ticket, BoxedParameters)>,
     /// The session wants no bytes now: the unit is out of buffers or has not decided about the peer.
     paused: bool,
 }
@@ -127,6 +133,8 @@ impl Links {
             waiting: BTreeMap::new(),
             acknowledgements: Vec::new(),
             unanswered: Vec::new(),
+            running: Vec::new(),
+            progress: Vec::new(),
             paused: false,
         });
     }
@@ -214,12 +222,65 @@ impl Links {
         network: &mut Network,
         index: u16,
         ticket: Ticket,
-        outcome: Result<BoxedParameters, Error>,
+        outcome: Result<BoxedParameters, Box<CallFailure>>,
     ) {
-        let lent = outcome.as_deref().map_err(|error| *error);
-        let answered = self.with(network, index, |session, cx| session.answer(cx, ticket, lent));
+        if let Some(link) = self.link_mut(index) {
+            link.running.retain(|running| running.ticket != ticket);
+            link.progress.retain(|(known, _)| *known != ticket);
+        }
+        let answered = self.with(network, index, |session, cx| match &outcome {
+            Ok(results) => session.answer(cx, ticket, Ok(results)),
+            Err(failed) => match &failed.failure {
+                Some(failure) if failed.error == failure.into() => session.answer_failed(cx, ticket, failure),
+                _ => session.answer(cx, ticket, Err(failed.error)),
+            },
+        });
         if let (Some(Err(_)), Some(link)) = (answered, self.link_mut(index)) {
             link.unanswered.push((ticket, outcome));
+        }
+    }
+
+    /// A call of the peer runs.
+    pub(super) fn runs(&mut self, index: u16, running: &Rc<Serving>) {
+        if let Some(link) = self.link_mut(index) {
+            link.running.push(Rc::clone(running));
+        }
+    }
+
+    /// Tells the caller of a running call how far it is, now or when there is room.
+    pub(super) fn progress(
+        &mut self,
+        network: &mut Network,
+        index: u16,
+        ticket: Ticket,
+        values: &ParametersView,
+    ) -> Result<(), Error> {
+        let told = self.with(network, index, |session, cx| session.progress(cx, ticket, values)).unwrap_or(Ok(()));
+        let Some(link) = self.link_mut(index) else { return told };
+        let waiting = link.progress.iter().position(|(known, _)| *known == ticket);
+        match told {
+            Err(Error::Full(_)) => {}
+            Ok(()) => {
+                waiting.map(|place| link.progress.remove(place));
+                return Ok(());
+            }
+            // What is wrong with these values is nothing against those that wait.
+            Err(error) => return Err(error),
+        }
+        let mut kept = super::service::boxed_parameters(size_of_val(values));
+        kept.copy_from(values)?;
+        match waiting {
+            Some(place) => link.progress[place].1 = kept,
+            None => link.progress.push((ticket, kept)),
+        }
+        Ok(())
+    }
+
+    fn progress_again(&mut self, network: &mut Network, index: u16) {
+        let Some(link) = self.link_mut(index) else { return };
+        for (ticket, values) in std::mem::take(&mut link.progress) {
+            // What is wrong with it was told when it was new.
+            let _ = self.progress(network, index, ticket, &values);
         }
     }
 
@@ -232,6 +293,7 @@ impl Links {
         self.poll(network, index, &mut happened);
         self.begin_calls(network, index, &mut happened);
         self.poll(network, index, &mut happened);
+        self.progress_again(network, index);
         self.arm(network, index);
         happened
     }
@@ -391,7 +453,10 @@ impl Link {
     /// Ends everything that still waits for this link.
     pub(super) fn abandon(self, error: Error) {
         for waiting in self.waiting.into_values() {
-            waiting.promise.keep(Err(error));
+            waiting.promise.keep(Err(Box::new(error.into())));
+        }
+        for running in self.running {
+            running.cancelled.keep(());
         }
         for (_, promise) in self.acknowledgements {
             promise.keep(false);
@@ -407,7 +472,9 @@ pub(super) fn timer_token(index: u16) -> u64 {
 /// The arguments of a call in parameters of their own.
 fn own(functions: &FunctionList<Boxed, Handler>, slot: Slot, arguments: &ParametersView) -> BoxedParameters {
     let bytes = functions.function(slot).map_or(0, |function| function.signature.parameters_bytes());
-    let mut parameters = super::service::boxed_parameters(bytes as usize);
+    // By its signature alone a list is empty.
+    let used = size_of_val(arguments) - arguments.remaining();
+    let mut parameters = super::service::boxed_parameters(used.max(bytes as usize));
     // Room for the signature is room for its arguments; if not, the service finds them missing and says so.
     let copied = parameters.copy_from(arguments);
     debug_assert_eq!(copied, Ok(()));
@@ -426,9 +493,23 @@ fn note(
     match event {
         None | Some(Event::Answered) => {}
         Some(Event::Reply(id, outcome)) => {
+            let failure = if outcome.is_err() { link.session.failure(lent) } else { None };
             if let Some(waiting) = link.waiting.remove(&id) {
-                waiting.finish(outcome.and_then(|results| link.session.results(&results, lent)));
+                let outcome = outcome.and_then(|results| link.session.results(&results, lent));
+                waiting.finish(outcome.map_err(|error| CallFailure { error, failure }));
             }
+        }
+        Some(Event::Progress(id, values)) => {
+            let block = link.session.progress_values(&values, lent).expect("it has just come");
+            let mut values = super::service::boxed_parameters(block.parameters_bytes() as usize);
+            let read = block.read_into(&mut values);
+            if let Some(waiting) = link.waiting.get(&id).filter(|_| read.is_ok()) {
+                waiting.progress.put(values);
+            }
+        }
+        Some(Event::Cancelled(ticket)) => {
+            let running = link.running.iter().find(|running| running.ticket == ticket);
+            running.into_iter().for_each(|running| running.cancelled.keep(()));
         }
         Some(Event::Acknowledged { serial, .. }) => {
             link.acknowledgements.retain(|(wanted, promise)| {
@@ -441,7 +522,7 @@ fn note(
         }
         Some(event @ Event::Sample(sample)) => {
             let block = link.session.results(&sample.values, lent).expect("it has just come");
-            let mut values = super::service::boxed_parameters(block.signature().parameters_bytes() as usize);
+            let mut values = super::service::boxed_parameters(block.parameters_bytes() as usize);
             block.read_into(&mut values).expect("it was checked");
             happened.push((event, Some(values)));
         }

@@ -6,7 +6,7 @@ use std::pin::Pin;
 use std::rc::Rc;
 use std::task::{Context, Poll, Waker};
 
-use cara_core::error::Error;
+use cara_core::distribution::failure::CallFailure;
 use cara_core::services::session::ReplyBlock;
 
 use super::service::BoxedParameters;
@@ -28,6 +28,15 @@ impl<T> Clone for Promise<T> {
 impl<T> Promise<T> {
     pub(super) fn new() -> Self {
         Self(Rc::new(RefCell::new(State { value: None, waker: None })))
+    }
+
+    /// Whether it is known; if not, the task of `context` is woken when it is.
+    pub(super) fn is_kept(&self, context: &Context<'_>) -> bool {
+        let mut state = self.0.borrow_mut();
+        if state.value.is_none() {
+            state.waker = Some(context.waker().clone());
+        }
+        state.value.is_some()
     }
 
     /// Makes it known; only the first value counts.
@@ -60,12 +69,40 @@ impl<T> Future for Promise<T> {
 /// A call in flight: a copy of the caller's parameters that the results are put into.
 pub(super) struct Waiting {
     pub(super) parameters: BoxedParameters,
-    pub(super) promise: Promise<Result<BoxedParameters, Error>>,
+    pub(super) promise: Promise<Result<BoxedParameters, Box<CallFailure>>>,
+    /// The newest that it has told, until it is looked at.
+    pub(super) progress: Newest,
+}
+
+/// What a call has told last, and what waits for it.
+#[derive(Clone, Default)]
+pub(super) struct Newest(Rc<RefCell<(Option<BoxedParameters>, Option<Waker>)>>);
+
+impl Newest {
+    pub(super) fn put(&self, values: BoxedParameters) {
+        let mut state = self.0.borrow_mut();
+        state.0 = Some(values);
+        state.1.take().into_iter().for_each(Waker::wake);
+    }
+
+    /// Takes it; without one, the task of `context` is woken by the next.
+    pub(super) fn take(&self, context: &Context<'_>) -> Option<BoxedParameters> {
+        let mut state = self.0.borrow_mut();
+        let values = state.0.take();
+        if values.is_none() {
+            state.1 = Some(context.waker().clone());
+        }
+        values
+    }
 }
 
 impl Waiting {
-    pub(super) fn finish(mut self, result: Result<ReplyBlock<'_>, Error>) {
-        let result = result.and_then(|block| block.read_into(&mut self.parameters));
-        self.promise.keep(result.map(|()| self.parameters));
+    pub(super) fn finish(mut self, result: Result<ReplyBlock<'_>, CallFailure>) {
+        let result = match result.map(|block| block.read_into(&mut self.parameters)) {
+            Ok(Ok(())) => Ok(self.parameters),
+            Ok(Err(error)) => Err(Box::new(error.into())),
+            Err(failure) => Err(Box::new(failure)),
+        };
+        self.promise.keep(result);
     }
 }

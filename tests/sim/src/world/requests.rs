@@ -1,5 +1,8 @@
 //! Requests of a unit: the paper's two forms, to one node and to all, and the leases that they hold.
 
+use std::task::Poll;
+
+use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -7,7 +10,7 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 
 use super::handle::{Peer, UnitHandle};
-use super::replies::{Promise, Waiting};
+use super::replies::{Newest, Promise, Waiting};
 use super::service::{BoxedParameters, LeaseWatch, boxed_parameters};
 use crate::event::StreamId;
 
@@ -67,13 +70,36 @@ impl UnitHandle {
             let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..options };
             match self.call(&peer, function, parameters, &options) {
                 Ok(call) => {
-                    let results = call.results().await?;
+                    let results = call.results().await.map_err(|failed| failed.error)?;
                     return parameters.copy_from(&results);
                 }
                 Err(Error::TooSoon { wait }) if self.now() + wait < deadline => self.sleep(wait).await,
                 Err(error) => return Err(error),
             }
         }
+    }
+
+    /// A call that is watched: what it tells while it runs, and why it fails. Given up with what this returns.
+    ///
+    /// ```no_run
+    /// # async fn run(unit: cara_sim::UnitHandle) -> Result<(), Box<dyn std::error::Error>> {
+    /// let options = cara_core::services::session::RequestOptions::default();
+    /// let mut call = unit.watch("agv", "go_to", &cara_core::distribution::parameters::Parameters::new(), options)?;
+    /// while let Some(progress) = call.progress().await {
+    ///     let left: f64 = progress.variable("left")?;
+    /// }
+    /// let results = call.results().await?;
+    /// # Ok(()) }
+    /// ```
+    pub fn watch(
+        &self,
+        peer: impl Into<Peer>,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+    ) -> Result<Watched, Error> {
+        let options = RequestOptions { progress: true, ..options };
+        Ok(Watched(self.call(&peer.into(), function, parameters, &options)?))
     }
 
     /// A call whose lease ends when what this returns is dropped.
@@ -85,7 +111,7 @@ impl UnitHandle {
         options: RequestOptions,
     ) -> Result<Hold, Error> {
         let call = self.call(&peer.into(), function, parameters, &options)?;
-        parameters.copy_from(&call.promise.clone().await?)?;
+        parameters.copy_from(&call.promise.clone().await.map_err(|failed| failed.error)?)?;
         Ok(Hold { _call: call })
     }
 
@@ -112,7 +138,7 @@ impl UnitHandle {
             outcomes.push((
                 peer,
                 match call {
-                    Ok(call) => call.results().await,
+                    Ok(call) => call.results().await.map_err(|failed| failed.error),
                     Err(error) => Err(error),
                 },
             ));
@@ -167,14 +193,16 @@ impl UnitHandle {
         let mut copy = boxed_parameters(size_of_val(parameters));
         copy.copy_from(parameters)?;
         let promise = Promise::new();
-        let waiting = Waiting { parameters: copy, promise: promise.clone() };
+        let progress = Newest::default();
+        let waiting = Waiting { parameters: copy, promise: promise.clone(), progress: progress.clone() };
         let requested = self.machine(|machine, network| {
             let stream = machine.links.link(index).map(|link| link.stream).ok_or(Error::NotConnected)?;
             let id = machine.links.request(network, index, function, parameters, options, Some(waiting))?;
             Ok((stream, id))
         })?;
         self.work(index);
-        requested.map(|(stream, id)| InFlight { unit: self.clone(), stream, id, promise, has_succeeded: false })
+        let unit = self.clone();
+        requested.map(|(stream, id)| InFlight { unit, stream, id, promise, progress, has_succeeded: false })
     }
 }
 
@@ -196,12 +224,41 @@ struct InFlight {
     unit: UnitHandle,
     stream: StreamId,
     id: CallId,
-    promise: Promise<Result<BoxedParameters, Error>>,
+    promise: Promise<Result<BoxedParameters, Box<CallFailure>>>,
+    progress: Newest,
     has_succeeded: bool,
 }
 
+/// A call in flight; dropped before it has ended, it is given up, and its callee is told so.
+#[must_use = "dropped, it is given up at once"]
+pub struct Watched(InFlight);
+
+impl std::fmt::Debug for Watched {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Watched").field("id", &self.0.id).finish_non_exhaustive()
+    }
+}
+
+impl Watched {
+    /// The newest that the call has told and this has not returned; `None` once it has ended.
+    pub async fn progress(&mut self) -> Option<BoxedParameters> {
+        std::future::poll_fn(|context| {
+            if self.0.promise.is_kept(context) {
+                return Poll::Ready(None);
+            }
+            self.0.progress.take(context).map_or(Poll::Pending, |values| Poll::Ready(Some(values)))
+        })
+        .await
+    }
+
+    /// Its results, or all that is known of why there are none.
+    pub async fn results(self) -> Result<BoxedParameters, Box<CallFailure>> {
+        self.0.results().await
+    }
+}
+
 impl InFlight {
-    async fn results(mut self) -> Result<BoxedParameters, Error> {
+    async fn results(mut self) -> Result<BoxedParameters, Box<CallFailure>> {
         let results = self.promise.clone().await;
         self.has_succeeded = results.is_ok();
         results

@@ -8,16 +8,20 @@ use std::pin::Pin;
 use std::rc::Rc;
 
 use cara_core::config::Priority;
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
-use cara_core::error::ServiceError;
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::Ticket;
 use cara_core::services::lease::{Ended, Latch, Lease, Order};
 use cara_core::time::{Duration, Instant};
 
 use super::actuator::Actuator;
 use super::handle::UnitHandle;
+use super::replies::Promise;
 use super::streams::Values;
+use crate::event::StreamId;
 
 /// Parameters of any size on the heap.
 pub type BoxedParameters = Box<ParametersView>;
@@ -49,15 +53,56 @@ pub struct Call {
     pub lease: Option<LeaseWatch>,
     /// The unit that serves, which can request from any other, the caller among them.
     pub unit: UnitHandle,
+    pub(super) running: Rc<Serving>,
 }
 
 impl Call {
+    /// What the handler is to return for this failure, whose text and values go to the caller.
+    pub fn fail(&self, failure: Failure) -> ServiceError {
+        let error = failure.error();
+        *self.running.failure.borrow_mut() = Some(failure);
+        error
+    }
+
+    /// Tells the caller how far the call is, if it wants to know. Of values that cannot be sent at once the newest ones are.
+    pub fn progress(&self, values: &ParametersView) -> Result<(), Error> {
+        self.unit.progress(self.running.stream, self.running.ticket, values)
+    }
+
+    /// Whether the caller has given the call up, or is gone.
+    pub fn is_cancelled(&self) -> bool {
+        self.unit.is_cancelled(self.running.stream, self.running.ticket)
+    }
+
+    /// Ends when the caller gives the call up, or goes.
+    pub async fn cancelled(&self) {
+        if !self.is_cancelled() {
+            self.running.cancelled.clone().await;
+        }
+    }
+
     /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
     pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
         match &self.lease {
             Some(lease) => lease.commit(change),
             None => Ok(change()),
         }
+    }
+}
+
+/// A call that runs, as its unit knows it.
+pub(super) struct Serving {
+    pub(super) stream: StreamId,
+    pub(super) ticket: Ticket,
+    /// What its handler has said of its failure.
+    pub(super) failure: RefCell<Option<Failure>>,
+    /// Kept when its caller has given it up.
+    pub(super) cancelled: Promise<()>,
+}
+
+impl fmt::Debug for Serving {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:?}", self.ticket)
     }
 }
 

@@ -31,7 +31,7 @@ pub(crate) struct Image {
     pub(crate) has_logs: bool,
     /// Whether it has a cipher and keys.
     pub(crate) is_secured: bool,
-    /// What only tests want of it, on the emulated board.
+    /// What not every image has, on the emulated board.
     pub(crate) feature: Option<&'static str>,
 }
 
@@ -68,14 +68,22 @@ const ECHO: Image = Image::plain("echo", "echo");
 const EMULATED: &[Image] = &[
     AGV,
     Image::plain("agv-plain", "agv"),
+    STREAMS,
+    WAREHOUSE,
     Image::plain("unit-secured", "unit").secured(),
     Image::plain("unit", "unit"),
     ECHO,
     Image::plain("agv-quiet", "agv").secured().quiet(),
+    Image { name: "agv-streams-quiet", ..STREAMS }.quiet(),
     Image::plain("unit-secured-quiet", "unit").secured().quiet(),
     Image::plain("unit-quiet", "unit").quiet(),
     Image::plain("echo-quiet", "echo").quiet(),
 ];
+/// The AGV of the emulated board with its streams.
+pub(crate) const STREAMS: Image = Image { name: "agv-streams", feature: Some("streams"), ..AGV };
+/// A vehicle of the warehouse.
+pub(crate) const WAREHOUSE: Image =
+    Image { feature: Some("warehouse"), ..Image::plain("warehouse", "warehouse").secured() };
 /// The AGV of the emulated board with a service that makes it fail.
 pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
 /// The AGV of the emulated board with random numbers that are the same in each life.

@@ -38,6 +38,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
                     slot: Slot(two as u16),
                     generation: Generation(three as u16 / 3),
                     wants_reply: flag,
+                    wants_progress: false,
                     takes_over: false,
                     operator: false,
                     unknown: if two == 5 { 0x10 } else { 0 },

@@ -43,6 +43,7 @@ fn an_emergency_above_its_limit_is_refused() {
             slot,
             generation: Generation(0),
             wants_reply: false,
+            wants_progress: false,
             takes_over: false,
             operator: false,
             unknown: 0,

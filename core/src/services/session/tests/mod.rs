@@ -12,6 +12,8 @@ mod acts;
 mod actuators;
 mod chaos;
 mod delivery;
+#[cfg(feature = "details")]
+mod details;
 mod ends;
 mod gathering;
 mod hearts;

@@ -135,6 +135,7 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
         slot: told.slot,
         generation: told.generation,
         wants_reply: false,
+        wants_progress: false,
         takes_over: false,
         operator: false,
         unknown: 0,
@@ -200,6 +201,7 @@ fn a_call_that_is_given_up_ends_without_an_event() {
     pair.agv.offer_held("wait()");
     pair.publish();
     let id = pair.manager.call("wait", &none()).unwrap();
+    pair.settle();
     pair.manager.cancel(id);
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));

@@ -96,6 +96,11 @@ pub(super) struct Side {
     unanswered: Vec<(Call, Result<Arguments, Error>)>,
     pub(super) buffers: usize,
     pub(super) base: Duration,
+    /// Why calls have failed, and what they have told.
+    #[cfg(feature = "details")]
+    pub(super) failures: Vec<crate::distribution::failure::Failure>,
+    #[cfg(feature = "details")]
+    pub(super) progress: Vec<(CallId, i64)>,
     /// Values of streams that have arrived: their `x`, and their age.
     #[cfg(feature = "streams")]
     pub(super) samples: Vec<(i64, Duration)>,
@@ -147,6 +152,10 @@ impl Side {
             unanswered: Vec::new(),
             buffers: setup.buffers,
             base,
+            #[cfg(feature = "details")]
+            failures: Vec::new(),
+            #[cfg(feature = "details")]
+            progress: Vec::new(),
             #[cfg(feature = "streams")]
             samples: Vec::new(),
         }
@@ -239,6 +248,10 @@ impl Side {
 
     /// A call has its arguments in `arguments`, and results are in what has arrived.
     fn note(&mut self, event: Option<Event>, arguments: &mut Arguments) {
+        #[cfg(feature = "details")]
+        if let Some(Event::Reply(_, Err(_)) | Event::Failed(..)) = event {
+            self.failures.extend(self.session.failure(&self.inbox));
+        }
         match event {
             None => {}
             Some(Event::Call(call)) => self.run(call, arguments),
@@ -248,6 +261,12 @@ impl Side {
                     block.read_into(self.results.get_mut(&id).unwrap()).map(|()| results)
                 });
                 self.happened.push(Event::Reply(id, outcome));
+            }
+            #[cfg(feature = "details")]
+            Some(Event::Progress(id, values)) => {
+                let mut told: Arguments = Box::default();
+                self.session.progress_values(&values, &self.inbox).unwrap().read_into(&mut told).unwrap();
+                self.progress.push((id, told.variable("x").unwrap()));
             }
             #[cfg(feature = "streams")]
             Some(Event::Sample(sample)) => {

@@ -133,6 +133,7 @@ pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
         left_reason: (!connected).then(|| "Silent".into()),
         left_text: (!connected).then(|| "nothing was heard".into()),
         limits: None,
+        link: None,
         functions: 0,
     }
 }

@@ -52,6 +52,7 @@ impl Subject {
             priority: None,
             best_effort: false,
             take_over: false,
+            progress: false,
         }
     }
 }

@@ -22,6 +22,10 @@ mod printed {
             Of::SIGNATURE_stop,
             Of::SIGNATURE_reset,
             Of::SIGNATURE_log_line,
+            Of::SIGNATURE_plan,
+            Of::SIGNATURE_dock,
+            Of::SIGNATURE_undock,
+            Of::SIGNATURE_lift,
         ];
         let attributes = [
             Of::ATTRIBUTES_pos_info,
@@ -29,6 +33,10 @@ mod printed {
             Of::ATTRIBUTES_stop,
             Of::ATTRIBUTES_reset,
             Of::ATTRIBUTES_log_line,
+            Of::ATTRIBUTES_plan,
+            Of::ATTRIBUTES_dock,
+            Of::ATTRIBUTES_undock,
+            Of::ATTRIBUTES_lift,
         ];
         signatures.iter().map(ToString::to_string).zip(attributes).collect()
     }
@@ -47,9 +55,34 @@ fn the_printed_trait_is_the_one_that_was_published() {
         "log/line(line: string[64], a-b: float, a.b: bool, type: int, self: int, _raw: bytes[8], 2nd: int) -> \
          (text: string[9], is-new: bool)"
     );
+    assert_eq!(
+        published[5].signature,
+        "plan(nodes: {id: string[32], at-m: float[2], actions: {kind: string[8], type: int}[..4], note: string[20][..1]}[..50], \
+         start: {x: float}, speed: float[..1]) -> (last: {x: float}[..1], photos: bytes[3][..1])"
+    );
+    assert_eq!(published[6].signature, "dock(call: int) progress (left: float) fails (at: int[2], by: string[8])");
+    assert_eq!(published[8].signature, "lift() fails (at: int[2], by: string[8])");
     assert_eq!(interface("agv-17/17", &published).unwrap(), SOURCE);
     let broken = FunctionInfo { signature: "f(".into(), ..published[0].clone() };
     assert!(interface("agv", &[broken]).unwrap_err().contains("f("));
+}
+
+#[test]
+fn streams_are_printed_as_structs() {
+    let attributes = Attributes { priority: cara_std::Priority::Low, stream: Some(20), ..Attributes::default() };
+    let stream =
+        |name: &str, signature: &str| FunctionInfo { name: name.into(), signature: signature.into(), attributes };
+    let functions = [
+        stream("pose", "pose() -> (position: float[2])"),
+        FunctionInfo { attributes: Attributes::default(), ..stream("stop", "stop()") },
+        stream("at_dock", "at_dock() -> (position: float[2])"),
+    ];
+    let source = interface("agv/17", &functions).unwrap();
+    let structs =
+        "#[derive(Variables, Clone, Debug, PartialEq)]\npub struct Pose {\n    pub position: [f64; 2],\n}\n\n";
+    let streams = "// Values of the stream `pose` are a `Pose`.\n// Values of the stream `at_dock` are a `Pose`.\n";
+    assert!(source.contains(&format!("{structs}{streams}#[interface]")), "{source}");
+    assert_eq!(source.matches("fn ").count(), 1, "{source}");
 }
 
 #[test]

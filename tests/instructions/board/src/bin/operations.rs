@@ -6,7 +6,7 @@
 
 use cara_core::distribution::parameters::Parameters;
 use cara_core::services::session::buffer_bytes;
-use cara_instructions::{Blocks, Discovery, DiscoveryMemory, Meter, Operation, Pair, PairMemory, Sealing};
+use cara_instructions::{Blocks, Discovery, DiscoveryMemory, Meter, Operation, Pair, PairMemory, Programs, Sealing};
 use cara_lm3s6965evb as _;
 use defmt_semihosting as _;
 use embassy_time::Instant;
@@ -73,6 +73,7 @@ fn main() -> ! {
     let mut clock = Clock::new();
     messages(&mut clock);
     requests(&mut clock);
+    count_all(&mut clock, Programs::operations(), &mut Programs::new());
     nodes(&mut clock);
     seals(&mut clock);
     println!("end");

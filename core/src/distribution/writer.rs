@@ -1,0 +1,332 @@
+//! Writing lists and records into a `Parameters`: element by element, behind all that is used there, in the form of a block.
+//! The old value goes when the new one is complete, so that an error leaves it as it was.
+//!
+//! What a list or record is made of stands in the same arena. It is read by its place there, step by step, since a slice of
+//! it would forbid writing.
+
+use super::block::padding_after;
+use super::function::RawSpec;
+use super::nested::{self, LIST_HEAD};
+use super::parameters::{IntoValue, ParametersView, Target};
+use super::value::{Type, saturate};
+use crate::bytes::copy;
+use crate::error::{Error, Limit};
+
+/// Adds elements to a list, of which the oldest comes first.
+///
+/// An element that was refused leaves the list as it was before it.
+pub struct ListWriter<'p> {
+    view: &'p mut ParametersView,
+    index: u8,
+    /// Where the next element goes.
+    at: usize,
+    element: Made,
+    count: u32,
+    most: u32,
+}
+
+/// Sets the fields of a record, each once and in their order.
+pub struct RecordWriter<'p> {
+    view: &'p mut ParametersView,
+    index: u8,
+    /// Where the next field goes.
+    at: usize,
+    /// Where the next field's type stands.
+    field_at: usize,
+    left: u32,
+}
+
+/// Where one value goes: a variable, an element of a list, or a field of a record.
+pub struct Slot<'a>(To<'a>);
+
+enum To<'a> {
+    /// A variable that is no list or record.
+    Variable(Target<'a>),
+    /// The list or record in a place.
+    #[cfg(feature = "nested")]
+    Nested(&'a mut ParametersView, usize),
+    /// What a list or record that is being written has next, and where it ends once it is there.
+    #[cfg(feature = "nested")]
+    Part(&'a mut ParametersView, u8, usize, Made, &'a mut Option<usize>),
+}
+
+/// A type, and where in the arena stands what it is made of.
+#[derive(Clone, Copy)]
+struct Made {
+    kind: Type,
+    size: u32,
+    inner_at: usize,
+}
+
+impl<'a> From<Target<'a>> for Slot<'a> {
+    #[inline]
+    fn from(target: Target<'a>) -> Self {
+        Self(To::Variable(target))
+    }
+}
+
+impl Slot<'_> {
+    /// Sets it to a number, a truth value, an array of them, a `&str` or a `&[u8]`.
+    #[inline]
+    pub fn set(self, value: impl IntoValue) -> Result<(), Error> {
+        match self.0 {
+            To::Variable(target) => value.into_value(target),
+            #[cfg(feature = "nested")]
+            To::Nested(_, place) => Err(Error::WrongType { index: place as u8 }),
+            #[cfg(feature = "nested")]
+            To::Part(view, index, at, made, end) => {
+                *end = Some(leaf(view, index, at, made, value)?);
+                Ok(())
+            }
+        }
+    }
+
+    /// Sets it to a list.
+    #[cfg(feature = "nested")]
+    pub fn list(self, write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
+        match self.0 {
+            To::Variable(target) => Err(Error::WrongType { index: target.index }),
+            To::Nested(view, place) => view.write_list(place, write),
+            To::Part(view, index, at, made, end) => {
+                *end = Some(list(view, index, at, made, write)?);
+                Ok(())
+            }
+        }
+    }
+
+    /// Sets it to a record.
+    #[cfg(feature = "nested")]
+    pub fn record(self, write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
+        match self.0 {
+            To::Variable(target) => Err(Error::WrongType { index: target.index }),
+            To::Nested(view, place) => view.write_record(place, write),
+            To::Part(view, index, at, made, end) => {
+                *end = Some(record(view, index, at, made, write)?);
+                Ok(())
+            }
+        }
+    }
+}
+
+/// Lets `write` set a part, and returns where it ends.
+#[cfg(feature = "nested")]
+fn part(
+    view: &mut ParametersView,
+    index: u8,
+    at: usize,
+    made: Made,
+    write: impl FnOnce(Slot<'_>) -> Result<(), Error>,
+) -> Result<usize, Error> {
+    let mut end = None;
+    write(Slot(To::Part(view, index, at, made, &mut end)))?;
+    end.ok_or(Error::MissingArgument { index })
+}
+
+impl ListWriter<'_> {
+    /// Adds a number, a truth value, an array of them, a `&str` or a `&[u8]`.
+    ///
+    /// [`Error::WrongType`], [`Error::WrongSize`], also for one element too many, [`Error::OutOfRange`] and [`Error::Full`].
+    pub fn push(&mut self, value: impl IntoValue) -> Result<(), Error> {
+        self.add(|view, index, at, element| leaf(view, index, at, element, value))
+    }
+
+    /// Adds a list; the errors of [`push`](Self::push), and those of `write`.
+    pub fn push_list(&mut self, write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
+        self.add(|view, index, at, element| list(view, index, at, element, write))
+    }
+
+    /// Adds a record; the errors of [`push`](Self::push), and those of `write`.
+    pub fn push_record(&mut self, write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
+        self.add(|view, index, at, element| record(view, index, at, element, write))
+    }
+
+    /// Adds an element that `write` sets.
+    #[cfg(feature = "nested")]
+    pub fn push_with(&mut self, write: impl FnOnce(Slot<'_>) -> Result<(), Error>) -> Result<(), Error> {
+        self.add(|view, index, at, element| part(view, index, at, element, write))
+    }
+
+    fn add(
+        &mut self,
+        write: impl FnOnce(&mut ParametersView, u8, usize, Made) -> Result<usize, Error>,
+    ) -> Result<(), Error> {
+        let count = self.count.saturating_add(1);
+        if count > self.most {
+            return Err(Error::WrongSize { index: self.index, expected: self.most, found: count });
+        }
+        self.at = write(self.view, self.index, self.at, self.element)?;
+        self.count = count;
+        Ok(())
+    }
+}
+
+impl RecordWriter<'_> {
+    /// Sets the next field to a number, a truth value, an array of them, a `&str` or a `&[u8]`.
+    ///
+    /// [`Error::UnknownVariable`] if the next field has another name, [`Error::WrongType`], [`Error::WrongSize`],
+    /// [`Error::OutOfRange`] and [`Error::Full`].
+    pub fn set(&mut self, name: &str, value: impl IntoValue) -> Result<(), Error> {
+        self.field(name, |view, index, at, field| leaf(view, index, at, field, value))
+    }
+
+    /// Sets the next field, which is a list; the errors of [`set`](Self::set), and those of `write`.
+    pub fn set_list(
+        &mut self,
+        name: &str,
+        write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        self.field(name, |view, index, at, field| list(view, index, at, field, write))
+    }
+
+    /// Sets the next field, which is a record; the errors of [`set`](Self::set), and those of `write`.
+    pub fn set_record(
+        &mut self,
+        name: &str,
+        write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        self.field(name, |view, index, at, field| record(view, index, at, field, write))
+    }
+
+    /// Has `write` set the next field.
+    #[cfg(feature = "nested")]
+    pub fn set_with(&mut self, name: &str, write: impl FnOnce(Slot<'_>) -> Result<(), Error>) -> Result<(), Error> {
+        self.field(name, |view, index, at, field| part(view, index, at, field, write))
+    }
+
+    fn field(
+        &mut self,
+        name: &str,
+        write: impl FnOnce(&mut ParametersView, u8, usize, Made) -> Result<usize, Error>,
+    ) -> Result<(), Error> {
+        let left = self.left.checked_sub(1).ok_or(Error::UnknownVariable)?;
+        let made = self.view.arena().get(self.field_at..).unwrap_or_default();
+        let (field, behind) =
+            RawSpec::split(made).filter(|(field, _)| field.name == name.as_bytes()).ok_or(Error::UnknownVariable)?;
+        let next = self.field_at.saturating_add(made.len().saturating_sub(behind.len()));
+        let inner_at = next.saturating_sub(field.inner.len());
+        let made = Made { kind: field.kind, size: field.size, inner_at };
+        self.at = write(self.view, self.index, self.at, made)?;
+        (self.field_at, self.left) = (next, left);
+        Ok(())
+    }
+}
+
+impl ParametersView {
+    /// The variable in a place, to be set whatever its type is.
+    #[doc(hidden)]
+    #[inline]
+    pub fn slot_of(&mut self, place: usize) -> Result<Slot<'_>, Error> {
+        #[cfg(feature = "nested")]
+        if self.value_of(place)?.kind().is_nested() {
+            return Ok(Slot(To::Nested(self, place)));
+        }
+        self.target_of(place).map(Slot::from)
+    }
+
+    pub(super) fn write_list(
+        &mut self,
+        place: usize,
+        write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        self.write_nested(place, |view, index, at, made| list(view, index, at, made, write))
+    }
+
+    pub(super) fn write_record(
+        &mut self,
+        place: usize,
+        write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        self.write_nested(place, |view, index, at, made| record(view, index, at, made, write))
+    }
+
+    fn write_nested(
+        &mut self,
+        place: usize,
+        write: impl FnOnce(&mut Self, u8, usize, Made) -> Result<usize, Error>,
+    ) -> Result<(), Error> {
+        let value = self.value_at(place).ok_or(Error::UnknownVariable)?;
+        let (kind, size) = (value.kind(), value.size());
+        let inner_at = self.inner_at(place).ok_or(Error::UnknownVariable)?;
+        let start = self.used();
+        let end = write(self, place as u8, start, Made { kind, size, inner_at })?;
+        self.replace_nested(place, end.saturating_sub(start));
+        Ok(())
+    }
+}
+
+/// Writes a value that is no list or record, and returns where it ends.
+fn leaf(view: &mut ParametersView, index: u8, at: usize, made: Made, value: impl IntoValue) -> Result<usize, Error> {
+    let Made { kind, size, .. } = made;
+    if kind.is_nested() {
+        return Err(Error::WrongType { index });
+    }
+    let full = Error::Full(Limit::ParametersBytes);
+    let declared = kind.bytes_of(size).ok_or(full)?;
+    let head = if kind.is_fixed() { 0 } else { LIST_HEAD };
+    let start = at.saturating_add(head);
+    let most = declared.checked_next_multiple_of(8).ok_or(full)?;
+    // A text may take less than is declared, and so fit where that would not.
+    let free = view.room_at(start, most).ok_or(full)?;
+    let is_short = free.len() < declared;
+    if is_short && kind.is_fixed() {
+        return Err(full);
+    }
+    let place = if is_short { free } else { free.get_mut(..declared).ok_or(full)? };
+    let mut length = saturate(if kind.is_fixed() { declared } else { 0 });
+    let set = value.into_value(Target { index, kind, size, length: &mut length, bytes: place });
+    set.map_err(|error| if is_short && matches!(error, Error::WrongSize { .. }) { full } else { error })?;
+    let padding = padding_after(length as usize);
+    let end = start.saturating_add(length as usize).saturating_add(padding);
+    view.room_at(end.saturating_sub(padding), padding).and_then(|free| free.get_mut(..padding)).ok_or(full)?.fill(0);
+    if head > 0 {
+        put(view, at, &u64::from(length).to_le_bytes())?;
+    }
+    Ok(end)
+}
+
+/// Writes a list, and returns where it ends.
+fn list(
+    view: &mut ParametersView,
+    index: u8,
+    at: usize,
+    made: Made,
+    write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>,
+) -> Result<usize, Error> {
+    if made.kind != Type::List {
+        return Err(Error::WrongType { index });
+    }
+    put(view, at, &[0; LIST_HEAD])?;
+    let start = at.saturating_add(LIST_HEAD);
+    let element = view.arena().get(made.inner_at..).and_then(nested::split_element);
+    let (kind, size, behind) = element.ok_or(Error::Malformed)?;
+    let inner_at = view.arena().len().saturating_sub(behind.len());
+    let element = Made { kind, size, inner_at };
+    let mut writer = ListWriter { view, index, at: start, element, count: 0, most: made.size };
+    write(&mut writer)?;
+    let ListWriter { view, count, at: end, .. } = writer;
+    put(view, at, &nested::list_head(count, end.saturating_sub(start)))?;
+    Ok(end)
+}
+
+/// Writes a record, and returns where it ends.
+fn record(
+    view: &mut ParametersView,
+    index: u8,
+    at: usize,
+    made: Made,
+    write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>,
+) -> Result<usize, Error> {
+    if made.kind != Type::Record {
+        return Err(Error::WrongType { index });
+    }
+    let mut writer = RecordWriter { view, index, at, field_at: made.inner_at, left: made.size };
+    write(&mut writer)?;
+    if writer.left > 0 { Err(Error::MissingArgument { index }) } else { Ok(writer.at) }
+}
+
+fn put(view: &mut ParametersView, at: usize, bytes: &[u8]) -> Result<(), Error> {
+    let full = Error::Full(Limit::ParametersBytes);
+    let place = view.room_at(at, bytes.len()).and_then(|free| free.get_mut(..bytes.len())).ok_or(full)?;
+    copy(bytes, place);
+    Ok(())
+}

@@ -1,0 +1,81 @@
+//! What is broken in a run, and when: the same for a seed. Which vehicle it meets is drawn when it happens, from those that move.
+
+use std::time::Duration;
+
+/// A fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// One vehicle is stopped, and goes on a while later.
+    Stop,
+    /// All are.
+    StopAll,
+    /// A vehicle is switched off, and on a while later.
+    Off,
+    /// A vehicle has a fault, for which the mechanic comes.
+    Fail,
+    /// The manager hangs for a while: its connections stay open.
+    FreezeManager,
+    /// The manager is killed, and started a while later.
+    KillManager,
+    /// Another manager takes over.
+    TakeOver,
+}
+
+/// Each kind with the least number of them in a run, and the seconds between two in a long one.
+const KINDS: [(Fault, u32, f64); 7] = [
+    (Fault::Stop, 24, 3.0),
+    (Fault::StopAll, 1, 120.0),
+    (Fault::Off, 7, 15.0),
+    (Fault::Fail, 2, 30.0),
+    (Fault::FreezeManager, 1, 180.0),
+    (Fault::KillManager, 1, 150.0),
+    (Fault::TakeOver, 1, 210.0),
+];
+/// The part of a run in which things are broken; the rest is left to finish.
+const PART: std::ops::Range<f64> = 0.06..0.86;
+
+/// The faults of a run that takes so long, in the order of their times.
+pub fn schedule(seed: u64, span: Duration) -> Vec<(Duration, Fault)> {
+    let mut rng = fastrand::Rng::with_seed(seed);
+    let mut faults = Vec::new();
+    for (index, (fault, least, every)) in KINDS.into_iter().enumerate() {
+        let count = least.max((span.as_secs_f64() / every) as u32);
+        let width = (PART.end - PART.start) / f64::from(count);
+        // Those that happen once are kept apart: each has its own place in the run.
+        let place = (index as f64 + 0.5) / KINDS.len() as f64;
+        for number in 0..count {
+            let within = if count == 1 { place } else { rng.f64() };
+            let part = PART.start + width * (f64::from(number) + within);
+            faults.push((span.mul_f64(part), fault));
+        }
+    }
+    faults.sort_by_key(|(at, _)| *at);
+    faults
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Fault, KINDS, schedule};
+    use std::time::Duration;
+
+    #[test]
+    fn a_short_run_has_each_often_enough() {
+        let span = Duration::from_secs(45);
+        let faults = schedule(1, span);
+        assert_eq!(faults, schedule(1, span));
+        for (fault, least, _) in KINDS {
+            let count = faults.iter().filter(|(_, other)| *other == fault).count();
+            assert_eq!(count, least as usize, "{fault:?}");
+        }
+        assert!(faults.is_sorted_by_key(|(at, _)| *at) && faults.iter().all(|(at, _)| *at < span.mul_f64(0.87)));
+        let at = |wanted| faults.iter().find(|(_, fault)| *fault == wanted).map(|(at, _)| *at).unwrap();
+        assert!(at(Fault::TakeOver) - at(Fault::KillManager) > Duration::from_secs(5));
+    }
+
+    #[test]
+    fn a_long_run_has_more() {
+        let faults = schedule(1, Duration::from_secs(600));
+        assert_eq!(faults.iter().filter(|(_, fault)| *fault == Fault::Stop).count(), 200);
+        assert_eq!(faults.iter().filter(|(_, fault)| *fault == Fault::KillManager).count(), 4);
+    }
+}

@@ -1,0 +1,74 @@
+//! `cara web`: the page of the crate `cara-web`, with the m_unit that the options choose.
+
+use std::ops::ControlFlow;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use cara_std::control::protocol::{Answer, Question};
+use cara_web::{Arguments, Cancel, Connection, Unit};
+use serde_json::Value;
+
+use crate::operator::{Need, Operator};
+use cara_tools::exit::Ended;
+use cara_tools::global::Global;
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    // A manager that is not there now may come, and the page says that it is absent. What is ambiguous is told now.
+    let own = match &global.act_as {
+        Some(_) => Some(Operator::open(global, &Need::Nothing)?),
+        None => {
+            Operator::open_if_any(global, &Need::Nothing)?;
+            None
+        }
+    };
+    cara_web::run(arguments, Arc::new(Chosen { global: global.clone(), own }), global)
+}
+
+/// The unit that the options choose.
+struct Chosen {
+    global: Global,
+    /// That of this process.
+    own: Option<Operator>,
+}
+
+impl Unit for Chosen {
+    fn connect(&self, for_a_stop: bool) -> anyhow::Result<Box<dyn Connection>> {
+        let operator = match &self.own {
+            Some(own) => own.another()?,
+            None if for_a_stop => Operator::open_to_stop(&self.global, &Need::Nothing)?,
+            None => Operator::open(&self.global, &Need::Nothing)?,
+        };
+        Ok(Box::new(Way { operator, wanted: Arc::new(AtomicBool::new(true)) }))
+    }
+
+    fn findings(&self, listen: Duration) -> anyhow::Result<Value> {
+        if self.own.is_some() {
+            return Err(Ended::usage(
+                "the doctor asks units that run, and this one is of `cara web --as`: start `cara doctor`",
+            ));
+        }
+        cara_doctor::examine(listen, &self.global)
+    }
+}
+
+struct Way {
+    operator: Operator,
+    wanted: Arc<AtomicBool>,
+}
+
+impl Connection for Way {
+    fn ask(&mut self, question: &Question, each: &mut dyn FnMut(Answer) -> ControlFlow<()>) -> anyhow::Result<()> {
+        let wanted = self.wanted.clone();
+        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire))
+    }
+
+    fn cancel(&self) -> anyhow::Result<Cancel> {
+        let (wanted, closer) = (self.wanted.clone(), self.operator.closer()?);
+        Ok(Box::new(move || {
+            wanted.store(false, Ordering::Release);
+            closer.iter().for_each(cara_std::control::Closer::close);
+        }))
+    }
+}

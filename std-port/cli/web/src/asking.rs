@@ -1,0 +1,285 @@
+//! What pages ask for: functions, calls, holds, stops, resets, the doctor. Answers go to the page as they come, a line of JSON
+//! each, of which the last one is `done` or `failed`.
+
+use std::collections::HashMap;
+use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use axum::body::{Body, Bytes, to_bytes};
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use cara_std::control::protocol::{Answer, CallQuestion, Failure, Question};
+use cara_tools::exit::Ended;
+use serde_json::{Value, json};
+use tokio::sync::mpsc;
+use tokio::task::spawn_blocking;
+use tokio::time::sleep;
+
+use crate::form;
+use crate::limits::{BODY, CALLS, Place, STOPS};
+use crate::picture::Section;
+use crate::push::Pieces;
+use crate::server::Shared;
+
+/// A hold ends when its page has not said for so long that it is there.
+pub(crate) const ATTENDED: Duration = Duration::from_millis(1500);
+/// How often is looked whether it has.
+const LOOK: Duration = Duration::from_millis(100);
+/// Answers that wait for a page that reads slowly; then the manager waits.
+const ANSWERS: usize = 64;
+/// Likewise of a stop, which waits for no page: all nodes that a unit may have, and the end.
+const STOP_ANSWERS: usize = 2048;
+/// How long the doctor listens.
+const LISTEN: Duration = Duration::from_secs(6);
+
+type Asked = State<Arc<Shared>>;
+
+/// The functions of a node: `{"node": …}`.
+pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
+    let node = match read(&shared, body).await {
+        Ok(asked) => asked["node"].as_str().unwrap_or_default().to_owned(),
+        Err(refusal) => return refusal,
+    };
+    // The semaphore is never closed. Pages wait for each other.
+    let _turn = shared.functions.acquire().await;
+    let own = shared.clone();
+    let asked = spawn_blocking(move || {
+        let mut lines = Vec::new();
+        ask(&own, false, &Question::Functions { node }, |line| {
+            lines.push(line);
+            true
+        });
+        lines
+    });
+    lines(&asked.await.unwrap_or_default())
+}
+
+/// A call, or with `"hold": true` one that is kept: until its end, or until the page is gone or says nothing more.
+pub(crate) async fn call(State(shared): Asked, body: Body) -> Response {
+    let mut asked = match read(&shared, body).await {
+        Ok(asked) => asked,
+        Err(refusal) => return refusal,
+    };
+    let is_held = asked.as_object_mut().and_then(|asked| asked.remove("hold")) == Some(Value::Bool(true));
+    let question = match form::call(asked) {
+        Ok(question) => question,
+        Err(text) => return lines(&[failed(&Failure::configuration("BadCall", text))]),
+    };
+    let Some(place) = Place::take(&shared.limits, |limits| &limits.calls) else { return busy("calls", CALLS) };
+    let (to, answers) = mpsc::channel(ANSWERS);
+    let hold = is_held.then(|| shared.begin_hold());
+    spawn_blocking(move || {
+        let _place = place;
+        kept(&shared, question, hold, &to);
+        if let Some(hold) = hold {
+            shared.holds().remove(&hold);
+        }
+    });
+    streamed(answers)
+}
+
+/// Asks, and gives up when the page is gone.
+fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mpsc::Sender<Bytes>) {
+    let told = |line: &Value| to.blocking_send(piece(line)).is_ok();
+    if !hold.is_none_or(|hold| told(&json!({ "answer": "held", "hold": hold }))) {
+        return;
+    }
+    let opened = shared.unit.connect(false).and_then(|way| Ok((way.cancel()?, way)));
+    let (cancel, mut way) = match opened {
+        Ok(opened) => opened,
+        Err(error) => {
+            told(&failed(&failure(&error)));
+            return;
+        }
+    };
+    let unattended = Arc::new(AtomicBool::new(false));
+    let watch =
+        tokio::runtime::Handle::current().spawn(attend(shared.clone(), hold, to.clone(), cancel, unattended.clone()));
+    let question = if hold.is_some() { Question::Hold(question) } else { Question::Call(question) };
+    let mut has_ended = false;
+    let outcome = way.ask(&question, &mut |answer| {
+        has_ended |= matches!(answer, Answer::Done | Answer::Failed(_));
+        if told(&shown(&answer)) { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    });
+    watch.abort();
+    if unattended.load(Ordering::Acquire) {
+        let text = "the page said nothing any more, as one that is hidden or asleep: what it held was released";
+        told(&failed(&Failure::configuration("Unattended", text)));
+    } else if let Err(error) = outcome {
+        told(&failed(&failure(&error)));
+    } else if !has_ended {
+        told(&json!({ "answer": "done" }));
+    }
+}
+
+/// Ends what is asked when its page is gone, or does not attend what it holds.
+async fn attend(
+    shared: Arc<Shared>,
+    hold: Option<u64>,
+    to: mpsc::Sender<Bytes>,
+    cancel: crate::Cancel,
+    unattended: Arc<AtomicBool>,
+) {
+    loop {
+        let is_gone = tokio::select! {
+            () = to.closed() => true,
+            () = sleep(LOOK) => false,
+        };
+        let last = hold.and_then(|hold| shared.holds().get(&hold).copied());
+        let is_left = last.is_some_and(|last| last.elapsed() >= ATTENDED);
+        if is_gone || is_left {
+            unattended.store(is_left, Ordering::Release);
+            return cancel();
+        }
+    }
+}
+
+/// `{"hold": …}`: its page is there.
+pub(crate) async fn beat(State(shared): Asked, body: Body) -> Response {
+    let asked = match read(&shared, body).await {
+        Ok(asked) => asked,
+        Err(refusal) => return refusal,
+    };
+    let mut holds = shared.holds();
+    match asked["hold"].as_u64().and_then(|hold| holds.get_mut(&hold)) {
+        Some(last) => {
+            *last = Instant::now();
+            StatusCode::NO_CONTENT.into_response()
+        }
+        None => StatusCode::GONE.into_response(),
+    }
+}
+
+/// `{"node": …}`, or null for all. It is carried out to its end, also where the page is gone.
+pub(crate) async fn stop(State(shared): Asked, body: Body) -> Response {
+    emergency(shared, body, |node| Question::Stop { node }).await
+}
+
+/// Likewise.
+pub(crate) async fn reset(State(shared): Asked, body: Body) -> Response {
+    emergency(shared, body, |node| Question::Reset { node }).await
+}
+
+async fn emergency(shared: Arc<Shared>, body: Body, question: fn(Option<String>) -> Question) -> Response {
+    let node = match read(&shared, body).await {
+        Ok(Value::Object(asked)) if asked.get("node").is_some_and(|node| node.is_null() || node.is_string()) => {
+            asked["node"].as_str().map(str::to_owned)
+        }
+        Ok(_) => {
+            let text = "that names no node, and null for all neither";
+            return lines(&[failed(&Failure::configuration("BadQuestion", text))]);
+        }
+        Err(refusal) => return refusal,
+    };
+    let Some(place) = Place::take(&shared.limits, |limits| &limits.stops) else { return busy("stops", STOPS) };
+    let (to, answers) = mpsc::channel(STOP_ANSWERS);
+    spawn_blocking(move || {
+        let _place = place;
+        ask(&shared, true, &question(node), |line| {
+            // The page may be gone, or read nothing: what it asked for goes on.
+            let _ = to.try_send(piece(&line));
+            true
+        });
+    });
+    streamed(answers)
+}
+
+/// Has the doctor look, and tells all pages what it found.
+pub(crate) async fn doctor(State(shared): Asked, body: Body) -> Response {
+    if let Err(refusal) = read(&shared, body).await {
+        return refusal;
+    }
+    let Ok(_turn) = shared.doctor.try_acquire() else { return busy("doctors", 1) };
+    let own = shared.clone();
+    let found = spawn_blocking(move || own.unit.findings(LISTEN)).await;
+    let line = match found {
+        Ok(Ok(found)) => {
+            let mut picture = shared.picture();
+            let told =
+                json!({ "at": picture.now(), "findings": found["findings"], "listened_ms": found["listened_ms"] });
+            picture.put(Section::Doctor, "", &told);
+            json!({ "answer": "done" })
+        }
+        Ok(Err(error)) => failed(&failure(&error)),
+        Err(_) => failed(&Failure::configuration("Failed", "the doctor failed")),
+    };
+    lines(&[line])
+}
+
+/// Asks, and passes on each answer as a line until that says `false`. The last one is the end.
+fn ask(shared: &Shared, for_a_stop: bool, question: &Question, mut each: impl FnMut(Value) -> bool) {
+    let outcome = shared.unit.connect(for_a_stop).and_then(|mut way| {
+        way.ask(question, &mut |answer| match each(shown(&answer)) {
+            true => ControlFlow::Continue(()),
+            false => ControlFlow::Break(()),
+        })
+    });
+    if let Err(error) = outcome {
+        each(failed(&failure(&error)));
+    }
+}
+
+/// An answer in the form of the page.
+fn shown(answer: &Answer) -> Value {
+    let mut told = json!(answer);
+    match answer {
+        Answer::Called { results, .. } => told["results"] = results.iter().map(form::shown).collect(),
+        Answer::Function(info) => told["function"] = form::function(info),
+        _ => {}
+    }
+    told
+}
+
+fn failed(failure: &Failure) -> Value {
+    json!(Answer::Failed(failure.clone()))
+}
+
+/// An error on the way to the manager.
+fn failure(error: &anyhow::Error) -> Failure {
+    let name = error.downcast_ref::<Ended>().map_or("Failed", |ended| ended.name.as_str());
+    let (cause, error, text) = ("transport".to_owned(), name.to_owned(), format!("{error:#}"));
+    Failure { cause, error, kind: None, code: None, said: None, text }
+}
+
+/// The JSON of a request.
+async fn read(shared: &Shared, body: Body) -> Result<Value, Response> {
+    let Ok(bytes) = to_bytes(body, BODY).await else {
+        shared.limits.bodies.refuse();
+        return Err((StatusCode::PAYLOAD_TOO_LARGE, format!("a request has at most {BODY} bytes")).into_response());
+    };
+    serde_json::from_slice(&bytes)
+        .map_err(|error| (StatusCode::BAD_REQUEST, format!("that is no JSON: {error}")).into_response())
+}
+
+fn busy(what: &str, most: usize) -> Response {
+    let text = format!("{most} {what} run already, which is the most at a time: wait until one has ended");
+    lines(&[failed(&Failure::configuration("Busy", text))])
+}
+
+fn piece(line: &Value) -> Bytes {
+    format!("{line}\n").into()
+}
+
+fn lines(lines: &[Value]) -> Response {
+    let text: String = lines.iter().map(|line| format!("{line}\n")).collect();
+    ([(header::CONTENT_TYPE, "application/x-ndjson")], text).into_response()
+}
+
+fn streamed(answers: mpsc::Receiver<Bytes>) -> Response {
+    ([(header::CONTENT_TYPE, "application/x-ndjson")], Body::from_stream(Pieces(answers))).into_response()
+}
+
+impl Shared {
+    fn begin_hold(&self) -> u64 {
+        let hold = self.next_hold.fetch_add(1, Ordering::Relaxed);
+        self.holds().insert(hold, Instant::now());
+        hold
+    }
+
+    fn holds(&self) -> MutexGuard<'_, HashMap<u64, Instant>> {
+        self.holds.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

@@ -1,0 +1,165 @@
+// Joins the parts: messages of the server, the theme, the keyboard, and the banner that says when nothing is new.
+
+import { $, flag, forgetColours, span, text } from "./dom.js";
+import * as api from "./api.js";
+import * as charts from "./charts.js";
+import * as map from "./map.js";
+import * as nodes from "./nodes.js";
+import * as stop from "./stop.js";
+import { state, take, trouble } from "./state.js";
+
+// Between two attempts to reach the server again.
+const RETRY = 1000;
+// The tables are drawn so often, and the map with each message.
+const DRAW = 250;
+
+// A connection on which nothing came for so long is given up.
+const SILENT = 5000;
+
+let connection = new AbortController();
+async function listen() {
+  for (;;) {
+    connection = new AbortController();
+    try {
+      await api.follow(heard, opened, connection.signal);
+    } catch (error) {
+      if (error.status === 401) {
+        await login();
+        continue;
+      }
+      state.broken = error.message;
+      if (state.heard === null) shout("No connection to cara web.", error.message);
+    }
+    await new Promise((go) => setTimeout(go, RETRY));
+  }
+}
+
+function opened() {
+  $("login").close();
+  api.map().then((background) => background && map.lay(background)).catch(() => {});
+}
+
+function heard(message) {
+  take(message);
+  state.broken = null;
+  map.redraw();
+}
+
+// Until a token was given.
+function login() {
+  if (api.token()) text($("login-error"), "This token is not the right one.");
+  if (!$("login").open) $("login").showModal();
+  return new Promise((go) => {
+    $("login-form").onsubmit = (event) => {
+      event.preventDefault();
+      api.keepToken($("token").value);
+      $("token").value = "";
+      go();
+    };
+  });
+}
+
+function shout(what, why) {
+  const banner = $("banner");
+  banner.hidden = false;
+  if (banner.firstChild?.textContent !== what || banner.lastChild?.textContent !== why) {
+    banner.replaceChildren(what, Object.assign(document.createElement("small"), { textContent: why }));
+  }
+}
+
+function drawLink() {
+  const wrong = trouble();
+  const banner = $("banner");
+  flag(document.body, "stale", wrong);
+  if (wrong) {
+    // Only what is new is read aloud: the age counts on the map and in the pill.
+    shout(`${wrong.what}. What is shown is old.`, wrong.why);
+    text($("link"), `old: ${span(wrong.age)} ago`);
+  } else if (state.heard !== null) {
+    banner.hidden = true;
+    text($("link"), "live");
+  }
+  flag($("link"), "bad", wrong);
+  flag($("link"), "good", !wrong && state.heard !== null);
+  const unit = state.unit[""];
+  if (unit) {
+    text($("unit"), `${unit.name}/${unit.id}`);
+    text($("unit-more"), `fleet ${unit.fleet}, ${unit.mode ?? ""}`);
+    document.title = `${wrong ? "OLD – " : ""}${unit.name} – CARA`;
+  }
+  if (wrong) map.redraw();
+  if (performance.now() - (state.heard ?? performance.now()) > SILENT) connection.abort(new Error("the server says nothing any more"));
+}
+
+const THEMES = ["system", "light", "dark"];
+function theme(next) {
+  const chosen = next ?? localStorage.getItem("cara-theme") ?? "system";
+  localStorage.setItem("cara-theme", chosen);
+  if (chosen === "system") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = chosen;
+  text($("theme"), `Theme: ${chosen}`);
+  recolour();
+}
+function recolour() {
+  forgetColours();
+  map.redraw(true);
+  charts.draw();
+}
+const nextTheme = () => theme(THEMES[(THEMES.indexOf(localStorage.getItem("cara-theme") ?? "system") + 1) % THEMES.length]);
+
+const KEYS = {
+  "/": () => $("filter").focus(), "?": () => $("help").showModal(), t: nextTheme, j: () => nodes.step(1), k: () => nodes.step(-1),
+  f: () => document.querySelector("#functions summary")?.focus(),
+};
+
+function keyboard(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.isComposing) return;
+  if (event.target.closest("input, textarea, select")) {
+    if (event.key === "Escape") event.target.blur();
+    return;
+  }
+  if (event.shiftKey && event.key === "S" && !event.repeat) return void stop.all("stop");
+  if (KEYS[event.key] && !document.querySelector("dialog[open]")) {
+    event.preventDefault();
+    KEYS[event.key]();
+  }
+}
+
+async function doctor() {
+  const button = $("doctor");
+  button.disabled = true;
+  text($("doctor-about"), "listens for 6 s …");
+  try {
+    for await (const line of api.ask("/api/doctor", {})) {
+      if (line.answer === "failed") text($("doctor-about"), line.text);
+    }
+  } catch (error) {
+    text($("doctor-about"), `not reached: ${error.message}`);
+  }
+  button.disabled = false;
+}
+
+api.token();
+theme();
+map.start(nodes.choose);
+$("theme").onclick = nextTheme;
+$("stop-all").onclick = () => stop.all("stop");
+$("stop-close").onclick = () => { $("stop-panel").hidden = true; };
+$("node-stop").onclick = () => stop.one("stop");
+$("node-reset").onclick = () => stop.one("reset");
+$("reset-all").onclick = () => $("confirm").showModal();
+$("confirm-no").onclick = () => $("confirm").close();
+$("confirm-yes").onclick = () => { $("confirm").close(); stop.all("reset"); };
+$("help-open").onclick = () => $("help").showModal();
+$("help-close").onclick = () => $("help").close();
+$("doctor").onclick = doctor;
+$("filter").oninput = () => nodes.draw();
+// A token is not to be passed by: without it nothing is shown.
+$("login").addEventListener("cancel", (event) => event.preventDefault());
+document.addEventListener("keydown", keyboard);
+// An address with a key, opened where the page is already.
+addEventListener("hashchange", () => location.reload());
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
+setInterval(() => { drawLink(); if (state.heard !== null) nodes.draw(); }, DRAW);
+setInterval(charts.sample, 1000);
+listen();

@@ -1,0 +1,141 @@
+//! What the command line asks for, checked before anything listens: an address beyond this host is served with a token and TLS
+//! or not at all.
+
+use std::net::{SocketAddr, TcpListener};
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::sync::Arc;
+
+use cara_tools::exit::Ended;
+use cara_tools::files;
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::ServerConfig;
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+
+use crate::Arguments;
+use crate::guard::Guard;
+use crate::map::{self, Map};
+
+/// Fewest characters of a token: fewer could be found by trying.
+const TOKEN_LEAST: usize = 16;
+/// Bytes of a key that is drawn.
+const DRAWN: usize = 16;
+/// Longest token, certificate and key, in bytes.
+const FILE_MOST: u64 = 64 * 1024;
+
+/// A server that is ready to serve.
+pub(crate) struct Prepared {
+    pub(crate) listener: TcpListener,
+    pub(crate) tls: Option<TlsAcceptor>,
+    pub(crate) guard: Guard,
+    pub(crate) map: Option<Map>,
+    address: SocketAddr,
+    drawn: Option<String>,
+}
+
+impl Prepared {
+    /// Where the page is. A key that was drawn stands behind `#`, which browsers keep to themselves.
+    pub(crate) fn url(&self) -> String {
+        let scheme = if self.tls.is_some() { "https" } else { "http" };
+        let key = self.drawn.as_ref().map(|key| format!("#{key}")).unwrap_or_default();
+        format!("{scheme}://{}/{key}", self.address)
+    }
+}
+
+/// Reads the files, checks what belongs together, and opens the port.
+pub(crate) fn prepare(arguments: Arguments) -> anyhow::Result<Prepared> {
+    let Arguments { listen, token_file, cert, key, host_name, background } = arguments;
+    if !listen.ip().is_loopback() && (token_file.is_none() || cert.is_none()) {
+        return Err(Ended::usage(format!(
+            "{listen} can be reached from other hosts, and who reaches it commands the fleet: give it a token and TLS. Write a \
+             token into a file (`(umask 077; openssl rand -hex 32 > token)`), get a certificate for this host's name \
+             (for a trial: `openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 30 -subj /CN=NAME \
+             -addext subjectAltName=DNS:NAME -keyout key.pem -out cert.pem`), and add --token-file token --cert cert.pem --key \
+             key.pem --host-name NAME; or listen on 127.0.0.1, and reach it with `ssh -L`"
+        )));
+    }
+    let tls = match (&cert, &key) {
+        (Some(cert), Some(key)) => Some(tls(cert, key)?),
+        _ => None,
+    };
+    let (token, drawn) = match token_file {
+        Some(file) => (token(&file)?, None),
+        None => {
+            let mut bytes = [0; DRAWN];
+            getrandom::fill(&mut bytes)
+                .map_err(|error| anyhow::anyhow!("the system has no random numbers: {error}"))?;
+            let key = hex::encode(bytes);
+            (key.clone(), Some(key))
+        }
+    };
+    let map = background.map(|file| background_of(&file)).transpose()?;
+    let listener = TcpListener::bind(listen).map_err(|error| {
+        Ended::failed("NotListening", format!("cannot listen on {listen}: {error}; choose another port with --listen"))
+    })?;
+    listener.set_nonblocking(true)?;
+    let address = listener.local_addr()?;
+    let guard = Guard::new(token, tls.is_some(), host_name);
+    Ok(Prepared { listener, tls, guard, map, address, drawn })
+}
+
+/// A file that nobody but its owner may read.
+fn secret(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let shown = path.display();
+    let unreadable = |error| Ended::usage(format!("cannot read {shown}: {error}"));
+    let mode = path.metadata().map_err(unreadable)?.mode();
+    if mode & 0o077 != 0 {
+        return Err(Ended::usage(format!("others than its owner may read {shown}: `chmod 600 {shown}`")));
+    }
+    bytes(path)
+}
+
+fn bytes(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let shown = path.display();
+    let (bytes, is_longer) =
+        files::read(path, FILE_MOST).map_err(|error| Ended::usage(format!("cannot read {shown}: {error}")))?;
+    if is_longer {
+        return Err(Ended::usage(format!("{shown} is longer than {FILE_MOST} bytes: it is no such file")));
+    }
+    Ok(bytes.to_vec())
+}
+
+fn token(path: &Path) -> anyhow::Result<String> {
+    let text = String::from_utf8(secret(path)?).unwrap_or_default();
+    let token = text.trim();
+    let is_plain = token.bytes().all(|byte| byte.is_ascii_graphic());
+    if token.len() < TOKEN_LEAST || !is_plain {
+        return Err(Ended::usage(format!(
+            "{} has no token: one line of at least {TOKEN_LEAST} letters and digits, as of `openssl rand -hex 32`",
+            path.display()
+        )));
+    }
+    Ok(token.to_owned())
+}
+
+fn tls(cert: &Path, key: &Path) -> anyhow::Result<TlsAcceptor> {
+    let chain: Vec<CertificateDer<'static>> =
+        CertificateDer::pem_slice_iter(&bytes(cert)?)
+            .collect::<Result<_, _>>()
+            .map_err(|error| Ended::usage(format!("{} has no certificate as PEM: {error}", cert.display())))?;
+    let private = PrivateKeyDer::from_pem_slice(&secret(key)?)
+        .map_err(|error| Ended::usage(format!("{} has no private key as PEM: {error}", key.display())))?;
+    let config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()?
+        .with_no_client_auth()
+        .with_single_cert(chain, private)
+        .map_err(|error| Ended::usage(format!("{} and {} cannot be used: {error}", cert.display(), key.display())))?;
+    Ok(TlsAcceptor::from(Arc::new(config)))
+}
+
+fn background_of(path: &Path) -> anyhow::Result<Map> {
+    let shown = path.display();
+    let (bytes, is_longer) =
+        files::read(path, map::LONGEST).map_err(|error| Ended::usage(format!("cannot read {shown}: {error}")))?;
+    if is_longer {
+        return Err(Ended::usage(format!("{shown} is longer than {} bytes: cut the map", map::LONGEST)));
+    }
+    let text = String::from_utf8_lossy(&bytes);
+    Map::parse(&text).map_err(|mistake| Ended::usage(format!("{shown}: {mistake}")))
+}

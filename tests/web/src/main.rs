@@ -1,0 +1,293 @@
+//! Clicks through `cara web` in a browser, as an operator would: vehicles that move, a form filled wrongly and rightly, a stop of
+//! all, a vehicle that dies, a manager that hangs and dies, a server that dies; then the warehouse at work. Any other outcome ends
+//! it with an error.
+
+mod browser;
+mod stage;
+mod warehouse;
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, ensure};
+use clap::Parser;
+use serde_json::Value;
+
+use browser::{Browser, DESKTOP, TABLET};
+use stage::{AGVS, Stage};
+
+/// Clicks through `cara web` in a headless Chromium.
+#[derive(Parser)]
+struct Options {
+    /// Where the programs `cara`, `agv` and `warehouse` are; where this one is unless told.
+    #[arg(long, value_name = "FOLDER")]
+    programs: Option<PathBuf>,
+    /// Write screenshots into this folder.
+    #[arg(long, value_name = "FOLDER")]
+    write: Option<PathBuf>,
+    /// Instead of all that, keep the page open for so many minutes while a warehouse works in which everything fails, and print
+    /// what it takes.
+    #[arg(long)]
+    minutes: Option<u32>,
+    /// With so many vehicles.
+    #[arg(long, default_value_t = 200, requires = "minutes")]
+    vehicles: u32,
+}
+
+fn main() -> Result<()> {
+    let options = Options::parse();
+    let own = std::env::current_exe()?.parent().context("a program is in a folder")?.to_owned();
+    let programs = options.programs.unwrap_or(own);
+    tokio::runtime::Builder::new_current_thread().enable_all().build()?.block_on(async {
+        if let Some(minutes) = options.minutes {
+            let browser = Browser::start(None).await?;
+            warehouse::watch(&browser, &programs, options.vehicles, minutes).await?;
+            return browser.close().await;
+        }
+        let mut stage = Stage::start(&programs)?;
+        let url = stage.start_web()?;
+        let browser = Browser::start(options.write.as_deref()).await?;
+        look(&browser, &mut stage, &url).await?;
+        command(&browser).await?;
+        pictures(&browser).await?;
+        tablet(&browser).await?;
+        stop(&browser).await?;
+        lose(&browser, &mut stage).await?;
+        browser.check_faults().await?;
+        drop(stage);
+        warehouse::look(&browser, &programs).await?;
+        browser.close().await
+    })
+}
+
+/// The place of a vehicle in the table of nodes.
+fn place(agv: &str) -> String {
+    let row = format!("[...document.querySelectorAll('#nodes tr')].find((row) => row.innerText.startsWith('{agv}/'))");
+    format!("{row}?.children[3].textContent")
+}
+
+/// What is seen without a click.
+async fn look(browser: &Browser, stage: &mut Stage, url: &str) -> Result<()> {
+    let (page, key) = url.split_once('#').context("the address has a key")?;
+    browser.open(page).await?;
+    browser.says("#login", "Token").await?;
+    browser.fill("#token", "0000").await?;
+    browser.click("#login button").await?;
+    browser.says("#login-error", "not the right one").await?;
+    browser.fill("#token", key).await?;
+    browser.click("#login button").await?;
+    browser.wait("the key opens the page", "!document.querySelector('#login').open").await?;
+    browser.open("about:blank").await?;
+    browser.open(url).await?;
+    let count = AGVS.len();
+    browser.says("#count", &format!("{count} of {count} connected")).await?;
+    ensure!(
+        !browser.run("return location.href").await?.as_str().unwrap_or("#").contains('#'),
+        "the key stays in the address"
+    );
+    browser.says("#link", "live").await?;
+    browser.says("#unit", "depot/1").await?;
+    measure(browser).await?;
+    stage.drive()?;
+    for agv in ["agv-2", "agv-3"] {
+        browser
+            .wait(
+                &format!("{agv} is on its way"),
+                &format!("({}) && !{}.startsWith('0.00, 0.00')", place(agv), place(agv)),
+            )
+            .await?;
+    }
+    browser.run(&format!("window.before = {}", place("agv-2"))).await?;
+    browser.wait("agv-2 moves", &format!("{} !== before", place("agv-2"))).await?;
+    browser.says("#orders tr", "runs").await?;
+    browser.says("#map-about", "25 × 14 cells").await?;
+    browser
+        .wait("round trips are measured", "/[µm]s/.test(document.querySelector('#nodes td.number').textContent)")
+        .await?;
+    accessible(browser).await
+}
+
+/// How much came over the wire, and when something was to be seen first.
+pub(crate) async fn measure(browser: &Browser) -> Result<()> {
+    let script =
+        "const all = [...performance.getEntriesByType('navigation'), ...performance.getEntriesByType('resource')]
+        .filter((entry) => !entry.name.includes('/api/'));
+        return [all.reduce((sum, entry) => sum + entry.transferSize, 0), all.length,
+            performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? null]";
+    let found = browser.run(script).await?;
+    println!(
+        "first load: {} bytes in {} files, first contentful paint after {:.0} ms",
+        found[0],
+        found[1],
+        found[2].as_f64().unwrap_or(f64::NAN)
+    );
+    let bytes = found[0].as_u64().context("the browser counts bytes")?;
+    ensure!((1..100_000).contains(&bytes), "the first load takes {bytes} bytes");
+    Ok(())
+}
+
+/// Everything that can be used has a name, and the page has its landmarks.
+async fn accessible(browser: &Browser) -> Result<()> {
+    let script = "const name = (element) => (element.getAttribute('aria-label') || element.innerText || element.title
+            || element.labels?.[0]?.innerText || element.getAttribute('aria-labelledby') || '').trim();
+        return [...document.querySelectorAll('button, input, select, textarea, canvas, section, dialog')]
+            .filter((element) => !name(element)).map((element) => element.outerHTML.slice(0, 100))";
+    let nameless = browser.run(script).await?;
+    ensure!(nameless == Value::Array(Vec::new()), "without a name: {nameless}");
+    let landmarks = "return ['header', 'main', 'h1', '#banner[role=alert]', '[role=log]', 'html[lang]']
+        .every((selector) => document.querySelectorAll(selector).length === 1)";
+    ensure!(browser.run(landmarks).await? == true, "a landmark is missing or there twice");
+    Ok(())
+}
+
+/// A filter, a form filled wrongly and rightly, a hold.
+async fn command(browser: &Browser) -> Result<()> {
+    browser.press('/').await?;
+    browser.run("window.filter = document.activeElement.id").await?;
+    browser.wait("the slash goes to the filter", "filter === 'filter'").await?;
+    browser.fill("#filter", "agv-3").await?;
+    browser.wait("one node is left", "document.querySelectorAll('#nodes tr').length === 1").await?;
+    browser.says("#nodes-about", "1 of 5").await?;
+    browser.run("document.querySelector('#filter').value = ''; document.querySelector('#filter').oninput()").await?;
+    browser.wait("all are back", "document.querySelectorAll('#nodes tr').length === 5").await?;
+    browser.click("#nodes tr:first-child button").await?;
+    browser.says("#node-title", "agv-1/11").await?;
+    browser.says("#functions summary", "pos_info").await?;
+    let form = open(browser, "go_to").await?;
+    let [x, y] = [1, 2].map(|nth| format!("{form} .inputs input:nth-child({nth})"));
+    browser.fill(&x, "1.5").await?;
+    browser.says(&format!("{form} .field .error"), "element 2 is missing").await?;
+    // So far that it is released before.
+    browser.fill(&y, "900").await?;
+    browser.says(&format!("{form} .field .error"), "“1.5” is no whole number").await?;
+    browser.click(&format!("{form} button.primary")).await?;
+    let asked = browser.run(&format!("return !document.querySelector('{form} .outcome').hidden")).await?;
+    ensure!(asked == false, "a form with a mistake was sent");
+    browser.fill(&x, "6").await?;
+    browser.wait("the mistake is gone", &format!("document.querySelector('{form} .error').textContent === ''")).await?;
+    browser.click(&format!("{form} details summary")).await?;
+    browser.click(&format!("{form} .options label:nth-child(3) input")).await?;
+    browser.click(&format!("{form} button.primary")).await?;
+    browser.says(&format!("{form} .outcome"), "held, as long as this page is shown").await?;
+    browser.wait("agv-1 moves", &format!("{} && !{}.startsWith('0.00, 0.00')", place("agv-1"), place("agv-1"))).await?;
+    let form = open(browser, "pos_info").await?;
+    for nth in [1, 2] {
+        browser.fill(&format!("{form} .inputs input:nth-child({nth})"), "0").await?;
+    }
+    browser.click(&format!("{form} button.primary")).await?;
+    browser.says(&format!("{form} .outcome"), "position = [").await?;
+    let form = open(browser, "go_to").await?;
+    browser.click(&format!("{form} button.primary")).await?;
+    browser.says(&format!("{form} .outcome"), "released").await?;
+    // The node refuses what the form cannot know.
+    browser.fill(&x, "99999999").await?;
+    browser.click(&format!("{form} button.primary")).await?;
+    browser.says(&format!("{form} .outcome.bad"), "Service (Failed, code 1)").await
+}
+
+/// Opens the form of a function of the chosen node. How it is found from then on.
+async fn open(browser: &Browser, function: &str) -> Result<String> {
+    let script = format!(
+        "const found = [...document.querySelectorAll('details.function')].find((one) => one.querySelector('summary').firstChild.textContent === '{function}');
+        found.id = 'form-{function}';
+        if (!found.open) found.querySelector('summary').click();
+        found.scrollIntoView({{ block: 'center' }});"
+    );
+    browser.run(&script).await?;
+    Ok(format!("#form-{function}"))
+}
+
+/// Light and dark, with vehicles in the aisles.
+async fn pictures(browser: &Browser) -> Result<()> {
+    let form = open(browser, "go_to").await?;
+    browser.fill(&format!("{form} .inputs input:nth-child(1)"), "6").await?;
+    browser.click(&format!("{form} button.primary")).await?;
+    let y_of = |agv: &str| format!("Number({}.split(',')[1])", place(agv));
+    browser.wait("agv-1 is in its aisle", &format!("{} > 3", y_of("agv-1"))).await?;
+    let script = "document.querySelectorAll('details.function').forEach((one) => { one.open = one.id === 'form-go_to'; one.querySelector('details').open = false; });
+        document.activeElement.blur(); scrollTo(0, 0)";
+    browser.run(script).await?;
+    for theme in ["light", "dark"] {
+        browser.theme(theme).await?;
+        // The tables are drawn four times a second.
+        tokio::time::sleep(std::time::Duration::from_millis(600)).await;
+        browser.shoot(theme).await?;
+    }
+    browser.click(&format!("{form} button.primary")).await?;
+    browser.says(&format!("{form} .outcome"), "released").await
+}
+
+async fn tablet(browser: &Browser) -> Result<()> {
+    browser.press('t').await?;
+    browser.resize(TABLET).await?;
+    browser.wait("nothing is wider than a tablet", "document.documentElement.scrollWidth <= innerWidth").await?;
+    let in_view = "const box = document.querySelector('#stop-all').getBoundingClientRect(); scrollTo(0, 1e6);
+        const then = document.querySelector('#stop-all').getBoundingClientRect();
+        return [box, then].every(({ top, bottom, left, right }) => top >= 0 && left >= 0 && bottom <= innerHeight && right <= innerWidth)";
+    ensure!(browser.run(in_view).await? == true, "stop-all is not in view on a tablet");
+    browser.run("scrollTo(0, 0)").await?;
+    browser.shoot("tablet").await?;
+    browser.resize(DESKTOP).await
+}
+
+/// A stop of all by a click, a reset, and a stop by the keyboard.
+async fn stop(browser: &Browser) -> Result<()> {
+    let count = AGVS.len();
+    let all = format!("{count} of {count} acknowledged");
+    browser.click("#stop-all").await?;
+    browser.says("#stop-summary", &all).await?;
+    browser
+        .wait(
+            "each acknowledgement is shown",
+            &format!("document.querySelectorAll('#stop-list li.good').length === {count}"),
+        )
+        .await?;
+    browser.wait("all are shown as stopped", &format!("[...document.querySelectorAll('#nodes tr')].filter((row) => row.innerText.includes('stopped')).length === {count}")).await?;
+    browser.shoot("stop").await?;
+    browser.click("#reset-all").await?;
+    browser.says("#confirm", "may move again").await?;
+    browser.click("#confirm-yes").await?;
+    browser.says("#stop-title", "Reset of all").await?;
+    browser.says("#stop-summary", &all).await?;
+    browser.press('S').await?;
+    browser.says("#stop-title", "Stop of all").await?;
+    browser.says("#stop-summary", &all).await?;
+    browser.run("document.querySelector('#doctor').scrollIntoView()").await?;
+    browser.click("#doctor").await?;
+    browser.says("#doctor-about", "looked").await?;
+    browser.wait("the doctor's findings are shown", "document.querySelector('#findings li')").await
+}
+
+/// A vehicle that dies, a manager that hangs, dies and comes back, a server that dies.
+async fn lose(browser: &Browser, stage: &mut Stage) -> Result<()> {
+    browser.run("scrollTo(0, 0)").await?;
+    stage.kill_a_vehicle()?;
+    browser.says("#nodes tr.lost .state", "LOST").await?;
+    browser.says("#count.bad", "4 of 5 connected").await?;
+    browser.click("#stop-all").await?;
+    browser.says("#stop-summary.bad", "4 of 5 acknowledged").await?;
+    browser.says("#stop-list li.bad", "NOT REACHED").await?;
+    stage.freeze_manager()?;
+    browser.says("#banner", "The manager does not answer. What is shown is old.").await?;
+    stage.thaw_manager()?;
+    browser.wait("a manager that goes on is live", "document.querySelector('#banner').hidden").await?;
+    stage.kill_manager()?;
+    browser.says("#banner", "The manager is lost. What is shown is old.").await?;
+    browser.wait("old data is grey and has its age", "document.body.classList.contains('stale') && document.querySelector('#map-stale').innerText.startsWith('as it was')").await?;
+    browser.says("#nodes .state", "was connected").await?;
+    browser.click("#stop-all").await?;
+    browser.says("#stop-summary.bad", "THE STOP FAILED").await?;
+    browser.says("#stop-summary", "Use the vehicles’ own emergency stop.").await?;
+    browser.shoot("lost").await?;
+    stage.start_manager()?;
+    browser
+        .wait(
+            "a new manager is found",
+            "document.querySelector('#banner').hidden && !document.body.classList.contains('stale')",
+        )
+        .await?;
+    browser.says("#count", "4 of").await?;
+    stage.kill_web()?;
+    browser.says("#banner", "No connection to cara web. What is shown is old.").await?;
+    browser.click("#stop-all").await?;
+    browser.says("#stop-summary.bad", "THE STOP FAILED: the server of this page was not reached").await
+}

@@ -1,0 +1,126 @@
+//! A manager, vehicles and `cara web`, each a process, and a browser that looks.
+
+use std::collections::hash_map::RandomState;
+use std::hash::{BuildHasher, Hasher};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, Result, anyhow};
+use cara_processes::Process;
+use cara_test_keys::KeyFolder;
+use tempfile::TempDir;
+
+/// Longest wait for anything that is to happen.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(40);
+/// Vehicles, of which the last one is killed.
+pub(crate) const AGVS: [&str; 5] = ["agv-1", "agv-2", "agv-3", "agv-4", "agv-5"];
+/// Where those drive that do not wait for the page: along x first, then along y, through the aisles of the [map].
+/// Each command has one of the few connections to the manager.
+const TARGETS: [(&str, [u32; 2]); 2] = [("agv-2", [24, 13]), ("agv-3", [12, 13])];
+
+/// All processes but the browser.
+pub(crate) struct Stage {
+    programs: PathBuf,
+    fleet: u32,
+    folder: TempDir,
+    keys: KeyFolder,
+    manager: Option<Process>,
+    agvs: Vec<Process>,
+    web: Option<Process>,
+    /// Calls that are held from outside of the page.
+    held: Vec<Process>,
+}
+
+impl Stage {
+    /// The manager and its vehicles, all joined, the latter at their start.
+    pub(crate) fn start(programs: &Path) -> Result<Self> {
+        let fleet = RandomState::new().build_hasher().finish() as u32;
+        let folder = tempfile::tempdir()?;
+        std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o700))?;
+        std::fs::write(folder.path().join("hall.map"), map())?;
+        let nodes: Vec<String> = AGVS.iter().zip(11..).map(|(name, id)| format!("{name}/{id}")).collect();
+        let mut all = vec!["depot/1@m_unit"];
+        all.extend(nodes.iter().map(String::as_str));
+        let keys = KeyFolder::draw(fleet, &all)?;
+        let programs = programs.to_owned();
+        let mut stage =
+            Self { programs, fleet, folder, keys, manager: None, agvs: Vec::new(), web: None, held: Vec::new() };
+        stage.start_manager()?;
+        for (name, id) in AGVS.iter().zip(11..) {
+            let id = id.to_string();
+            let arguments = ["--name", name, "--id", &id, "--manager", "depot/1", "--loopback"];
+            let agv = stage.process(name, "agv", &arguments)?;
+            stage.agvs.push(agv);
+        }
+        stage.agvs.iter().try_for_each(|agv| agv.seen("joined depot", PATIENCE).map(drop))?;
+        Ok(stage)
+    }
+
+    /// A program with the keys, the fleet and the control sockets of this test.
+    fn process(&self, name: &str, program: &str, arguments: &[&str]) -> Result<Process> {
+        let keys = format!("CARA_KEYS={}", self.keys.path().display());
+        let control = format!("CARA_CONTROL_DIR={}", self.folder.path().display());
+        let (program, fleet) = (self.programs.join(program).display().to_string(), self.fleet.to_string());
+        let (before, behind) = ([&*keys, &*control, &*program], ["--fleet", &*fleet]);
+        let all = before.iter().chain(arguments).chain(&behind).copied();
+        Process::start(name, Path::new("env"), all)
+    }
+
+    pub(crate) fn start_manager(&mut self) -> Result<()> {
+        self.manager = Some(self.process("depot", "cara", &["node", "--name", "depot", "--id", "1", "--loopback"])?);
+        Ok(())
+    }
+
+    /// Has some vehicles drive, kept by commands until they have arrived.
+    pub(crate) fn drive(&mut self) -> Result<()> {
+        for (name, [x, y]) in TARGETS {
+            let call = format!("go_to(position: [{x}, {y}])");
+            let held = self.process(name, "cara", &["call", "--hold", "--timeout", "30s", name, &call])?;
+            self.held.push(held);
+        }
+        Ok(())
+    }
+
+    /// The page's server; its address with the key.
+    pub(crate) fn start_web(&mut self) -> Result<String> {
+        let map = self.folder.path().join("hall.map").display().to_string();
+        let mut web = self.process("web", "cara", &["web", "--listen", "127.0.0.1:0", "--background", &map])?;
+        let line = web.expect("the page is at ", PATIENCE)?.text;
+        self.web = Some(web);
+        Ok(line.rsplit(' ').next().context("it names an address")?.to_owned())
+    }
+
+    pub(crate) fn kill_manager(&mut self) -> Result<()> {
+        kill(&mut self.manager)
+    }
+
+    pub(crate) fn freeze_manager(&mut self) -> Result<()> {
+        self.manager.as_mut().context("it runs")?.freeze().map(drop)
+    }
+
+    pub(crate) fn thaw_manager(&mut self) -> Result<()> {
+        self.manager.as_mut().context("it runs")?.thaw()
+    }
+
+    pub(crate) fn kill_web(&mut self) -> Result<()> {
+        kill(&mut self.web)
+    }
+
+    /// Kills the last vehicle.
+    pub(crate) fn kill_a_vehicle(&mut self) -> Result<()> {
+        self.agvs.last_mut().context("there is one")?.kill().map(drop)
+    }
+}
+
+fn kill(process: &mut Option<Process>) -> Result<()> {
+    process.take().ok_or_else(|| anyhow!("it runs"))?.kill().map(drop)
+}
+
+/// Racks with aisles between them.
+fn map() -> String {
+    let (width, height) = (25, 14);
+    let is_rack = |x: usize, y: usize| ((2..=5).contains(&y) || (9..=11).contains(&y)) && !x.is_multiple_of(6);
+    let row = |y: usize| (0..width).map(|x| if is_rack(x, y) { 'T' } else { '.' }).collect::<String>() + "\n";
+    format!("type octile\nheight {height}\nwidth {width}\nmap\n") + &(0..height).map(row).collect::<String>()
+}
