@@ -34,6 +34,10 @@ pub const PROGRESS_INTERVAL: Duration = Duration::from_millis(10);
 /// Longest encoded signature (name, arguments and results of one function), in bytes: 384, or 1,024 for units that have
 /// lists and records. Stored as long as it is.
 pub const SIGNATURE_BYTES: usize = if cfg!(feature = "nested") { 1024 } else { 384 };
+/// Longest line of help on a function, in bytes; a longer one is cut. Stored as long as it is, with the signature.
+pub const HELP_BYTES: usize = 160;
+/// Longest unit of a variable, in bytes; a longer one is cut. Stored as long as it is, with the signature.
+pub const UNIT_BYTES: usize = 16;
 /// Most lists and records inside each other, the outermost included. Costs 32 bytes of stack each while a block is checked.
 pub const DEPTH: usize = 4;
 /// Bytes of the values and names in a `Parameters` whose size is not given.

@@ -31,7 +31,7 @@ impl Default for Capacities {
             signature_bytes: 8 * 1024,
             published_to_one: 1024,
             their_functions: 48,
-            their_signature_bytes: 2 * 1024,
+            their_signature_bytes: 4 * 1024,
             calls_in_flight: 64,
             calls_running: 16,
             pending_links: 64,

@@ -78,8 +78,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     ///
     ///     #[actuator(motor)]
     ///     #[lease(ms = 400)]
-    ///     #[unit(height = "m")]
-    ///     fn lift_to(&mut self, height: f64) -> Result<(), ServiceError>;
+    ///     fn lift_to(&mut self, #[unit = "m"] height: f64) -> Result<(), ServiceError>;
     /// }
     ///
     /// struct Fork { height: f64, target: f64 }

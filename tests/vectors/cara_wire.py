@@ -538,29 +538,39 @@ def write_control(name, value):
 
 # Behind the results: the name of each, and the word in the text form.
 SECTIONS = {1: ("progress", "progress"), 2: ("failure", "fails")}
+# Lines for people: number 0 is what the function does, 1 the name of a variable, a blank and its unit.
+HELP = 3
 
 
 def decode_signature(data):
-    require(len(data) <= 1024)
     reader = Reader(data)
     name = read_name(reader, reader.u8())
     arguments = read_variables(reader)
     results = read_variables(reader)
-    sections, last = {}, 0
+    sections, people, last, end = {}, [], 0, len(data)
     while reader.at < len(data):
         section = reader.u8()
         require(section > last)
+        if section >= HELP > last:
+            end = reader.at - 1
         last = section
         if section in SECTIONS:
             sections[SECTIONS[section][0]] = read_variables(reader)
             require(sections[SECTIONS[section][0]])
         else:
-            skip_variables(reader)
+            lines = skip_variables(reader)
+            people = lines if section == HELP else people
     known = {variable["name"]: variable for variable in arguments}
     require(all(known.get(variable["name"], variable) == variable for variable in results))
     require(len(known.keys() | {variable["name"] for variable in results}) <= 16)
     text = text_form(name, arguments, results, sections)
-    return {"name": name, "arguments": arguments, "results": results, **sections, "text": text}
+    require(end <= 1024)
+    # Too long with its help, it is kept without.
+    people = people if len(data) <= 1024 else []
+    said = {"help": next((text for number, text in people if number == 0), "")}
+    said["units"] = [text.split(" ", 1) for number, text in people if number == 1 and " " in text]
+    said = {key: value for key, value in said.items() if value}
+    return {"name": name, "arguments": arguments, "results": results, **sections, **said, "text": text}
 
 
 def encode_signature(signature):
@@ -572,6 +582,13 @@ def encode_signature(signature):
         out += before + bytes([len(variables)])
         for variable in variables:
             out += write_variable(variable)
+    lines = [(0, signature["help"])] if "help" in signature else []
+    lines += [(1, " ".join(unit)) for unit in signature.get("units", [])]
+    if lines:
+        out += bytes([HELP, len(lines)])
+    for number, text in lines:
+        text = text.encode()
+        out += struct.pack("<BBI", TYPES.index("string"), len(text), number) + text
     return out
 
 
@@ -611,13 +628,14 @@ def read_some_variables(reader, count, depth):
 
 
 def skip_variables(reader):
-    """Those of a section that is not known: no more of them is looked at than how long they are."""
-    count = reader.u8()
+    """The sizes and names of those of a section, of which no more is looked at than how long they are."""
+    count, lines = reader.u8(), []
     require(count > 0)
     for _ in range(count):
         kind, length, size = reader.fixed("BBI")
-        text_of(reader.take(length))
+        lines.append((size, text_of(reader.take(length))))
         skip_type(reader, kind, size)
+    return lines
 
 
 def skip_type(reader, kind, size):

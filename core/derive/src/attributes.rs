@@ -6,13 +6,16 @@ use syn::{Attribute, Error, Expr, ExprLit, Ident, Lit, LitInt, LitStr, Meta, Res
 
 /// Most bytes of text or bytes, or elements of a list, that can be declared.
 const LARGEST: u64 = u32::MAX as u64;
+/// As the core has it, which looks at what is written here.
+const HELP_BYTES: usize = 160;
 
-/// `#[size(200)]` and `#[name = "…"]` of a variable.
+/// `#[size(200)]`, `#[name = "…"]` and `#[unit = "m"]` of a variable.
 #[derive(Default)]
 pub(crate) struct OfVariable {
     /// As `#[size(50, 32)]` has them: of a list, then of its elements.
     pub(crate) size: Vec<LitInt>,
     pub(crate) name: Option<String>,
+    pub(crate) unit: Option<LitStr>,
 }
 
 impl OfVariable {
@@ -20,11 +23,13 @@ impl OfVariable {
     pub(crate) fn take(attributes: &mut Vec<Attribute>) -> Result<Self> {
         let mut found = Self::default();
         let mut size = None;
-        for attribute in extract(attributes, &["size", "name"]) {
+        for attribute in extract(attributes, &["size", "name", "unit"]) {
             if attribute.path().is_ident("size") {
                 set(&mut size, sizes(&attribute)?, &attribute)?;
-            } else {
+            } else if attribute.path().is_ident("name") {
                 set(&mut found.name, text(&attribute)?.value(), &attribute)?;
+            } else {
+                set(&mut found.unit, text(&attribute)?, &attribute)?;
             }
         }
         found.size = size.unwrap_or_default();
@@ -69,6 +74,25 @@ pub(crate) fn text(attribute: &Attribute) -> Result<LitStr> {
     }
     let name = attribute.path().get_ident().map(ToString::to_string).unwrap_or_default();
     Err(Error::new(attribute.span(), format!("write #[{name} = \"…\"]")))
+}
+
+/// The documentation's first paragraph as one line, with as much of it as a line of help may have.
+pub(crate) fn first_line(attributes: &[Attribute]) -> String {
+    let line = |attribute: &Attribute| match &attribute.meta {
+        Meta::NameValue(pair) if attribute.path().is_ident("doc") => match &pair.value {
+            Expr::Lit(ExprLit { lit: Lit::Str(text), .. }) => Some(text.value().trim().to_owned()),
+            _ => None,
+        },
+        _ => None,
+    };
+    let paragraph =
+        attributes.iter().filter_map(line).take_while(|line| !line.is_empty()).collect::<Vec<_>>().join(" ");
+    if paragraph.len() <= HELP_BYTES {
+        return paragraph;
+    }
+    let whole = paragraph.floor_char_boundary(HELP_BYTES - '…'.len_utf8());
+    let kept = paragraph[..whole].rsplit_once(' ').map_or(&paragraph[..whole], |(words, _)| words);
+    format!("{kept}…")
 }
 
 /// `#[flag]`.

@@ -3,11 +3,10 @@
 use proc_macro2::TokenStream;
 use quote::{format_ident, quote};
 use syn::parse::{Parse, ParseStream};
-use syn::punctuated::Punctuated;
 use syn::spanned::Spanned;
-use syn::{Attribute, Error, Ident, Lit, LitInt, LitStr, Result, Token};
+use syn::{Attribute, Error, Ident, Lit, LitInt, Result, Token};
 
-use crate::attributes::{extract, flag, plain, set};
+use crate::attributes::{extract, flag, set};
 
 /// How a function wants to be called.
 #[derive(Default)]
@@ -88,16 +87,6 @@ fn read_lease(attribute: &Attribute) -> Result<LitInt> {
         }
         _ => Ok(ms),
     }
-}
-
-pub(crate) fn read_units(attribute: &Attribute) -> Result<Vec<(String, LitStr)>> {
-    let wrong = || Error::new(attribute.span(), "write #[unit(position = \"m\")]");
-    let pairs = attribute.parse_args_with(Punctuated::<Pair, Token![,]>::parse_terminated).map_err(|_| wrong())?;
-    let unit = |pair: Pair| match pair.value {
-        Lit::Str(unit) => Ok((plain(&pair.name), unit)),
-        _ => Err(wrong()),
-    };
-    pairs.into_iter().map(unit).collect()
 }
 
 /// `name = literal`.

@@ -167,10 +167,7 @@ fn prepared(interface: &Interface, function: &Function, root: &TokenStream) -> T
 
 /// The documentation of a call.
 fn help(function: &Function) -> String {
-    let units =
-        function.units.iter().map(|(name, unit)| format!(" `{name}` is in {}.", unit.value())).collect::<String>();
-    let help = if function.help.is_empty() { format!("Calls `{}`.", function.name) } else { function.help.clone() };
-    format!("{help}{units}")
+    if function.help.is_empty() { format!("Calls `{}`.", function.name) } else { function.help.clone() }
 }
 
 fn blocking(interface: &Interface, function: &Function, root: &TokenStream) -> TokenStream {

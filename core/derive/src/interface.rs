@@ -6,12 +6,12 @@ use syn::parse::{Parse, ParseStream};
 use syn::punctuated::Punctuated;
 use syn::spanned::Spanned;
 use syn::{
-    Attribute, Error, Expr, ExprLit, FnArg, GenericArgument, Ident, ItemTrait, Lit, LitInt, LitStr, Meta, Pat,
-    PathArguments, Result, ReturnType, Token, TraitItem, TraitItemFn, Type, TypeParamBound,
+    Attribute, Error, FnArg, GenericArgument, Ident, ItemTrait, LitStr, Pat, PathArguments, Result, ReturnType, Token,
+    TraitItem, TraitItemFn, Type, TypeParamBound,
 };
 
-use crate::attributes::{OfVariable, extract, flag, plain, set, text};
-use crate::calling::{Attributes, read_units};
+use crate::attributes::{OfVariable, extract, first_line, flag, plain, set, text};
+use crate::calling::Attributes;
 use crate::kind::Variable;
 use crate::{client, server};
 
@@ -32,8 +32,8 @@ pub(crate) struct Function {
     /// It returns a `Result`.
     pub(crate) can_fail: bool,
     pub(crate) attributes: Attributes,
+    /// A line of it.
     pub(crate) help: String,
-    pub(crate) units: Vec<(String, LitStr)>,
 }
 
 /// What a function is called with.
@@ -126,9 +126,9 @@ impl Function {
         }
         let ident = signature.ident.clone();
         let mut returns = None;
-        let (mut name, mut help, mut units) = (None, None, Vec::new());
+        let (mut name, mut help) = (None, None);
         let attributes = Attributes::take(&mut item.attrs)?;
-        for attribute in extract(&mut item.attrs, &["returns", "name", "help", "unit"]) {
+        for attribute in extract(&mut item.attrs, &["returns", "name", "help"]) {
             match attribute.path().get_ident().map(ToString::to_string).unwrap_or_default().as_str() {
                 "returns" => set(
                     &mut returns,
@@ -136,8 +136,7 @@ impl Function {
                     &attribute,
                 )?,
                 "name" => set(&mut name, text(&attribute)?.value(), &attribute)?,
-                "help" => set(&mut help, text(&attribute)?.value(), &attribute)?,
-                _ => units.extend(read_units(&attribute)?),
+                _ => set(&mut help, text(&attribute)?.value(), &attribute)?,
             }
         }
         let mut takes_state = false;
@@ -160,9 +159,9 @@ impl Function {
             return Err(Error::new(span, "an argument with #[variables] is the only one"));
         }
         let (results, can_fail) = read_results(&signature.output, returns)?;
-        let help = help.unwrap_or_else(|| documentation(&item.attrs));
+        let help = help.unwrap_or_else(|| first_line(&item.attrs));
         let name = name.unwrap_or_else(|| plain(&ident));
-        let function = Self { ident, name, takes_state, inputs, results, can_fail, attributes, help, units };
+        let function = Self { ident, name, takes_state, inputs, results, can_fail, attributes, help };
         function.check(span)?;
         Ok(function)
     }
@@ -186,15 +185,7 @@ impl Function {
         if *stop && *reset {
             return Err(Error::new(span, "a function stops or resets, not both"));
         }
-        let known: Vec<&str> = self.variables().map(|variable| variable.name.as_str()).collect();
-        let has_struct = self.inputs.iter().any(|input| matches!(input, Input::Struct(..)))
-            || matches!(&self.results, Results::Struct(rust) if !is_unit(rust));
-        match self.units.iter().find(|(name, _)| !has_struct && !known.contains(&name.as_str())) {
-            Some((name, unit)) => {
-                Err(Error::new(unit.span(), format!("the function has no argument and no result `{name}`")))
-            }
-            None => Ok(()),
-        }
+        Ok(())
     }
 
     /// Arguments and results that are told one by one.
@@ -208,6 +199,20 @@ impl Function {
             Input::Call(_) | Input::Struct(..) => None,
         });
         arguments.chain(results)
+    }
+
+    /// The structs whose fields are variables of it.
+    fn structs(&self) -> Vec<Type> {
+        let arguments = self.inputs.iter().filter_map(|input| match input {
+            Input::Struct(_, rust) => Some(rust.clone()),
+            Input::Call(_) | Input::Variable(..) => None,
+        });
+        let results = match &self.results {
+            Results::Struct(rust) => Some(rust.clone()),
+            Results::Named(_) => None,
+        };
+        let told = self.told().map(|(progress, fails)| [progress, fails]);
+        arguments.chain(results).chain(told.into_iter().flatten()).collect()
     }
 
     /// What the argument says that tells about the call.
@@ -264,7 +269,7 @@ impl Input {
             return Ok(Self::Struct(pattern.ident.clone(), rust.clone()));
         }
         let name = said.name_or(&pattern.ident);
-        Ok(Self::Variable(pattern.ident.clone(), Variable::new(name, rust.clone(), said.size)?))
+        Ok(Self::Variable(pattern.ident.clone(), Variable::new(name, rust.clone(), said)?))
     }
 }
 
@@ -296,16 +301,16 @@ fn types_of(bound: &TypeParamBound) -> Vec<Type> {
 struct Named {
     name: String,
     span: Span,
-    size: Vec<LitInt>,
+    said: OfVariable,
 }
 
 impl Parse for Named {
     fn parse(input: ParseStream<'_>) -> Result<Self> {
         let mut attributes = input.call(Attribute::parse_outer)?;
-        let size = OfVariable::take(&mut attributes)?.size;
+        let said = OfVariable::take(&mut attributes)?;
         let span = input.span();
         let name = if input.peek(LitStr) { input.parse::<LitStr>()?.value() } else { plain(&input.parse()?) };
-        Ok(Self { name, span, size })
+        Ok(Self { name, span, said })
     }
 }
 
@@ -339,11 +344,11 @@ fn read_results(output: &ReturnType, returns: Option<Punctuated<Named, Token![,]
         return Err(Error::new_spanned(rust, wrong));
     }
     let mut results = Vec::new();
-    for (Named { name, span, size }, rust) in names.into_iter().zip(types) {
+    for (Named { name, span, said }, rust) in names.into_iter().zip(types) {
         if let Type::Reference(reference) = &rust {
             return Err(Error::new_spanned(reference, "a result is owned: it outlives the call that made it"));
         }
-        let result = Variable::new(name, rust, size).map_err(|error| {
+        let result = Variable::new(name, rust, said).map_err(|error| {
             let mut error = error;
             error.combine(Error::new(span, "this result"));
             error
@@ -362,22 +367,6 @@ fn of_result(rust: &Type) -> Option<Type> {
         GenericArgument::Type(rust) => Some(rust.clone()),
         _ => None,
     }
-}
-
-fn is_unit(rust: &Type) -> bool {
-    matches!(rust, Type::Tuple(tuple) if tuple.elems.is_empty())
-}
-
-/// The documentation as one text.
-fn documentation(attributes: &[Attribute]) -> String {
-    let line = |attribute: &Attribute| match &attribute.meta {
-        Meta::NameValue(pair) if attribute.path().is_ident("doc") => match &pair.value {
-            Expr::Lit(ExprLit { lit: Lit::Str(text), .. }) => Some(text.value().trim().to_owned()),
-            _ => None,
-        },
-        _ => None,
-    };
-    attributes.iter().filter_map(line).collect::<Vec<_>>().join(" ")
 }
 
 /// Signatures, and the places of results.
@@ -418,6 +407,8 @@ fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
             }
             None => (quote!(&[]), quote!(&[])),
         };
+        let (help, units) = (&function.help, function.variables().filter_map(Variable::unit));
+        let of_structs = function.structs().into_iter().map(|rust| quote!(<#rust as #typed::Variables>::UNITS));
         let values = function.attributes.expression(root);
         let span = function.ident.span();
         let made = quote_spanned! { span =>
@@ -435,6 +426,8 @@ fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
                 results: Self::#results,
                 progress: #progress,
                 fails: #fails,
+                help: #help,
+                units: &[&[#(#units),*], #(#of_structs),*],
             };
             const #encoded: &'static #typed::Encoded<{ Self::#declared.encoded_bytes(#name) }> = &#made;
             const #signature: #parts::Signature<'static> = Self::#encoded.signature();

@@ -2,7 +2,9 @@
 
 use proc_macro2::TokenStream;
 use quote::{ToTokens, quote};
-use syn::{Error, GenericArgument, LitInt, PathArguments, Result, Type};
+use syn::{Error, GenericArgument, LitInt, LitStr, PathArguments, Result, Type};
+
+use crate::attributes::OfVariable;
 
 /// A variable as a field, an argument or a result declares it.
 pub(crate) struct Variable {
@@ -10,6 +12,7 @@ pub(crate) struct Variable {
     pub(crate) name: String,
     pub(crate) rust: Type,
     pub(crate) kind: Kind,
+    unit: Option<LitStr>,
 }
 
 /// How a Rust type is a variable.
@@ -46,11 +49,11 @@ enum Spelling {
 
 impl Variable {
     /// Or what is wrong with its type.
-    pub(crate) fn new(name: String, rust: Type, sizes: Vec<LitInt>) -> Result<Self> {
-        let mut sizes = sizes.into_iter();
+    pub(crate) fn new(name: String, rust: Type, said: OfVariable) -> Result<Self> {
+        let mut sizes = said.size.into_iter();
         let variable = Self::nested(name, rust, &mut sizes)?;
         match sizes.next() {
-            None => Ok(variable),
+            None => Ok(Self { unit: said.unit, ..variable }),
             Some(size) => {
                 let wrong = match variable.kind {
                     Kind::Field => "only `String`, `&str`, `Vec` and `&[u8]` have a #[size]",
@@ -82,7 +85,13 @@ impl Variable {
                 Kind::List(holder, most, Box::new(Self::nested(String::new(), *element, sizes)?))
             }
         };
-        Ok(Self { name, rust, kind })
+        Ok(Self { name, rust, kind, unit: None })
+    }
+
+    /// Its name and its unit, where it has one.
+    pub(crate) fn unit(&self) -> Option<TokenStream> {
+        let (name, unit) = (&self.name, self.unit.as_ref()?);
+        Some(quote!((#name, #unit)))
     }
 
     /// Whether it is borrowed.
@@ -92,7 +101,7 @@ impl Variable {
 
     /// Its `VariableSpec`.
     pub(crate) fn spec(&self, root: &TokenStream) -> TokenStream {
-        let Self { name, rust, kind } = self;
+        let Self { name, rust, kind, .. } = self;
         let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
         match kind {
             Kind::Field => {

@@ -22,19 +22,20 @@ use quote::quote;
 /// |---|---|
 /// | `#[size(200)]` | how many bytes a `String` or `Vec<u8>`, or elements a `Vec<T>`, has at most; `#[size(50, 32)]` for a `Vec<String>` |
 /// | `#[name = "x-1"]` | the variable's name, where it is not the field's |
-#[proc_macro_derive(Variables, attributes(size, name))]
+/// | `#[unit = "m"]` | its unit, for people |
+#[proc_macro_derive(Variables, attributes(size, name, unit))]
 pub fn variables(input: TokenStream) -> TokenStream {
     variables::derive(input.into(), &quote!(::cara_core)).into()
 }
 
 /// The same, as `cara_std::Variables`.
-#[proc_macro_derive(VariablesStd, attributes(size, name))]
+#[proc_macro_derive(VariablesStd, attributes(size, name, unit))]
 pub fn variables_std(input: TokenStream) -> TokenStream {
     variables::derive(input.into(), &quote!(::cara_std)).into()
 }
 
 /// The same, as `cara_embassy::Variables`.
-#[proc_macro_derive(VariablesEmbassy, attributes(size, name))]
+#[proc_macro_derive(VariablesEmbassy, attributes(size, name, unit))]
 pub fn variables_embassy(input: TokenStream) -> TokenStream {
     variables::derive(input.into(), &quote!(::cara_embassy)).into()
 }
@@ -49,10 +50,10 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// | `#[lease(ms = 400)]` | how long it moves it after the caller's last sign that it wants it |
 /// | `#[stop]`, `#[reset]` | it stops, or lets move again, its actuator or, without one, all |
 /// | `#[idempotent]` | running it twice is as good as running it once |
-/// | `#[help = "…"]`, `#[unit(position = "m")]` | what it does, and units of its variables; its documentation is the help otherwise |
+/// | `#[help = "…"]` | what it does, in a line for people; the first paragraph of its documentation otherwise |
 /// | `#[name = "go-to"]` | its name, where it is not the method's |
 ///
-/// Arguments have `#[size(200)]` and `#[name = "…"]` as fields do, and names of results too: `#[returns(#[size(64)] text)]`. One
+/// Arguments have `#[size(200)]`, `#[name = "…"]` and `#[unit = "m"]` as fields do, and names of results too: `#[returns(#[unit = "%"] charge)]`. One
 /// argument alone may be `#[variables] order: Order`, whose fields are the arguments then. An argument `call: &impl AnyCall` tells
 /// about the call; where its bounds need types that differ from port to port, the trait declares them (`type Order;`).
 ///

@@ -47,11 +47,6 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
             )?;
         }
     });
-    let help = functions.iter().map(|function| {
-        let (name, text) = (&function.name, &function.help);
-        let units = function.units.iter().map(|(variable, unit)| quote!((#variable, #unit)));
-        quote!(#typed::Help { function: #name, text: #text, units: &[#(#units),*] })
-    });
     quote! {
         #[doc = #about]
         #declared
@@ -65,9 +60,6 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         #[allow(dead_code)]
         impl #holder {
             #(#serving)*
-
-            /// What the functions do, and the units of their variables.
-            #visibility const HELP: &'static [#typed::Help] = &[#(#help),*];
         }
 
         impl<T, F> #typed::Interface<T, F> for #of_port

@@ -5,7 +5,7 @@ use quote::{format_ident, quote};
 use syn::spanned::Spanned;
 use syn::{Data, DataEnum, DeriveInput, Error, Fields, FieldsNamed, Ident, Result};
 
-use crate::attributes::OfVariable;
+use crate::attributes::{OfVariable, first_line};
 use crate::kind::Variable;
 
 /// The implementation for a struct or an enum, or what is wrong with it.
@@ -19,7 +19,7 @@ fn implement(input: DeriveInput, root: &TokenStream) -> Result<TokenStream> {
     }
     match input.data {
         Data::Struct(data) => match data.fields {
-            Fields::Named(fields) => of_struct(&input.ident, fields, root),
+            Fields::Named(fields) => of_struct(&input.ident, fields, &first_line(&input.attrs), root),
             fields => Err(Error::new(
                 if fields.is_empty() { input.ident.span() } else { fields.span() },
                 "variables have names: make it a struct with named fields",
@@ -32,13 +32,13 @@ fn implement(input: DeriveInput, root: &TokenStream) -> Result<TokenStream> {
     }
 }
 
-fn of_struct(ident: &Ident, fields: FieldsNamed, root: &TokenStream) -> Result<TokenStream> {
+fn of_struct(ident: &Ident, fields: FieldsNamed, help: &str, root: &TokenStream) -> Result<TokenStream> {
     let mut names = Vec::new();
     let mut variables = Vec::new();
     for mut field in fields.named {
         let Some(name) = field.ident.take() else { continue };
         let mut said = OfVariable::take(&mut field.attrs)?;
-        let variable = Variable::new(said.name_or(&name), field.ty, said.size)?;
+        let variable = Variable::new(said.name_or(&name), field.ty, said)?;
         if variable.is_borrowed() {
             let wrong =
                 "a struct of variables owns its data: use `String` or `heapless::String<N>`, or a vector of `u8`";
@@ -57,6 +57,7 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, root: &TokenStream) -> Result<T
         quote!(record.set_with(#name, |slot| #write)?;)
     });
     let specs = variables.iter().map(|variable| variable.spec(root));
+    let units = variables.iter().filter_map(Variable::unit);
     let places = (0..variables.len()).map(|index| quote!(#root::typed::place(places, #index))).collect::<Vec<_>>();
     let reads = variables.iter().zip(&places).map(|(variable, place)| variable.read(root, place));
     let writes = variables
@@ -69,6 +70,8 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, root: &TokenStream) -> Result<T
         #[automatically_derived]
         impl #root::typed::Variables for #ident {
             const SPECS: &'static [#root::typed::parts::VariableSpec<'static>] = &[#(#specs),*];
+            const UNITS: #root::typed::Units = &[#(#units),*];
+            const HELP: &'static str = #help;
 
             fn read_places(parameters: &#parameters, places: &[u8]) -> ::core::result::Result<Self, #error> {
                 ::core::result::Result::Ok(Self { #(#names: #reads?),* })

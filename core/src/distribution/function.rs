@@ -2,7 +2,7 @@
 //!
 //! A signature exists in one encoding, which is stored and travels as it is: name length u8, name, number of
 //! arguments u8, arguments, number of results u8, results; where declared, a section u8, its number of variables u8 and
-//! those, for the progress of calls (1) and for the values of failures (2); each variable: type u8, name length u8, size u32
+//! those, for the progress of calls (1) and for the values of failures (2), behind which [help](super::help) may stand; each variable: type u8, name length u8, size u32
 //! little-endian, name, and what a list or record is made of. [`Definition`] owns one, [`Signature`] borrows one.
 
 use core::fmt;
@@ -11,6 +11,7 @@ use crate::config::{SIGNATURE_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
 pub use super::attributes::Attributes;
+use super::help;
 use super::name::check_name;
 use super::nested;
 use super::parameters::{ParametersView, Type, bytes_of_variable};
@@ -31,7 +32,7 @@ use super::value::saturate;
 /// ```
 #[derive(Clone, PartialEq, Eq)]
 pub struct Definition {
-    bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
+    pub(super) bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
 }
 
 /// A signature in borrowed bytes; `Display` is its text form.
@@ -192,9 +193,16 @@ impl Section {
 
 impl<'a> Signature<'a> {
     /// Checks an encoded signature; [`Error::Malformed`] for anything that [`Definition`] could not have made.
+    ///
+    /// Help is not in what is returned where the feature `help` is off, or where it makes the signature too long.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
         let (name, arguments, results) = Self::split(bytes).ok_or(Error::Malformed)?;
-        let this = Self { bytes };
+        let whole = Self { bytes };
+        let has_room = cfg!(feature = "help") && bytes.len() <= SIGNATURE_BYTES;
+        let this = if has_room { whole } else { whole.without_help() };
+        if this.bytes.len() > SIGNATURE_BYTES {
+            return Err(Error::Malformed);
+        }
         let rebuilt = Builder::of(name, arguments, results).and_then(|mut builder| builder.sections_of(this));
         rebuilt.map(|()| this).map_err(|_| Error::Malformed)
     }
@@ -220,21 +228,34 @@ impl<'a> Signature<'a> {
     /// What its calls tell while they run.
     #[cfg(feature = "details")]
     pub fn progress(&self) -> VariableSpecs<'a> {
-        self.section(Section::Progress)
+        self.section(Section::Progress as u8)
     }
 
     /// The values of its failures.
     #[cfg(feature = "details")]
     pub fn failure(&self) -> VariableSpecs<'a> {
-        self.section(Section::Failure)
+        self.section(Section::Failure as u8)
+    }
+
+    /// What people read is not in it.
+    pub(crate) fn without_help(self) -> Self {
+        let mut rest = self.results().behind();
+        while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {
+            if section >= help::SECTION {
+                break;
+            }
+            rest = VariableSpecs::of_checked(Some(behind)).behind();
+        }
+        let length = self.bytes.len().saturating_sub(rest.map_or(0, <[u8]>::len));
+        Self { bytes: self.bytes.get(..length).unwrap_or(self.bytes) }
     }
 
     #[cfg(feature = "details")]
-    fn section(&self, wanted: Section) -> VariableSpecs<'a> {
+    pub(super) fn section(&self, wanted: u8) -> VariableSpecs<'a> {
         let mut rest = self.results().behind();
         while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {
             let specs = VariableSpecs::of_checked(Some(behind));
-            if section == wanted as u8 {
+            if section == wanted {
                 return specs;
             }
             rest = specs.behind();
@@ -290,7 +311,7 @@ impl<'a> Signature<'a> {
                 return None;
             }
         }
-        (bytes.len() <= SIGNATURE_BYTES).then_some((name, arguments, results))
+        Some((name, arguments, results))
     }
 }
 
@@ -436,7 +457,9 @@ impl Builder {
     #[cfg(feature = "details")]
     fn sections_of(&mut self, signature: Signature<'_>) -> Result<(), Error> {
         let mut all = Section::ALL.into_iter();
-        all.try_for_each(|(section, _)| signature.section(section).try_for_each(|spec| self.declare(section, spec)))
+        all.try_for_each(|(section, _)| {
+            signature.section(section as u8).try_for_each(|spec| self.declare(section, spec))
+        })
     }
 
     /// A unit that has no use for sections passes them over.
@@ -604,7 +627,7 @@ impl fmt::Display for Signature<'_> {
         }
         #[cfg(feature = "details")]
         for (section, word) in Section::ALL {
-            let specs = self.section(section);
+            let specs = self.section(section as u8);
             if specs.left > 0 {
                 write!(f, " {word} {specs}")?;
             }

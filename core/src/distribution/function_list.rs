@@ -188,13 +188,14 @@ impl<S: Storage> TheirFunctionList<S> {
         signature: &[u8],
     ) -> Result<(), Error> {
         self.remove(slot);
-        let name = match Signature::decode(signature) {
-            Ok(signature) => signature.name(),
+        let signature = match Signature::decode(signature) {
+            Ok(signature) => signature,
             Err(error) => {
                 self.skipped = self.skipped.saturating_add(1);
                 return Err(error);
             }
         };
+        let name = signature.name();
         if let Some(index) = self.table.find(name) {
             self.table.take(index);
         }
@@ -202,7 +203,11 @@ impl<S: Storage> TheirFunctionList<S> {
             self.skipped = self.skipped.saturating_add(1);
             return Ok(());
         }
-        let put = self.put(slot, generation, attributes, signature);
+        let mut put = self.put(slot, generation, attributes, signature.as_bytes());
+        if cfg!(feature = "help") && put.is_err() {
+            // Rather the function without its help than none.
+            put = self.put(slot, generation, attributes, signature.without_help().as_bytes());
+        }
         if put.is_err() {
             self.skipped = self.skipped.saturating_add(1);
         }

@@ -14,6 +14,7 @@ pub mod failure;
 pub mod function;
 pub mod function_list;
 pub mod hello;
+mod help;
 pub mod identity;
 pub mod items;
 pub mod message;

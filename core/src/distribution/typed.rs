@@ -9,12 +9,16 @@ use core::fmt;
 #[cfg(feature = "streams")]
 use super::function::{Builder, Definition};
 use super::function::{Signature, VariableSpec, VariableSpecs};
-use super::name::is_name_byte;
 use super::nested::{self, Bounds};
 use super::parameters::{Elements, Fields, FromValue, Parameters, ParametersView, Slot, Type};
 use super::value::{Element, Value};
-use crate::config::{DEPTH, FAILURE_VALUES_BYTES, NAME_BYTES, SIGNATURE_BYTES, VARIABLES};
+use crate::config::{NAME_BYTES, VARIABLES};
 use crate::error::{Error, ServiceError};
+
+mod signatures;
+
+use signatures::position;
+pub use signatures::{Declared, Encoded, element, element_bytes, fields, fields_bytes, parameters_bytes};
 
 /// The code of [`ServiceError::Failed`] with which a typed service refuses an argument that its Rust type cannot hold, as
 /// 300 for a `u8`, before any code of its own runs.
@@ -92,6 +96,9 @@ impl<const N: usize> Field for heapless::Vec<u8, N> {
     }
 }
 
+/// The names of variables, and their units.
+pub type Units = &'static [(&'static str, &'static str)];
+
 /// A struct whose fields are variables; `#[derive(Variables)]` writes it.
 #[diagnostic::on_unimplemented(
     message = "`{Self}` does not say what its variables are called",
@@ -101,6 +108,10 @@ impl<const N: usize> Field for heapless::Vec<u8, N> {
 pub trait Variables: Sized {
     /// The variables in the order of the fields.
     const SPECS: &'static [VariableSpec<'static>];
+    /// The units of variables, by name.
+    const UNITS: Units = &[];
+    /// A line of help for people: what a stream of these values is.
+    const HELP: &'static str = "";
 
     /// Reads the fields from the variables in these places.
     #[doc(hidden)]
@@ -163,7 +174,13 @@ impl Variables for () {
 pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     let mut stream = Builder::new(name)?;
     V::SPECS.iter().try_for_each(|spec| stream.result(*spec))?;
-    Ok(stream.finish())
+    let stream = stream.finish();
+    #[cfg(feature = "help")]
+    let stream = {
+        let stream = if V::HELP.is_empty() { stream } else { stream.help(V::HELP)? };
+        V::UNITS.iter().try_fold(stream, |stream, (variable, unit)| stream.unit(variable, unit))?
+    };
+    Ok(stream)
 }
 
 /// Each argument where it stands in the signature.
@@ -205,175 +222,6 @@ pub fn borrowed<'p, T: FromValue<'p>>(parameters: &'p ParametersView, place: usi
 /// What a service answers where an argument does not fit its Rust type.
 pub fn refused(_: Error) -> ServiceError {
     ServiceError::Failed(BAD_ARGUMENT)
-}
-
-/// All variables of a function.
-#[derive(Clone, Copy, Debug)]
-pub struct Declared<'a> {
-    /// What a caller must pass.
-    pub arguments: &'a [VariableSpec<'a>],
-    /// What it gets back.
-    pub results: &'a [VariableSpec<'a>],
-    /// What its calls tell while they run.
-    pub progress: &'a [VariableSpec<'a>],
-    /// The values of its failures.
-    pub fails: &'a [VariableSpec<'a>],
-}
-
-impl Declared<'_> {
-    /// Bytes that the signature of a function of this name takes.
-    pub const fn encoded_bytes(&self, name: &str) -> usize {
-        let fixed = name.len().saturating_add(3);
-        let bytes = fixed.saturating_add(bytes_of_specs(self.arguments)).saturating_add(bytes_of_specs(self.results));
-        bytes.saturating_add(bytes_of_section(self.progress)).saturating_add(bytes_of_section(self.fails))
-    }
-}
-
-/// A section without variables is not there.
-const fn bytes_of_section(specs: &[VariableSpec<'_>]) -> usize {
-    if specs.is_empty() { 0 } else { bytes_of_specs(specs).saturating_add(2) }
-}
-
-const fn bytes_of_specs(mut specs: &[VariableSpec<'_>]) -> usize {
-    let mut bytes = 0_usize;
-    while let Some((spec, rest)) = specs.split_first() {
-        bytes = bytes.saturating_add(spec.name.len()).saturating_add(spec.inner.len()).saturating_add(6);
-        specs = rest;
-    }
-    bytes
-}
-
-/// Bytes that a variable takes in a `Parameters` beside its name. A list or record is there twice while it is set, the old
-/// one as short as it can be, and lists are as long as they may become.
-const fn bytes_of_value(spec: VariableSpec<'_>) -> usize {
-    if !spec.kind.is_nested() {
-        return (spec.size as usize).saturating_mul(spec.kind.width());
-    }
-    let inner = Insides::of(spec.kind, spec.size, spec.inner, 0);
-    inner.least.saturating_add(inner.longest).saturating_add(spec.inner.len())
-}
-
-/// What the bytes of a signature say of a type, when compiling.
-struct Insides<'a> {
-    /// Bytes of the shortest and of the longest value in a block.
-    least: usize,
-    longest: usize,
-    /// What is behind them.
-    rest: &'a [u8],
-    /// The rule that is broken, or nothing.
-    wrong: &'static str,
-}
-
-impl<'a> Insides<'a> {
-    const fn wrong(wrong: &'static str) -> Self {
-        Self { least: 0, longest: 0, rest: &[], wrong }
-    }
-
-    const fn of(kind: Type, size: u32, rest: &'a [u8], depth: usize) -> Self {
-        if !matches!(kind, Type::List | Type::Record) {
-            let head = if kind.is_fixed() { 0 } else { 8 };
-            let bytes = (size as usize).saturating_mul(kind.width());
-            let longest = match bytes.checked_next_multiple_of(8) {
-                Some(padded) => padded.saturating_add(head),
-                None => usize::MAX,
-            };
-            return Self { least: if kind.is_fixed() { longest } else { head }, longest, rest, wrong: "" };
-        }
-        if !cfg!(feature = "nested") {
-            return Self::wrong("lists and structs in structs need the feature `nested` of the core");
-        }
-        if depth >= DEPTH {
-            return Self::wrong("lists and structs are in each other at most 4 deep");
-        }
-        if matches!(kind, Type::List) { Self::of_list(size, rest, depth) } else { Self::of_record(size, rest, depth) }
-    }
-
-    const fn of_list(size: u32, rest: &'a [u8], depth: usize) -> Self {
-        let Some((kind, element_size, rest)) = nested::split_element(rest) else {
-            return Self::wrong("a list has no element");
-        };
-        let element = Self::of(kind, element_size, rest, depth.saturating_add(1));
-        if !element.wrong.is_empty() {
-            return element;
-        }
-        if element.least == 0 {
-            return Self::wrong("an element of a list takes bytes");
-        }
-        let longest = element.longest.saturating_mul(size as usize).saturating_add(8);
-        Self { least: 8, longest, rest: element.rest, wrong: "" }
-    }
-
-    const fn of_record(size: u32, mut rest: &'a [u8], depth: usize) -> Self {
-        if size == 0 || size > u8::MAX as u32 {
-            return Self::wrong("a struct in another one or in a list has 1 to 255 fields");
-        }
-        let (mut left, mut least, mut longest) = (size, 0_usize, 0_usize);
-        while left > 0 {
-            left = left.saturating_sub(1);
-            let Some((&[kind, length, a, b, c, d], named)) = rest.split_first_chunk::<6>() else {
-                return Self::wrong("a struct has not all of its fields");
-            };
-            let (Some(kind), Some((name, inner))) = (Type::from_wire(kind), named.split_at_checked(length as usize))
-            else {
-                return Self::wrong("a struct has not all of its fields");
-            };
-            if !is_name_of(name) {
-                return Self::wrong("a field's name has 1 to 32 letters, digits, '_', '-', '.' or '/'");
-            }
-            let field = Self::of(kind, u32::from_le_bytes([a, b, c, d]), inner, depth.saturating_add(1));
-            if !field.wrong.is_empty() {
-                return field;
-            }
-            least = least.saturating_add(field.least);
-            longest = longest.saturating_add(field.longest);
-            rest = field.rest;
-        }
-        Self { least, longest, rest, wrong: "" }
-    }
-}
-
-/// The rule that a variable breaks by what it is made of, or nothing.
-const fn wrong_inside(spec: VariableSpec<'_>) -> &'static str {
-    let inside = Insides::of(spec.kind, spec.size, spec.inner, 0);
-    if !inside.wrong.is_empty() {
-        inside.wrong
-    } else if inside.rest.is_empty() {
-        ""
-    } else {
-        "a type has more behind it than it is made of"
-    }
-}
-
-/// Bytes of what a list of such elements is made of.
-pub const fn element_bytes(element: VariableSpec<'_>) -> usize {
-    element.inner.len().saturating_add(5)
-}
-
-/// What a list of such elements is made of, in [`element_bytes`].
-pub const fn element<const BYTES: usize>(element: VariableSpec<'_>) -> [u8; BYTES] {
-    let mut bytes = [0; BYTES];
-    let rest = put(&mut bytes, &[element.kind as u8]);
-    put(put(rest, &element.size.to_le_bytes()), element.inner);
-    bytes
-}
-
-/// Bytes of what a record with such fields is made of.
-pub const fn fields_bytes(fields: &[VariableSpec<'_>]) -> usize {
-    bytes_of_specs(fields)
-}
-
-/// What a record with such fields is made of, in [`fields_bytes`]; two fields of one name are a rule that is broken.
-pub const fn fields<const BYTES: usize>(fields: &[VariableSpec<'_>]) -> Result<[u8; BYTES], &'static str> {
-    let mut rest = fields;
-    while let Some((field, others)) = rest.split_first() {
-        if position(others, field.name).is_some() {
-            return Err("two fields have one name");
-        }
-        rest = others;
-    }
-    let mut bytes = [0; BYTES];
-    put_all(&mut bytes, fields);
-    Ok(bytes)
 }
 
 /// The elements of a list; [`Error::WrongType`] for another type.
@@ -445,226 +293,6 @@ macro_rules! __list {
 
 pub use crate::{__list, __nested};
 
-/// Bytes of a `Parameters` that holds all arguments and results of a function.
-pub const fn parameters_bytes(arguments: &[VariableSpec<'_>], results: &[VariableSpec<'_>]) -> usize {
-    let (mut bytes, mut rest, mut is_argument) = (0_usize, arguments, true);
-    loop {
-        let Some((spec, others)) = rest.split_first() else {
-            if !is_argument {
-                return bytes;
-            }
-            (rest, is_argument) = (results, false);
-            continue;
-        };
-        if is_argument || position(arguments, spec.name).is_none() {
-            bytes = bytes.saturating_add(spec.name.len()).saturating_add(bytes_of_value(*spec));
-        }
-        rest = others;
-    }
-}
-
-/// A signature that is encoded when compiling.
-#[derive(Debug)]
-pub struct Encoded<const BYTES: usize> {
-    bytes: [u8; BYTES],
-}
-
-impl<const BYTES: usize> Encoded<BYTES> {
-    /// Encodes a signature of [`Declared::encoded_bytes`], or says which rule it breaks.
-    pub const fn new(name: &str, declared: Declared<'_>) -> Result<Self, &'static str> {
-        if let Err(rule) = check(name, &declared) {
-            return Err(rule);
-        }
-        let mut bytes = [0; BYTES];
-        let rest = put(&mut bytes, &[name.len() as u8]);
-        let rest = put(rest, name.as_bytes());
-        let rest = put_specs(rest, declared.arguments);
-        let rest = put_specs(rest, declared.results);
-        let rest = put_section(rest, 1, declared.progress);
-        let rest = put_section(rest, 2, declared.fails);
-        if rest.is_empty() && BYTES == declared.encoded_bytes(name) {
-            Ok(Self { bytes })
-        } else {
-            Err("the signature has another length")
-        }
-    }
-
-    /// The signature.
-    pub const fn signature(&self) -> Signature<'_> {
-        Signature::of_checked(&self.bytes)
-    }
-}
-
-/// The rules of a [`Definition`](super::function::Definition).
-const fn check(name: &str, declared: &Declared<'_>) -> Result<(), &'static str> {
-    let Declared { arguments, results, progress, fails } = *declared;
-    if !is_name(name) {
-        return Err("a function's name has 1 to 32 letters, digits, '_', '-', '.' or '/'");
-    }
-    if let Err(rule) = check_list(
-        arguments,
-        "an argument's name has 1 to 32 letters, digits, '_', '-', '.' or '/'",
-        "two arguments have one name",
-    ) {
-        return Err(rule);
-    }
-    if let Err(rule) = check_list(
-        results,
-        "a result's name has 1 to 32 letters, digits, '_', '-', '.' or '/'",
-        "two results have one name",
-    ) {
-        return Err(rule);
-    }
-    let named_wrongly =
-        "a value of progress or of a failure has a name of 1 to 32 letters, digits, '_', '-', '.' or '/'";
-    let twice = "two values of progress or of a failure have one name";
-    if let Err(rule) = check_list(progress, named_wrongly, twice) {
-        return Err(rule);
-    }
-    if let Err(rule) = check_list(fails, named_wrongly, twice) {
-        return Err(rule);
-    }
-    if parameters_bytes(fails, &[]) > FAILURE_VALUES_BYTES {
-        return Err("the values of a failure take at most `FAILURE_VALUES_BYTES` bytes with their names");
-    }
-    let mut only_results = 0_usize;
-    let mut rest = results;
-    while let Some((result, others)) = rest.split_first() {
-        match named(arguments, result.name) {
-            Some(argument)
-                if argument.kind as u8 != result.kind as u8
-                    || argument.size != result.size
-                    || !are_same(argument.inner, result.inner) =>
-            {
-                return Err("a result with the name of an argument has its type and size, since both are one variable");
-            }
-            Some(_) => {}
-            None => only_results = only_results.saturating_add(1),
-        }
-        rest = others;
-    }
-    if arguments.len().saturating_add(only_results) > VARIABLES {
-        return Err("a function has at most 16 arguments and results");
-    }
-    if progress.len() > VARIABLES || fails.len() > VARIABLES {
-        return Err("progress and failures have at most 16 values each");
-    }
-    if declared.encoded_bytes(name) > SIGNATURE_BYTES {
-        return Err(
-            "the names of a function, its arguments and its results are too long together: `SIGNATURE_BYTES` bytes with 6 for each",
-        );
-    }
-    Ok(())
-}
-
-/// The rules of variables that stand side by side.
-const fn check_list(
-    list: &[VariableSpec<'_>],
-    named_wrongly: &'static str,
-    twice: &'static str,
-) -> Result<(), &'static str> {
-    let mut rest = list;
-    while let Some((variable, others)) = rest.split_first() {
-        if !is_name(variable.name) {
-            return Err(named_wrongly);
-        }
-        if position(others, variable.name).is_some() {
-            return Err(twice);
-        }
-        let wrong = wrong_inside(*variable);
-        if !wrong.is_empty() {
-            return Err(wrong);
-        }
-        rest = others;
-    }
-    Ok(())
-}
-
-const fn is_name(name: &str) -> bool {
-    is_name_of(name.as_bytes())
-}
-
-const fn is_name_of(name: &[u8]) -> bool {
-    let mut rest = name;
-    while let Some((byte, others)) = rest.split_first() {
-        if !is_name_byte(*byte) {
-            return false;
-        }
-        rest = others;
-    }
-    !name.is_empty() && name.len() <= NAME_BYTES
-}
-
-const fn position(specs: &[VariableSpec<'_>], name: &str) -> Option<u8> {
-    let (mut rest, mut index) = (specs, 0_u8);
-    while let Some((spec, others)) = rest.split_first() {
-        if is_same(spec.name, name) {
-            return Some(index);
-        }
-        (rest, index) = (others, index.saturating_add(1));
-    }
-    None
-}
-
-const fn named<'s>(specs: &'s [VariableSpec<'s>], name: &str) -> Option<&'s VariableSpec<'s>> {
-    let mut rest = specs;
-    while let Some((spec, others)) = rest.split_first() {
-        if is_same(spec.name, name) {
-            return Some(spec);
-        }
-        rest = others;
-    }
-    None
-}
-
-const fn is_same(one: &str, other: &str) -> bool {
-    are_same(one.as_bytes(), other.as_bytes())
-}
-
-const fn are_same(mut one: &[u8], mut other: &[u8]) -> bool {
-    while let (Some((a, rest)), Some((b, others))) = (one.split_first(), other.split_first()) {
-        if *a != *b {
-            return false;
-        }
-        (one, other) = (rest, others);
-    }
-    one.is_empty() && other.is_empty()
-}
-
-/// Writes `bytes`, and returns what is free behind them.
-const fn put<'a>(mut to: &'a mut [u8], mut bytes: &[u8]) -> &'a mut [u8] {
-    while let Some((byte, rest)) = bytes.split_first() {
-        match to.split_first_mut() {
-            Some((place, free)) => {
-                *place = *byte;
-                to = free;
-            }
-            None => return &mut [],
-        }
-        bytes = rest;
-    }
-    to
-}
-
-const fn put_specs<'a>(to: &'a mut [u8], specs: &[VariableSpec<'_>]) -> &'a mut [u8] {
-    put_all(put(to, &[specs.len() as u8]), specs)
-}
-
-const fn put_section<'a>(to: &'a mut [u8], section: u8, specs: &[VariableSpec<'_>]) -> &'a mut [u8] {
-    if specs.is_empty() { to } else { put_specs(put(to, &[section]), specs) }
-}
-
-const fn put_all<'a>(mut to: &'a mut [u8], mut specs: &[VariableSpec<'_>]) -> &'a mut [u8] {
-    while let Some((spec, rest)) = specs.split_first() {
-        to = put(to, &[spec.kind as u8, spec.name.len() as u8]);
-        to = put(to, &spec.size.to_le_bytes());
-        to = put(to, spec.name.as_bytes());
-        to = put(to, spec.inner);
-        specs = rest;
-    }
-    to
-}
-
 /// Longest way to a variable; of a longer one the innermost names are left out, so that the error can be returned by value.
 const PATH_BYTES: usize = 40;
 
@@ -729,7 +357,7 @@ impl Mismatch {
     /// with its type and size, and what is wanted of it must be given. Of text and bytes an argument's length is looked at when
     /// it is sent, and a result must not become longer than is declared here. Progress and values of failures the peer need not have.
     pub fn check(ours: Signature<'_>, theirs: Signature<'_>) -> Result<(), Self> {
-        if ours.as_bytes() == theirs.as_bytes() {
+        if ours.as_bytes() == theirs.as_bytes() || ours.without_help() == theirs.without_help() {
             return Ok(());
         }
         let found = |name: &str, part, here: Option<VariableSpec<'_>>, there: Option<VariableSpec<'_>>| {

@@ -154,17 +154,6 @@ pub trait Interface<T: 'static, F: Functions<T> + ?Sized> {
     fn add_to(self, functions: &F) -> Result<(), Error>;
 }
 
-/// A line of help on a function, and the units of its variables, as the trait tells them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Help {
-    /// The function.
-    pub function: &'static str,
-    /// What it does.
-    pub text: &'static str,
-    /// The units of variables, by name.
-    pub units: &'static [(&'static str, &'static str)],
-}
-
 /// Why a typed call has no results.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CallError {

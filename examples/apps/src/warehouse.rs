@@ -99,14 +99,16 @@ pub struct Place {
     pub carries: i64,
     /// The order whose parcel it has put down last; 0 for none.
     pub delivered: i64,
-    /// Percent.
+    /// Of a full battery.
+    #[unit = "%"]
     pub charge: f64,
 }
 
 /// Where a vehicle is.
 #[derive(Variables, Clone, Copy, Debug, Default, PartialEq)]
 pub struct Pose {
-    /// The middle of its body, in cells.
+    /// The middle of its body.
+    #[unit = "cells"]
     pub position: [f64; 2],
     /// As [`Place`] has it.
     pub at: [i64; 2],
@@ -129,6 +131,7 @@ impl Pose {
 #[derive(Variables, Clone, Copy, Debug, Default, PartialEq)]
 pub struct Charge {
     /// Of a full one.
+    #[unit = "%"]
     pub percent: f64,
 }
 
@@ -142,7 +145,11 @@ pub trait Transport {
     #[actuator(drive)]
     #[lease(ms = 400)]
     #[returns(moves)]
-    fn advance(&mut self, call: &impl AnyCall<Order = Self::Order>, cell: [i64; 2]) -> Result<i64, ServiceError>;
+    fn advance(
+        &mut self,
+        call: &impl AnyCall<Order = Self::Order>,
+        #[unit = "cells"] cell: [i64; 2],
+    ) -> Result<i64, ServiceError>;
 
     /// Tells where it is, and what it carries.
     #[idempotent]
@@ -180,7 +187,7 @@ pub trait Brake {
 pub trait Workshop {
     /// Calls the mechanic to a vehicle, and tells in how many seconds it will be mended.
     #[idempotent]
-    #[returns(seconds)]
+    #[returns(#[unit = "s"] seconds)]
     fn call_mechanic(&mut self, #[size(32)] vehicle: &str, fault: u16) -> i64;
 }
 

@@ -91,10 +91,13 @@ pub(super) fn refused(finding: &Finding, age: Duration) -> RefusedInfo {
 }
 
 pub(super) fn function(function: &TheirFunction) -> FunctionInfo {
+    let signature = function.definition.signature();
     FunctionInfo {
-        name: function.definition.name().to_owned(),
-        signature: function.definition.signature().to_string(),
+        name: signature.name().to_owned(),
+        signature: signature.to_string(),
         attributes: function.attributes,
+        help: signature.help().to_owned(),
+        units: signature.units().map(|(variable, unit)| (variable.to_owned(), unit.to_owned())).collect(),
     }
 }
 

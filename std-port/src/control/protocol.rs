@@ -3,6 +3,8 @@
 //! `Failed`, and the next line is read. An empty line is a [`BEAT`] and not answered.
 
 use cara_core::distribution::function::Attributes;
+use std::collections::BTreeMap;
+
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -540,7 +542,7 @@ pub struct RefusedInfo {
 }
 
 /// A function that a node offers.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FunctionInfo {
     /// Its name.
     pub name: String,
@@ -549,6 +551,12 @@ pub struct FunctionInfo {
     /// How it wants to be called: `priority`, `lease_us` (or null), `idempotent`.
     #[serde(flatten, with = "super::attributes::Form")]
     pub attributes: Attributes,
+    /// What it does, in a line; absent where the node says nothing.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub help: String,
+    /// Units of variables, by their names; absent where there are none.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub units: BTreeMap<String, String>,
 }
 
 /// The state of what a function of a node moves, as the node told.

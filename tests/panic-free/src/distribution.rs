@@ -74,7 +74,8 @@ entry!(parameters_placed, {
 entry!(typed_signatures, {
     let (arguments, results) = (unknown_slice::<VariableSpec<'static>>(), unknown_slice::<VariableSpec<'static>>());
     let (progress, fails) = (unknown_slice::<VariableSpec<'static>>(), unknown_slice::<VariableSpec<'static>>());
-    let declared = typed::Declared { arguments, results, progress, fails };
+    let (help, units) = (unknown_text(), unknown_slice::<typed::Units>());
+    let declared = typed::Declared { arguments, results, progress, fails, help, units };
     keep(declared.encoded_bytes(unknown_text()));
     keep(typed::parameters_bytes(arguments, results));
     keep(typed::place(&typed::places_of_results(arguments, results), *unknown()));
@@ -155,6 +156,8 @@ entry!(definitions, {
     let definition = unknown::<Definition>();
     keep(definition.clone().arguments(parameters()));
     keep(definition.clone().results(parameters()));
+    keep(definition.clone().help(unknown_text()));
+    keep(definition.clone().unit(unknown_text(), unknown_text()));
     keep((definition.name(), definition.as_bytes(), definition.signature()));
 });
 
@@ -165,6 +168,8 @@ entry!(signatures, {
         keep(signature.arguments().named(unknown_text()));
         keep((signature.name(), signature.as_bytes(), signature.parameters_bytes()));
         keep(signature.to_definition());
+        keep((signature.help(), signature.unit_of(unknown_text())));
+        signature.units().for_each(|unit| keep(unit));
     }
 });
 

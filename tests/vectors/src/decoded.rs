@@ -207,6 +207,13 @@ fn signature(signature: Signature<'_>) -> Value {
             value[name] = variables(specs);
         }
     }
+    if !signature.help().is_empty() {
+        value["help"] = signature.help().into();
+    }
+    let units: Vec<_> = signature.units().collect();
+    if !units.is_empty() {
+        value["units"] = json!(units);
+    }
     value
 }
 

@@ -63,6 +63,24 @@ fn signatures() -> Vec<Vector> {
             }),
         ),
         Vector::new(
+            ("signature_lift", "a line of help, and the units of variables"),
+            Kind::Signature,
+            Context::default(),
+            definition("lift(height: float)")
+                .help("Lifts the fork.")
+                .and_then(|lift| lift.unit("height", "m"))
+                .expect("it fits")
+                .as_bytes(),
+            &json!({
+                "name": "lift",
+                "arguments": [{ "name": "height", "type": "float", "size": 1 }],
+                "results": [],
+                "help": "Lifts the fork.",
+                "units": [["height", "m"]],
+                "text": "lift(height: float)",
+            }),
+        ),
+        Vector::new(
             ("signature_empty_section", "refused: a section without variables"),
             Kind::Signature,
             Context::default(),

@@ -115,6 +115,10 @@ pub(crate) async fn look(browser: &Browser, programs: &Path) -> Result<()> {
     browser.click("#nodes tr:first-child button").await?;
     browser.says("#node-title", "agv-1/").await?;
     browser.says("#functions summary", "advance").await?;
+    let form = super::open(browser, "advance").await?;
+    browser.says(&format!("{form} form p.help"), "Drives into a cell beside its own").await?;
+    browser.says(&format!("{form} .field .label"), "int[2], cells").await?;
+    browser.run(&format!("document.querySelector('{form} summary').click()")).await?;
     if let Err(error) = browser.wait("all are drawn where they are", "wrong().length === 0").await {
         return Err(error.context(browser.run("return wrong()").await?));
     }

@@ -23,7 +23,7 @@ const BYTES: usize = DECLARED.encoded_bytes("go-to");
 const GO_TO: Result<Encoded<BYTES>, &str> = Encoded::new("go-to", DECLARED);
 
 const fn declared<'a>(arguments: &'a [VariableSpec<'a>], results: &'a [VariableSpec<'a>]) -> Declared<'a> {
-    Declared { arguments, results, progress: &[], fails: &[] }
+    Declared { arguments, results, progress: &[], fails: &[], help: "", units: &[] }
 }
 
 fn parsed(text: &str) -> Definition {
@@ -120,7 +120,7 @@ fn every_rule_of_a_definition_holds_when_compiling() {
 #[test]
 fn every_rule_of_sections_holds_when_compiling() {
     let refused = |progress: &[VariableSpec<'_>], fails: &[VariableSpec<'_>]| {
-        let declared = Declared { arguments: &[], results: &[], progress, fails };
+        let declared = Declared { arguments: &[], results: &[], progress, fails, help: "", units: &[] };
         Encoded::<12>::new("f", declared).err().unwrap_or_default()
     };
     assert!(refused(&[VariableSpec { name: "a b", ..DONE }], &[]).contains("has a name of 1 to 32"));

@@ -312,14 +312,16 @@ impl<P: Port> Session<P> {
                 None => self.send_control(cx, &Control::Withdraw { slot: slot.0 }),
                 Some(function) => {
                     let actuator = self.actuator_of(cx, function.handler);
-                    let signature = function.signature.as_bytes();
+                    let whole = function.signature.as_bytes();
+                    let least =
+                        if cfg!(feature = "help") { function.signature.without_help().as_bytes() } else { whole };
                     let control = Control::Publish {
                         slot: slot.0,
                         generation: function.generation.0,
                         attributes: &Attributes { actuator, ..*function.attributes }.encode(),
-                        // One that the peer has no buffer for would end the link. It counts as not kept there, as any that
-                        // it cannot read.
-                        signature: if self.may_hold(signature.len()) { signature } else { &[] },
+                        // One that the peer has no buffer for would end the link. Without one it counts as not kept there,
+                        // as any that it cannot read.
+                        signature: [whole, least].into_iter().find(|one| self.may_hold(one.len())).unwrap_or_default(),
                     };
                     self.send_control(cx, &control)
                 }

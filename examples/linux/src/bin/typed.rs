@@ -31,8 +31,11 @@ trait Agv {
     /// Drives there, while its caller wants it, and tells how far it is.
     #[actuator(drive)]
     #[lease(ms = 400)]
-    #[unit(position = "m")]
-    fn go_to(&mut self, call: &impl TypedCall<Left, Blocked>, position: [i64; 2]) -> Result<(), ServiceError>;
+    fn go_to(
+        &mut self,
+        call: &impl TypedCall<Left, Blocked>,
+        #[unit = "m"] position: [i64; 2],
+    ) -> Result<(), ServiceError>;
 }
 
 /// What it has to go, in metres.

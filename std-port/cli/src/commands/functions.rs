@@ -42,10 +42,21 @@ pub(crate) fn run(Arguments { node, rust }: Arguments, global: &Global) -> anyho
     Ok(Exit::Done.into())
 }
 
+/// A column of help where a function has any.
 fn table(functions: &[FunctionInfo]) -> Rows {
-    let mut rows = Rows::new(["FUNCTION", "ATTRIBUTES"]);
-    for FunctionInfo { signature, attributes, .. } in functions {
-        rows.add(PLAIN, [signature.clone(), attributes.to_string()]);
+    let helps: Vec<String> = functions.iter().map(help).collect();
+    let has_help = helps.iter().any(|help| !help.is_empty());
+    let mut rows =
+        if has_help { Rows::new(["FUNCTION", "ATTRIBUTES", "HELP"]) } else { Rows::new(["FUNCTION", "ATTRIBUTES"]) };
+    for (FunctionInfo { signature, attributes, .. }, help) in functions.iter().zip(helps) {
+        let columns = [signature.clone(), attributes.to_string()];
+        rows.add(PLAIN, columns.into_iter().chain(has_help.then_some(help)));
     }
     rows
+}
+
+/// What it does, and the units of its variables.
+fn help(FunctionInfo { help, units, .. }: &FunctionInfo) -> String {
+    let units = units.iter().map(|(variable, unit)| format!("{variable} in {unit}")).collect::<Vec<_>>().join(", ");
+    [help.as_str(), &units].into_iter().filter(|said| !said.is_empty()).collect::<Vec<_>>().join(" ")
 }

@@ -1,9 +1,13 @@
 //! The functions of a node as the trait that `#[interface]` takes, and the values of its streams as structs.
 
+use std::collections::BTreeMap;
 use std::fmt::{self, Write};
 
 use cara_std::control::protocol::FunctionInfo;
-use cara_std::{Attributes, Definition, Priority, Type, VariableSpec, VariableSpecs};
+use cara_std::{Definition, Priority, Type, VariableSpec, VariableSpecs, is_hidden};
+
+/// Units of variables, by their names.
+type Units = BTreeMap<String, String>;
 
 /// Words that cannot be names of Rust, not even behind `r#`.
 const NEVER: [&str; 5] = ["self", "Self", "super", "crate", "_"];
@@ -26,14 +30,15 @@ pub(crate) fn interface(node: &str, functions: &[FunctionInfo]) -> Result<String
         let definition: Definition =
             function.signature.parse().map_err(|error| format!("{}: {error}", function.signature))?;
         if function.attributes.stream.is_some() {
-            let values = structs.of(definition.signature().results(), definition.name());
+            let results = definition.signature().results();
+            let values = structs.of(results, definition.name(), &function.help, &function.units);
             streams += &format!("// Values of the stream `{}` are a `{values}`.\n", definition.name());
             continue;
         }
         if !methods.is_empty() {
             methods.push('\n');
         }
-        method(&mut methods, &definition, &function.attributes, &mut taken, &mut structs)
+        method(&mut methods, &definition, function, &mut taken, &mut structs)
             .map_err(|_| String::from("the source cannot be written"))?;
     }
     let source = structs.source;
@@ -53,8 +58,8 @@ struct Structs {
 
 impl Structs {
     /// The struct with these fields: a new one, called like the way to it, or the one that has the same.
-    fn of(&mut self, fields: VariableSpecs<'_>, way: &str) -> String {
-        let key = key(fields);
+    fn of(&mut self, fields: VariableSpecs<'_>, way: &str, help: &str, units: &Units) -> String {
+        let key = key(fields, units);
         if let Some((_, name)) = self.known.iter().find(|(known, _)| *known == key) {
             return name.clone();
         }
@@ -75,9 +80,13 @@ impl Structs {
             if let Some(size) = size(&field) {
                 source += &format!("    {size}\n");
             }
+            if let Some(unit) = units.get(field.name) {
+                source += &format!("    #[unit = {unit:?}]\n");
+            }
             let rust = rust_type(&field, false, &format!("{way} {}", field.name), self);
             source += &format!("    pub {ident}: {rust},\n");
         }
+        self.source += &documentation(help, "");
         self.source += &format!("#[derive(Variables, Clone, Debug, PartialEq)]\npub struct {name} {{\n{source}}}\n\n");
         name
     }
@@ -86,12 +95,13 @@ impl Structs {
 fn method(
     source: &mut String,
     definition: &Definition,
-    attributes: &Attributes,
+    FunctionInfo { attributes, help, units, .. }: &FunctionInfo,
     taken: &mut Vec<String>,
     structs: &mut Structs,
 ) -> fmt::Result {
     let (name, signature) = (definition.name(), definition.signature());
     let ident = identifier(name, taken);
+    source.push_str(&documentation(help, "    "));
     if plain(&ident) != name {
         writeln!(source, "    #[name = \"{name}\"]")?;
     }
@@ -112,7 +122,7 @@ fn method(
     }
     let results: Vec<VariableSpec<'_>> = signature.results().collect();
     if !results.is_empty() {
-        let names: Vec<String> = results.iter().map(result_name).collect();
+        let names: Vec<String> = results.iter().map(|result| result_name(result, units)).collect();
         writeln!(source, "    #[returns({})]", names.join(", "))?;
     }
     let mut inputs = Vec::new();
@@ -124,7 +134,7 @@ fn method(
     let (progress, failure) = (signature.progress(), signature.failure());
     if progress.clone().next().is_some() || failure.clone().next().is_some() {
         arguments.push(String::from("call"));
-        inputs.push(format!("call: &impl TypedCall<{}>", told(structs, name, progress, failure)));
+        inputs.push(format!("call: &impl TypedCall<{}>", told(structs, name, progress, failure, units)));
     }
     let way = |variable: &VariableSpec<'_>| format!("{name} {}", variable.name);
     for argument in signature.arguments() {
@@ -132,7 +142,7 @@ fn method(
         let name =
             if plain(&ident) == argument.name { String::new() } else { format!("#[name = \"{}\"] ", argument.name) };
         let rust = rust_type(&argument, true, &way(&argument), structs);
-        inputs.push(format!("{name}{}{ident}: {rust}", sized(&argument)));
+        inputs.push(format!("{name}{}{ident}: {rust}", said(&argument, units)));
     }
     let types: Vec<String> = results.iter().map(|result| rust_type(result, false, &way(result), structs)).collect();
     let returned = match types.as_slice() {
@@ -143,9 +153,15 @@ fn method(
 }
 
 /// The types of what a call tells, and of its failures.
-fn told(structs: &mut Structs, name: &str, progress: VariableSpecs<'_>, failure: VariableSpecs<'_>) -> String {
+fn told(
+    structs: &mut Structs,
+    name: &str,
+    progress: VariableSpecs<'_>,
+    failure: VariableSpecs<'_>,
+    units: &Units,
+) -> String {
     let mut of = |specs: VariableSpecs<'_>, what: &str| match specs.clone().next() {
-        Some(_) => structs.of(specs, &format!("{name} {what}")),
+        Some(_) => structs.of(specs, &format!("{name} {what}"), "", units),
         None => String::from("()"),
     };
     let progress = of(progress, "progress");
@@ -156,26 +172,34 @@ fn told(structs: &mut Structs, name: &str, progress: VariableSpecs<'_>, failure:
 }
 
 /// What two structs have in common that are the same.
-fn key(fields: VariableSpecs<'_>) -> Vec<u8> {
+fn key(fields: VariableSpecs<'_>, units: &Units) -> Vec<u8> {
     let mut key = Vec::new();
     for VariableSpec { name, kind, size, inner } in fields {
         key.extend([kind as u8, name.len() as u8]);
         key.extend(size.to_le_bytes());
         key.extend(name.as_bytes());
         key.extend(inner);
+        key.extend(units.get(name).into_iter().flat_map(|unit| unit.bytes()));
     }
     key
 }
 
-fn result_name(result: &VariableSpec<'_>) -> String {
+fn result_name(result: &VariableSpec<'_>, units: &Units) -> String {
     let ident = identifier(result.name, &mut Vec::new());
     let name = if plain(&ident) == result.name { ident } else { format!("\"{}\"", result.name) };
-    format!("{}{name}", sized(result))
+    format!("{}{name}", said(result, units))
 }
 
-/// The attribute of what has a bound, and a space.
-fn sized(spec: &VariableSpec<'_>) -> String {
-    size(spec).map_or_else(String::new, |size| size + " ")
+/// The attributes of what has a bound or a unit, each with a space.
+fn said(spec: &VariableSpec<'_>, units: &Units) -> String {
+    let unit = units.get(spec.name).map(|unit| format!("#[unit = {unit:?}]"));
+    size(spec).into_iter().chain(unit).map(|attribute| attribute + " ").collect()
+}
+
+/// The line of documentation that a line of help becomes. What would begin another line is left out: a node says what it likes.
+fn documentation(help: &str, indent: &str) -> String {
+    let shown: String = help.chars().map(|character| if is_hidden(character) { ' ' } else { character }).collect();
+    if shown.is_empty() { shown } else { format!("{indent}/// {shown}\n") }
 }
 
 /// `#[size(50, 32)]` of a list of 50 texts of 32 bytes. That of one at most is an `Option`, which has no size.
@@ -202,7 +226,7 @@ fn rust_type(spec: &VariableSpec<'_>, is_argument: bool, way: &str, structs: &mu
         (Type::String, false) => "String",
         (Type::Bytes, true) => "&[u8]",
         (Type::Bytes, false) => "Vec<u8>",
-        (Type::Record, _) => return structs.of(spec.fields(), way),
+        (Type::Record, _) => return structs.of(spec.fields(), way, "", &Units::new()),
         (Type::List, _) => {
             let holder = if spec.size == 1 { "Option" } else { "Vec" };
             let element = spec.element().map(|element| rust_type(&element, false, way, structs));

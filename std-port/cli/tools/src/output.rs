@@ -85,9 +85,9 @@ impl Rows {
     }
 
     /// One row more.
-    pub fn add<const COLUMNS: usize>(&mut self, style: Style, cells: [String; COLUMNS]) {
+    pub fn add(&mut self, style: Style, cells: impl IntoIterator<Item = String>) {
         // A line break in a cell would part the row from its style.
-        self.table.add_row(cells.map(|cell| Shown(&cell.replace(['\n', '\r'], " ")).to_string()));
+        self.table.add_row(cells.into_iter().map(|cell| Shown(&cell.replace(['\n', '\r'], " ")).to_string()));
         self.styles.push(style);
     }
 

@@ -14,7 +14,13 @@ pub(crate) fn function(info: &FunctionInfo) -> Value {
         let specs = if results { signature.results() } else { signature.arguments() };
         Some(
             specs
-                .map(|spec| json!({ "name": spec.name, "type": spec.kind.to_string(), "size": spec.size }))
+                .map(|spec| {
+                    let mut variable = json!({ "name": spec.name, "type": spec.kind.to_string(), "size": spec.size });
+                    if let Some(unit) = info.units.get(spec.name) {
+                        variable["unit"] = unit.as_str().into();
+                    }
+                    variable
+                })
                 .collect::<Value>(),
         )
     };
@@ -81,9 +87,13 @@ mod tests {
     #[test]
     fn a_function_has_its_variables() {
         let info =
-            serde_json::from_value(json!({ "name": "f", "signature": "f(a: int[2]) -> (b: string[8])" })).unwrap();
+            serde_json::from_value(json!({ "name": "f", "signature": "f(a: int[2]) -> (b: string[8])", "help": "Does.", "units": { "a": "m" } }))
+                .unwrap();
         let told = function(&info);
-        assert_eq!(told["inputs"], json!([{ "name": "a", "type": "int", "size": 2 }]));
+        assert_eq!(
+            (&told["help"], &told["inputs"]),
+            (&json!("Does."), &json!([{ "name": "a", "type": "int", "size": 2, "unit": "m" }]))
+        );
         assert_eq!(told["outputs"], json!([{ "name": "b", "type": "string", "size": 8 }]));
         let later = serde_json::from_value(json!({ "name": "f", "signature": "f(a: tree)" })).unwrap();
         assert_eq!(function(&later)["inputs"], Value::Null);

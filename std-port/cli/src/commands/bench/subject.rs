@@ -79,12 +79,11 @@ pub(crate) fn choose(operator: &mut Operator, node: &str, name: Option<&str>) ->
 
 #[cfg(test)]
 mod tests {
-    use cara_std::Attributes;
 
     use super::{FunctionInfo, Subject};
 
     fn longest(signature: &str, echo: bool) -> Option<usize> {
-        let info = FunctionInfo { name: "f".into(), signature: signature.into(), attributes: Attributes::default() };
+        let info = FunctionInfo { name: "f".into(), signature: signature.into(), ..FunctionInfo::default() };
         Subject::of("agv/1", &info, echo).map(|subject| subject.longest())
     }
 

@@ -26,6 +26,7 @@ pub struct PlanStart {
 
 #[derive(Variables, Clone, Debug, PartialEq)]
 pub struct DockProgress {
+    #[unit = "m"]
     pub left: f64,
 }
 
@@ -38,9 +39,10 @@ pub struct DockFailure {
 
 #[interface]
 pub trait Agv17 {
+    /// Tells where it is, or goes to be.
     #[idempotent]
-    #[returns(position)]
-    fn pos_info(&mut self, position: [i64; 2]) -> Result<[i64; 2], ServiceError>;
+    #[returns(#[unit = "m"] position)]
+    fn pos_info(&mut self, #[unit = "m"] position: [i64; 2]) -> Result<[i64; 2], ServiceError>;
 
     #[priority(high)]
     #[actuator(actuator_3)]
@@ -57,7 +59,7 @@ pub trait Agv17 {
     fn reset(&mut self) -> Result<(), ServiceError>;
 
     #[name = "log/line"]
-    #[returns(#[size(9)] text, "is-new")]
+    #[returns(#[size(9)] #[unit = "words"] text, "is-new")]
     fn log_line(&mut self, #[size(64)] line: &str, #[name = "a-b"] a_b: f64, #[name = "a.b"] a_b_: bool, r#type: i64, #[name = "self"] self_: i64, #[size(8)] _raw: &[u8], #[name = "2nd"] _2nd: i64) -> Result<(String, bool), ServiceError>;
 
     #[returns(last, #[size(3)] photos)]

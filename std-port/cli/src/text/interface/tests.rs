@@ -14,7 +14,7 @@ mod printed {
     include!("agv.rs");
 
     /// Signatures and attributes.
-    pub(super) fn functions() -> Vec<(String, cara_std::Attributes)> {
+    pub(super) fn functions() -> Vec<(cara_std::Signature<'static>, cara_std::Attributes)> {
         type Of = __Agv17Functions;
         let signatures = [
             Of::SIGNATURE_pos_info,
@@ -38,16 +38,21 @@ mod printed {
             Of::ATTRIBUTES_undock,
             Of::ATTRIBUTES_lift,
         ];
-        signatures.iter().map(ToString::to_string).zip(attributes).collect()
+        signatures.into_iter().zip(attributes).collect()
     }
 }
 
 #[test]
 fn the_printed_trait_is_the_one_that_was_published() {
-    let of = |(signature, attributes): (String, Attributes)| {
-        let moves = ["go_to", "stop"].iter().any(|name| signature.starts_with(name));
-        let attributes = Attributes { actuator: if moves { 3 } else { 0 }, ..attributes };
-        FunctionInfo { name: signature.clone(), signature, attributes }
+    let of = |(signature, attributes): (cara_std::Signature<'_>, Attributes)| {
+        let moves = ["go_to", "stop"].contains(&signature.name());
+        FunctionInfo {
+            name: signature.name().to_owned(),
+            signature: signature.to_string(),
+            attributes: Attributes { actuator: if moves { 3 } else { 0 }, ..attributes },
+            help: signature.help().to_owned(),
+            units: signature.units().map(|(variable, unit)| (variable.to_owned(), unit.to_owned())).collect(),
+        }
     };
     let published: Vec<FunctionInfo> = printed::functions().into_iter().map(of).collect();
     assert_eq!(
@@ -70,17 +75,27 @@ fn the_printed_trait_is_the_one_that_was_published() {
 #[test]
 fn streams_are_printed_as_structs() {
     let attributes = Attributes { priority: cara_std::Priority::Low, stream: Some(20), ..Attributes::default() };
-    let stream =
-        |name: &str, signature: &str| FunctionInfo { name: name.into(), signature: signature.into(), attributes };
+    let stream = |name: &str, signature: &str| FunctionInfo {
+        name: name.into(),
+        signature: signature.into(),
+        attributes,
+        ..FunctionInfo::default()
+    };
+    let units = [("position".to_owned(), "m".to_owned())].into();
     let functions = [
-        stream("pose", "pose() -> (position: float[2])"),
+        FunctionInfo { help: "Where it is\nnow.".into(), units, ..stream("pose", "pose() -> (position: float[2])") },
         FunctionInfo { attributes: Attributes::default(), ..stream("stop", "stop()") },
         stream("at_dock", "at_dock() -> (position: float[2])"),
+        stream("at_door", "at_door() -> (position: float[2])"),
     ];
     let source = interface("agv/17", &functions).unwrap();
-    let structs =
-        "#[derive(Variables, Clone, Debug, PartialEq)]\npub struct Pose {\n    pub position: [f64; 2],\n}\n\n";
-    let streams = "// Values of the stream `pose` are a `Pose`.\n// Values of the stream `at_dock` are a `Pose`.\n";
+    let derive = "#[derive(Variables, Clone, Debug, PartialEq)]\npub struct";
+    let structs = format!(
+        "/// Where it is now.\n{derive} Pose {{\n    #[unit = \"m\"]\n    pub position: [f64; 2],\n}}\n\n\
+         {derive} AtDock {{\n    pub position: [f64; 2],\n}}\n\n"
+    );
+    let streams = "// Values of the stream `pose` are a `Pose`.\n// Values of the stream `at_dock` are a `AtDock`.\n\
+                   // Values of the stream `at_door` are a `AtDock`.\n";
     assert!(source.contains(&format!("{structs}{streams}#[interface]")), "{source}");
     assert_eq!(source.matches("fn ").count(), 1, "{source}");
 }

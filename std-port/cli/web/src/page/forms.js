@@ -58,7 +58,7 @@ function form(node, info) {
   const call = make("button", { type: "submit", className: "primary" }, `Call ${info.name}`);
   const running = { abort: null };
   const made = make("form", { noValidate: true, autocomplete: "off" }, make("p", { className: "faint code" }, info.signature),
-    info.help ? make("p", {}, info.help) : null, ...fields.map((one) => one.element), options.element, call, outcome);
+    info.help ? make("p", { className: "help" }, info.help) : null, ...fields.map((one) => one.element), options.element, call, outcome);
   made.addEventListener("submit", (event) => {
     event.preventDefault();
     if (running.abort) return running.abort.abort();

@@ -1,0 +1,114 @@
+//! A line of help on a function and the units of its variables, for people: they stand behind all else in a signature.
+//!
+//! They are the section 3 of a signature, and its lines have the form of variables, so that a unit which does not know them
+//! passes them over: type u8 of a text, length u8, what it is u32 little-endian, text. 0 is the help; 1 is a unit behind the
+//! name of its variable and a blank, as `position m`.
+
+#[cfg(feature = "help")]
+use super::function::{Definition, Signature, VariableSpec};
+use super::parameters::Type;
+#[cfg(feature = "help")]
+use crate::config::{HELP_BYTES, UNIT_BYTES};
+#[cfg(feature = "help")]
+use crate::error::{Error, Limit};
+
+/// The number of the section; whatever has a greater one is behind it.
+pub(super) const SECTION: u8 = 3;
+
+/// What a line is.
+const HELP: u32 = 0;
+const UNIT: u32 = 1;
+
+/// What stands in front of a line's text.
+pub(super) const fn head(is_unit: bool, length: usize) -> [u8; 6] {
+    let [a, b, c, d] = if is_unit { UNIT } else { HELP }.to_le_bytes();
+    [Type::String as u8, length as u8, a, b, c, d]
+}
+
+#[cfg(feature = "help")]
+impl Definition {
+    /// The same function with a line of help for people: what it does. A text of more than [`HELP_BYTES`] is cut.
+    ///
+    /// What changes arguments, results, progress or failures later takes help and units away, so they come last.
+    ///
+    /// ```
+    /// # use cara_core::Definition;
+    /// let lift = Definition::parse("lift_to(height: float)").unwrap();
+    /// let lift = lift.help("Lifts the fork.")?.unit("height", "m")?;
+    /// assert_eq!((lift.signature().help(), lift.signature().unit_of("height")), ("Lifts the fork.", Some("m")));
+    /// // It is none of what a caller has to know.
+    /// assert_eq!(lift.to_string(), "lift_to(height: float)");
+    /// # Ok::<(), cara_core::error::Error>(())
+    /// ```
+    ///
+    /// [`Error::Full`] where the signature has no room for it, [`Error::NameTaken`] if it has help already.
+    pub fn help(self, text: &str) -> Result<Self, Error> {
+        if !self.signature().help().is_empty() {
+            return Err(Error::NameTaken);
+        }
+        self.with_line(false, &[cut(text, HELP_BYTES)])
+    }
+
+    /// The same function with the unit of a variable of this name, wherever it stands. A text of more than [`UNIT_BYTES`] is cut.
+    ///
+    /// [`Error::UnknownVariable`], [`Error::Full`] where the signature has no room for it, [`Error::NameTaken`] if the variable has a
+    /// unit already.
+    pub fn unit(self, variable: &str, unit: &str) -> Result<Self, Error> {
+        let signature = self.signature();
+        let all = [signature.arguments(), signature.results(), signature.progress(), signature.failure()];
+        if all.into_iter().all(|specs| specs.named(variable).is_none()) {
+            return Err(Error::UnknownVariable);
+        }
+        if signature.unit_of(variable).is_some() {
+            return Err(Error::NameTaken);
+        }
+        self.with_line(true, &[variable, " ", cut(unit, UNIT_BYTES)])
+    }
+
+    fn with_line(mut self, is_unit: bool, parts: &[&str]) -> Result<Self, Error> {
+        let section_at = self.signature().without_help().as_bytes().len();
+        let length = parts.iter().fold(0_usize, |length, part| length.saturating_add(part.len()));
+        let begin: &[u8] = if self.bytes.len() == section_at { &[SECTION, 0] } else { &[] };
+        let head = head(is_unit, length);
+        let pieces = [begin, &head].into_iter().chain(parts.iter().map(|part| part.as_bytes()));
+        for piece in pieces {
+            self.bytes.extend_from_slice(piece).map_err(|_| Error::Full(Limit::SignatureBytes))?;
+        }
+        if let Some(count) = self.bytes.get_mut(section_at.saturating_add(1)) {
+            *count = count.saturating_add(1);
+        }
+        Ok(self)
+    }
+}
+
+/// As much of a text as there is room for, up to the end of a character.
+#[cfg(feature = "help")]
+fn cut(text: &str, most: usize) -> &str {
+    text.get(..text.floor_char_boundary(most)).unwrap_or(text)
+}
+
+#[cfg(feature = "help")]
+impl<'a> Signature<'a> {
+    /// What the function does, in a line for people; empty where nothing is said.
+    pub fn help(&self) -> &'a str {
+        self.lines().find(|line| line.size == HELP).map_or("", |line| line.name)
+    }
+
+    /// The unit of the variable of this name, as `m`.
+    pub fn unit_of(&self, variable: &str) -> Option<&'a str> {
+        self.units().find(|(name, _)| *name == variable).map(|(_, unit)| unit)
+    }
+
+    /// The variables that have units, and these.
+    pub fn units(&self) -> impl Iterator<Item = (&'a str, &'a str)> + use<'a> {
+        self.lines().filter(|line| line.size == UNIT).filter_map(|line| line.name.split_once(' '))
+    }
+
+    /// The lines in the form of variables, whose names are the texts.
+    fn lines(&self) -> impl Iterator<Item = VariableSpec<'a>> + use<'a> {
+        self.section(SECTION)
+    }
+}
+
+#[cfg(test)]
+mod tests;
