@@ -84,7 +84,7 @@ pub use services::session::{Event, Session};
 pub use services::typed;
 #[cfg(feature = "details")]
 pub use services::typed::TypedCall;
-pub use services::typed::{AnyCall, Variables};
+pub use services::typed::{AnyCall, AsyncState, Variables};
 
 #[cfg(feature = "derive")]
 pub use cara_derive::{Variables, interface};

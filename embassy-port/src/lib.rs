@@ -112,7 +112,7 @@ mod time;
 pub use calls::Hold;
 #[cfg(feature = "details")]
 pub use cara_core::distribution::failure::Failure;
-pub use cara_core::typed::{self, AnyCall, CallError, Variables};
+pub use cara_core::typed::{self, AnyCall, AsyncState, CallError, Variables};
 #[cfg(feature = "details")]
 pub use cara_core::typed::{Failed, TypedCall};
 #[cfg(feature = "derive")]

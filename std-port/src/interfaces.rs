@@ -110,7 +110,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         interface.add_to(self)
     }
 
-    fn add<Form>(
+    pub(crate) fn add<Form>(
         &self,
         signature: Signature<'_>,
         attributes: Attributes,

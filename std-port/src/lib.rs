@@ -87,7 +87,7 @@ pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
 pub use cara_core::term::Term;
 pub use cara_core::time::Duration;
-pub use cara_core::typed::{self, AnyCall, CallError, Failed, Mismatch, TypedCall, Variables};
+pub use cara_core::typed::{self, AnyCall, AsyncState, CallError, Failed, Mismatch, TypedCall, Variables};
 #[cfg(feature = "derive")]
 pub use cara_derive::{VariablesStd as Variables, interface_std as interface};
 pub use communication_system::{CommunicationSystem, WeakSystem};

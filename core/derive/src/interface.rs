@@ -27,6 +27,7 @@ pub(crate) struct Function {
     /// Its name in the signature.
     pub(crate) name: String,
     pub(crate) takes_state: bool,
+    pub(crate) is_async: bool,
     pub(crate) inputs: Vec<Input>,
     pub(crate) results: Results,
     /// It returns a `Result`.
@@ -38,7 +39,7 @@ pub(crate) struct Function {
 
 /// What a function is called with.
 pub(crate) enum Input {
-    /// What tells about the call.
+    /// What tells about the call, or lends an `async fn` the state.
     Call(Call),
     Variable(Ident, Variable),
     /// A struct whose fields are the arguments.
@@ -47,6 +48,8 @@ pub(crate) enum Input {
 
 /// What an argument that tells about the call says of it.
 pub(crate) struct Call {
+    /// It lends the state, and tells nothing.
+    pub(crate) is_state: bool,
     /// The traits behind `impl`, for a state of the type `T`.
     pub(crate) bounds: TokenStream,
     /// The first and the second type of `TypedCall<Left, Blocked>`: the progress, and the values of failures.
@@ -118,9 +121,6 @@ impl Interface {
 impl Function {
     fn read(item: &mut TraitItemFn) -> Result<Self> {
         let signature = &mut item.sig;
-        if let Some(word) = &signature.asyncness {
-            return Err(Error::new_spanned(word, "a function of an interface is not `async`: its clients are"));
-        }
         if !signature.generics.params.is_empty() {
             return Err(Error::new_spanned(&signature.generics, "a function of an interface has no generics"));
         }
@@ -139,6 +139,7 @@ impl Function {
                 _ => set(&mut help, text(&attribute)?.value(), &attribute)?,
             }
         }
+        let is_async = signature.asyncness.is_some();
         let mut takes_state = false;
         let mut inputs = Vec::new();
         for input in &mut signature.inputs {
@@ -148,6 +149,10 @@ impl Function {
                         receiver,
                         "a function of an interface takes `&mut self`, `&self`, or no self at all",
                     ));
+                }
+                FnArg::Receiver(receiver) if is_async => {
+                    let wrong = "an `async fn` has the state for moments only: take `state: &impl AsyncState<Self>`";
+                    return Err(Error::new_spanned(receiver, wrong));
                 }
                 FnArg::Receiver(_) => takes_state = true,
                 FnArg::Typed(argument) => inputs.push(Input::read(&argument.pat, &argument.ty, &mut argument.attrs)?),
@@ -161,19 +166,26 @@ impl Function {
         let (results, can_fail) = read_results(&signature.output, returns)?;
         let help = help.unwrap_or_else(|| first_line(&item.attrs));
         let name = name.unwrap_or_else(|| plain(&ident));
-        let function = Self { ident, name, takes_state, inputs, results, can_fail, attributes, help };
+        let function = Self { ident, name, takes_state, is_async, inputs, results, can_fail, attributes, help };
         function.check(span)?;
+        make_future(item);
         Ok(function)
     }
 
     /// What holds between its attributes and the rest.
     fn check(&self, span: Span) -> Result<()> {
         let Attributes { priority, lease, actuator, stop, reset, .. } = &self.attributes;
-        if let (Some(priority), true) =
-            (priority.as_ref().filter(|priority| *priority == "emergency"), self.takes_state)
-        {
+        let emergency = priority.as_ref().filter(|priority| *priority == "emergency");
+        if let (Some(priority), true) = (emergency, self.takes_state) {
             let wrong = "an emergency service waits for nothing, and so does not get the state: take no self";
             return Err(Error::new(priority.span(), wrong));
+        }
+        if let (Some(priority), true) = (emergency, self.is_async) {
+            let wrong = "an emergency service waits for nothing, and so is no `async fn`";
+            return Err(Error::new(priority.span(), wrong));
+        }
+        if !self.is_async && self.inputs.iter().any(|input| matches!(input, Input::Call(call) if call.is_state)) {
+            return Err(Error::new(span, "an `async fn` alone takes the state so: take `&mut self`"));
         }
         if let (Some(lease), None) = (lease, actuator) {
             return Err(Error::new(lease.span(), "a lease is of what moves: name it with #[actuator(drive)]"));
@@ -218,8 +230,8 @@ impl Function {
     /// What the argument says that tells about the call.
     pub(crate) fn call(&self) -> Option<&Call> {
         self.inputs.iter().find_map(|input| match input {
-            Input::Call(call) => Some(call),
-            Input::Variable(..) | Input::Struct(..) => None,
+            Input::Call(call) if !call.is_state => Some(call),
+            Input::Call(_) | Input::Variable(..) | Input::Struct(..) => None,
         })
     }
 
@@ -258,9 +270,10 @@ impl Input {
         if let Type::Reference(reference) = rust
             && let Type::ImplTrait(call) = &*reference.elem
         {
+            let is_state = call.bounds.iter().any(lends_state);
             let told = call.bounds.iter().flat_map(types_of).collect();
             let bounds = call.bounds.to_token_stream().into_iter().map(of_state).collect();
-            return Ok(Self::Call(Call { bounds, told }));
+            return Ok(Self::Call(Call { is_state, bounds, told }));
         }
         let is_struct = extract(attributes, &["variables"]);
         let mut said = OfVariable::take(attributes)?;
@@ -271,6 +284,38 @@ impl Input {
         let name = said.name_or(&pattern.ident);
         Ok(Self::Variable(pattern.ident.clone(), Variable::new(name, rust.clone(), said)?))
     }
+}
+
+/// An `async fn` as any executor can run it: its future is `Send`, and so is what it borrows. What implements the trait writes
+/// `async fn`, and `&impl AnyCall` as the trait does.
+fn make_future(item: &mut TraitItemFn) {
+    let signature = &mut item.sig;
+    let Some(word) = signature.asyncness.take() else { return };
+    for input in &mut signature.inputs {
+        if let FnArg::Typed(argument) = input
+            && let Type::Reference(reference) = &mut *argument.ty
+            && let Type::ImplTrait(call) = &*reference.elem
+            && !call.bounds.iter().any(lends_state)
+        {
+            let bounds = &call.bounds;
+            *reference.elem = syn::parse_quote!((impl #bounds + ::core::marker::Sync));
+        }
+    }
+    let rust = match &signature.output {
+        ReturnType::Default => syn::parse_quote!(()),
+        ReturnType::Type(_, rust) => (**rust).clone(),
+    };
+    let future = quote_spanned!(word.span() => impl ::core::future::Future<Output = #rust> + ::core::marker::Send);
+    signature.output = syn::parse_quote!(-> #future);
+    if let Some(body) = &item.default {
+        item.default = Some(syn::parse_quote!({ async move #body }));
+    }
+}
+
+/// Of the bound `AsyncState<Self>`.
+fn lends_state(bound: &TypeParamBound) -> bool {
+    let TypeParamBound::Trait(bound) = bound else { return false };
+    bound.path.segments.last().is_some_and(|last| last.ident == "AsyncState")
 }
 
 /// What implements the trait is `Self` there, and `T` in the server's functions.

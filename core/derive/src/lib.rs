@@ -60,6 +60,15 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// `call: &impl TypedCall<Left, Blocked>` declares also what calls tell while they run, and the values of their failures: structs that
 /// derive `Variables`, or `()` for nothing. Clients have `watch_go_to` beside `go_to` then: it hands each `Left` to a closure, and
 /// fails with a `Failed<Blocked>`. It needs the feature `details` of the core, which Linux has always.
+///
+/// | a function | has the state |
+/// |---|---|
+/// | `fn go_to(&mut self, …)`, `fn pos_info(&self)` | while it runs, one such call at a time |
+/// | `fn stop()` | never, as an emergency service |
+/// | `async fn fetch(state: &impl AsyncState<Self>, …)` | in `state.with(\|agv\| …).await?`, and not while it waits; on Linux, with the feature `async` |
+///
+/// An `async fn` becomes a `fn` that returns a future which is `Send`, so that any executor can run it; what implements the trait writes
+/// `async fn`. Attributes, `call` and clients are as of any other function.
 #[proc_macro_attribute]
 pub fn interface(attribute: TokenStream, input: TokenStream) -> TokenStream {
     interface::expand(attribute.into(), input.into(), &quote!(::cara_core)).into()

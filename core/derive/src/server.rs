@@ -23,6 +23,8 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         let bounds = &call.bounds;
         quote!(F::Call: #bounds,)
     });
+    let list =
+        if functions.iter().any(|function| function.is_async) { quote!(AsyncFunctions) } else { quote!(Functions) };
     let debug = if actuators.is_empty() { quote!() } else { quote!(<A>) };
     let text = server.to_string();
     let serving = functions.iter().map(|function| serve(interface, function, root));
@@ -36,16 +38,14 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
             Some(actuator) => quote!(::core::option::Option::Some(&self.#actuator)),
             None => quote!(::core::option::Option::None),
         };
-        let add = format_ident!("{}", if function.takes_state { "add_method" } else { "add_free" });
-        quote! {
-            #typed::Functions::<T>::#add(
-                functions,
-                #holder::#signature,
-                #holder::#attributes,
-                #actuator,
-                &#holder::#serve::<T, F::Call>,
-            )?;
-        }
+        let (add, run) = match (function.is_async, function.takes_state) {
+            (true, _) => {
+                (quote!(AsyncFunctions::<T>::add_task), quote!(#holder::#serve::<T, F::Call, F::State, F::Room>))
+            }
+            (false, true) => (quote!(Functions::<T>::add_method), quote!(&#holder::#serve::<T, F::Call>)),
+            (false, false) => (quote!(Functions::<T>::add_free), quote!(&#holder::#serve::<T, F::Call>)),
+        };
+        quote!(#typed::#add(functions, #holder::#signature, #holder::#attributes, #actuator, #run)?;)
     });
     quote! {
         #[doc = #about]
@@ -65,7 +65,7 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         impl<T, F> #typed::Interface<T, F> for #of_port
         where
             T: #name + 'static,
-            F: #typed::Functions<T> + ?::core::marker::Sized,
+            F: #typed::#list<T> + ?::core::marker::Sized,
             #(#bounds)*
         {
             fn add_to(self, functions: &F) -> ::core::result::Result<(), #parts::Error> {
@@ -79,11 +79,63 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
 fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> TokenStream {
     let (name, ident, serve) = (&interface.item.ident, &function.ident, format_ident!("serve_{}", function.ident));
     let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
+    let (reads, passed) = arguments(function, root);
+    let bounds = function.call().map(|call| {
+        let bounds = &call.bounds;
+        quote!(+ #bounds)
+    });
+    let question = function.can_fail.then(|| quote!(?));
+    let writes = write_results(function, root);
+    if function.is_async {
+        return quote! {
+            #[allow(unused_variables, clippy::unit_arg, clippy::let_unit_value)]
+            async fn #serve<T: #name, C, S, R>(
+                call: C,
+                state: S,
+                mut room: R,
+            ) -> ::core::result::Result<R, #parts::ServiceError>
+            where
+                C: #typed::AnyCall + ::core::marker::Sync #bounds,
+                S: #typed::AsyncState<T>,
+                R: ::core::ops::DerefMut<Target = #parts::ParametersView>,
+            {
+                let parameters: &mut #parts::ParametersView = &mut room;
+                #(#reads)*
+                let results = <T as #name>::#ident(#(#passed),*).await #question;
+                #writes
+                ::core::result::Result::Ok(room)
+            }
+        };
+    }
+    let (state, receiver) = match function.takes_state {
+        true => (quote!(state: &mut T,), quote!(state,)),
+        false => (quote!(), quote!()),
+    };
+    quote! {
+        #[allow(unused_variables, clippy::unit_arg, clippy::let_unit_value)]
+        fn #serve<T: #name, C: #typed::AnyCall #bounds>(
+            #state
+            call: &C,
+            parameters: &mut #parts::ParametersView,
+        ) -> ::core::result::Result<(), #parts::ServiceError> {
+            #(#reads)*
+            let results = <T as #name>::#ident(#receiver #(#passed),*)#question;
+            #writes
+            ::core::result::Result::Ok(())
+        }
+    }
+}
+
+/// How the arguments are read, and what the function is called with.
+fn arguments(function: &Function, root: &TokenStream) -> (Vec<TokenStream>, Vec<TokenStream>) {
+    let typed = quote!(#root::typed);
     let mut place = 0;
     let mut reads = Vec::new();
     let mut passed = Vec::new();
     for input in &function.inputs {
         match input {
+            Input::Call(call) if call.is_state => passed.push(quote!(&state)),
+            Input::Call(_) if function.is_async => passed.push(quote!(&call)),
             Input::Call(_) => passed.push(quote!(call)),
             Input::Variable(argument, variable) => {
                 let read = variable.argument(root, place);
@@ -102,29 +154,7 @@ fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> Toke
             }
         }
     }
-    let (state, receiver) = match function.takes_state {
-        true => (quote!(state: &mut T,), quote!(state,)),
-        false => (quote!(), quote!()),
-    };
-    let bounds = function.call().map(|call| {
-        let bounds = &call.bounds;
-        quote!(+ #bounds)
-    });
-    let question = function.can_fail.then(|| quote!(?));
-    let writes = write_results(function, root);
-    quote! {
-        #[allow(unused_variables, clippy::unit_arg, clippy::let_unit_value)]
-        fn #serve<T: #name, C: #typed::AnyCall #bounds>(
-            #state
-            call: &C,
-            parameters: &mut #parts::ParametersView,
-        ) -> ::core::result::Result<(), #parts::ServiceError> {
-            #(#reads)*
-            let results = <T as #name>::#ident(#receiver #(#passed),*)#question;
-            #writes
-            ::core::result::Result::Ok(())
-        }
-    }
+    (reads, passed)
 }
 
 /// Sets the results in the places that they have in a view made from the signature.

@@ -116,6 +116,23 @@ pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
 #[cfg(feature = "details")]
 impl<C: AnyCall, P: Variables, F: Variables> TypedCall<P, F> for C {}
 
+/// The state of a unit, for an `async fn` of an interface: an argument `state: &impl AsyncState<Self>` is no variable, but this.
+/// Between two uses of it others have the state. An error, once the unit has stopped.
+pub trait AsyncState<T: ?Sized>: Send + Sync {
+    /// Runs `act` with the state when its turn comes, as a method has it. `act` itself must not wait. Dropped before its turn, it
+    /// gives the turn up.
+    fn with<R: Send>(
+        &self,
+        act: impl FnOnce(&mut T) -> R + Send,
+    ) -> impl Future<Output = Result<R, ServiceError>> + Send;
+
+    /// As [`with`](Self::with), unless the call's order has ended: see [`AnyCall::commit`].
+    fn commit<R: Send>(
+        &self,
+        change: impl FnOnce(&mut T) -> R + Send,
+    ) -> impl Future<Output = Result<R, ServiceError>> + Send;
+}
+
 /// A service with the application's state.
 pub type Method<T, C> = dyn Fn(&mut T, &C, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 /// A service without it, as one of the emergency class is.
@@ -146,6 +163,31 @@ pub trait Functions<T: 'static> {
         actuator: Option<&Self::Actuator>,
         run: &'static Free<Self::Call>,
     ) -> Result<(), Error>;
+}
+
+/// A port's list whose services may be futures. Such a service gets its call, the state and its variables to keep, and what it
+/// returns are its results where its arguments were.
+#[diagnostic::on_unimplemented(
+    message = "`{Self}` takes no service that is an `async fn`",
+    label = "this interface has an `async fn`",
+    note = "an `async fn` is served on Linux, with the feature `async` of `cara-std`; its clients work on any port"
+)]
+pub trait AsyncFunctions<T: 'static>: Functions<T, Call: Send + Sync> {
+    /// What lends its services the state.
+    type State: AsyncState<T> + 'static;
+    /// What holds the variables of a call.
+    type Room: DerefMut<Target = ParametersView> + Send + 'static;
+
+    /// As [`add_free`](Functions::add_free), for a service that is a future.
+    fn add_task<W>(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Self::Actuator>,
+        run: fn(Self::Call, Self::State, Self::Room) -> W,
+    ) -> Result<(), Error>
+    where
+        W: Future<Output = Result<Self::Room, ServiceError>> + Send + 'static;
 }
 
 /// The server that `#[interface]` makes: all functions of the trait, for a unit whose state implements it.

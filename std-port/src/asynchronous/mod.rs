@@ -26,7 +26,57 @@
 //! Dropping the last handle of a unit that runs stops it, and waits for its threads: [`Handle::stop_async`] before does not.
 //!
 //! Services may be `async` as well: [`MyFunctionList::add_service`](crate::MyFunctionList::add_service) takes them, and
-//! [`Handle::run_services_on`] tells which executor runs them.
+//! [`Handle::run_services_on`] tells which executor runs them. So may functions of an interface be, which get the
+//! state for moments, and not while they wait:
+//!
+//! ```no_run
+//! use std::time::Duration;
+//!
+//! use cara_std::{AsyncState, ServiceError, TypedCall, Unit, Variables, interface};
+//!
+//! #[derive(Variables)]
+//! struct Charged { percent: f32 }
+//!
+//! #[interface]
+//! trait Charger {
+//!     async fn charge(
+//!         state: &impl AsyncState<Self>,
+//!         call: &impl TypedCall<Charged>,
+//!         percent: f32,
+//!     ) -> Result<(), ServiceError>;
+//! }
+//!
+//! struct Agv { battery: f32 }
+//!
+//! impl Charger for Agv {
+//!     async fn charge(
+//!         state: &impl AsyncState<Self>,
+//!         call: &impl TypedCall<Charged>,
+//!         percent: f32,
+//!     ) -> Result<(), ServiceError> {
+//!         loop {
+//!             let charged = state.with(|agv| agv.battery).await?;
+//!             if charged >= percent {
+//!                 return Ok(());
+//!             }
+//!             call.progress(&Charged { percent: charged })?;
+//!             tokio::time::sleep(Duration::from_secs(1)).await;
+//!         }
+//!     }
+//! }
+//!
+//! # async fn serve() -> Result<(), cara_std::BuildError> {
+//! let agv = Unit::builder("agv", 7, "depot", 1)?.state(Agv { battery: 20.0 }).build()?;
+//! let runtime = tokio::runtime::Handle::current();
+//! agv.run_services_on(move |task| drop(runtime.spawn(task)));
+//! agv.my_function_list().serve(ChargerServer)?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! When nothing wants such a call any more, it is dropped at its next `await`, as without
+//! [`ServiceOptions::runs_to_its_end`](crate::ServiceOptions::runs_to_its_end). With a lease it changes what moves by
+//! `state.commit`, which does nothing once the call's order has ended. What it asks of `call` it asks outside of `with`.
 //!
 //! A call that has to wait for the minimum interval, or for room, does so within its deadline. A method that holds the
 //! application's state and waits for such a call, as in `block_on`, counts as waiting for its peer: the peer's calls that
@@ -71,4 +121,4 @@ pub(crate) use events::EventQueue;
 pub use events::{EventStream, EventsLost};
 pub use reply::PendingReply;
 pub use samples::SampleStream;
-pub use services::CallGivenUp;
+pub use services::{CallGivenUp, StateOfTasks};

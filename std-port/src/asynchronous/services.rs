@@ -4,16 +4,20 @@ use std::fmt;
 use std::future::Future;
 use std::marker::PhantomData;
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::task::{Context, Poll};
 
+use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
+use cara_core::typed::{AsyncFunctions, AsyncState};
 
-use crate::engine::{GivenUp, Spawned};
+use crate::actuator::Actuator;
+use crate::engine::{Engine, GivenUp, Spawned};
 use crate::growing::HandlerParameters;
 use crate::handle::Handle;
 use crate::handler::{Call, IntoHandler, Run, RunOf, ServiceOptions};
+use crate::my_function_list::MyFunctionList;
 
 impl<T: Send + 'static, R> Handle<T, R> {
     /// Has handlers that are futures run by an executor of the application, from here on. `spawn` is called by threads of the
@@ -68,6 +72,52 @@ impl Future for CallGivenUp {
 
     fn poll(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
         self.0.as_ref().map_or(Poll::Pending, |given_up| given_up.poll(cx))
+    }
+}
+
+/// Lends an `async fn` of an interface the unit's state. It does not keep the unit running.
+pub struct StateOfTasks<T: Send + 'static> {
+    engine: Weak<Engine<T>>,
+    call: Call,
+}
+
+impl<T: Send + 'static> fmt::Debug for StateOfTasks<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("StateOfTasks").field("call", &self.call).finish_non_exhaustive()
+    }
+}
+
+impl<T: Send + 'static> AsyncState<T> for StateOfTasks<T> {
+    async fn with<R: Send>(&self, act: impl FnOnce(&mut T) -> R + Send) -> Result<R, ServiceError> {
+        let engine = self.engine.upgrade().ok_or(ServiceError::NotReady)?;
+        Ok(engine.with_state_awaited(act).await?)
+    }
+
+    async fn commit<R: Send>(&self, change: impl FnOnce(&mut T) -> R + Send) -> Result<R, ServiceError> {
+        Ok(self.with(|state| self.call.commit(|| change(state))).await??)
+    }
+}
+
+impl<T: Send + 'static> AsyncFunctions<T> for MyFunctionList<'_, T> {
+    type State = StateOfTasks<T>;
+    type Room = Box<ParametersView>;
+
+    fn add_task<W>(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Actuator>,
+        run: fn(Call, StateOfTasks<T>, Box<ParametersView>) -> W,
+    ) -> Result<(), Error>
+    where
+        W: Future<Output = Result<Box<ParametersView>, ServiceError>> + Send + 'static,
+    {
+        let engine = Arc::downgrade(self.engine);
+        let run = move |call: Call, room: Box<ParametersView>| {
+            let state = StateOfTasks { engine: engine.clone(), call: call.clone() };
+            run(call, state, room)
+        };
+        self.add(signature, attributes, actuator, run)
     }
 }
 

@@ -10,8 +10,8 @@ use cara_core::services::heart::Renew;
 use cara_core::services::lease::Lease;
 use cara_core::time::Duration;
 use cara_embassy::{
-    Actuator, AnyCall, CallError, Config, Handle, Handler, Limits, ServiceOptions, TypedCall, Variables, interface,
-    resources,
+    Actuator, AnyCall, AsyncState, CallError, Config, Handle, Handler, Limits, ServiceOptions, TypedCall, Variables,
+    interface, resources,
 };
 use cara_embassy_host::{Bench, Board, keys};
 
@@ -62,6 +62,16 @@ trait Lift {
     fn load(&mut self) -> Load;
 
     fn tilt(&mut self, call: &impl TypedCall<Left, TooHeavy>, degrees: u8) -> Result<(), ServiceError>;
+}
+
+/// How a program for Linux would serve `tilt`.
+#[interface]
+trait Tilt {
+    async fn tilt(
+        state: &impl AsyncState<Self>,
+        call: &impl TypedCall<Left, TooHeavy>,
+        degrees: u8,
+    ) -> Result<(), ServiceError>;
 }
 
 impl Lift for Fork {
@@ -189,5 +199,9 @@ fn a_typed_failure_comes_with_its_text_and_its_values() {
         assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(3))));
         assert_eq!((failed.text.as_str(), failed.values), ("it is too heavy", Some(TooHeavy { kilograms: 900 })));
         assert_eq!(client.watch_tilt(5, |_| ControlFlow::Continue(())).await, Ok(()));
+        let client = TiltAsyncClient::at(&peer);
+        assert_eq!(client.tilt(5).await, Ok(()));
+        let failed = client.watch_tilt(6, |_| unreachable!("nothing is told")).await.unwrap_err();
+        assert_eq!(failed.values, Some(TooHeavy { kilograms: 900 }));
     });
 }

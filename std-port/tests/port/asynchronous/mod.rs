@@ -4,6 +4,7 @@ mod details;
 mod services;
 mod starving;
 mod streams;
+mod typed;
 mod waiting;
 
 use std::future::Future;

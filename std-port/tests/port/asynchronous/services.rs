@@ -44,7 +44,7 @@ impl Drop for Inside {
     }
 }
 
-fn run_on(agv: &Unit, runtime: &tokio::runtime::Runtime) {
+pub(super) fn run_on<T: Send + 'static>(agv: &Unit<T>, runtime: &tokio::runtime::Runtime) {
     let runtime = runtime.handle().clone();
     agv.run_services_on(move |task| drop(runtime.spawn(task)));
 }
