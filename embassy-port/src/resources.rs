@@ -39,6 +39,8 @@ use crate::time::now;
 const KNOWN: usize = 2;
 /// Bytes of signatures for each function; a list shares them.
 const SIGNATURE: usize = 64;
+/// The same of the unit's own functions, which have help where it is sent.
+const OWN_SIGNATURE: usize = if cfg!(feature = "help") { 192 } else { SIGNATURE };
 /// Events that wait for the application.
 const EVENTS: usize = 6;
 /// Refusals that are remembered.
@@ -77,7 +79,7 @@ pub struct Resources<
     node_links: MaybeUninit<[Option<u16>; LINKS]>,
     findings: MaybeUninit<[Option<Finding<SocketAddrV4>>; FINDINGS]>,
     functions: MaybeUninit<[Entry<Listed<T>>; OWN]>,
-    signatures: MaybeUninit<[[u8; SIGNATURE]; OWN]>,
+    signatures: MaybeUninit<[[u8; OWN_SIGNATURE]; OWN]>,
     to_all: MaybeUninit<[bool; OWN]>,
     to_one: MaybeUninit<[[Option<PublishedToOne>; OWN]; LINKS]>,
     buffers: MaybeUninit<[[u8; BUFFER]; BUFFERS]>,
@@ -267,7 +269,7 @@ impl<
                 keep_term: config.keep_term,
                 functions: FunctionList::new(
                     self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
-                    self.signatures.write([[0; SIGNATURE]; OWN]).as_flattened_mut(),
+                    self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
                 ),
                 pool: Pool::new(&mut pool[..]),
                 links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),

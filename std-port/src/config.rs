@@ -12,7 +12,7 @@ pub struct Capacities {
     pub published_to_one: usize,
     /// Functions kept of each peer's list.
     pub their_functions: usize,
-    /// Bytes for their signatures, per peer.
+    /// Bytes for their signatures, per peer. Help on functions is kept in the first half of them.
     pub their_signature_bytes: usize,
     /// Blocking calls in flight to one peer.
     pub calls_in_flight: usize,
@@ -31,7 +31,7 @@ impl Default for Capacities {
             signature_bytes: 8 * 1024,
             published_to_one: 1024,
             their_functions: 48,
-            their_signature_bytes: 4 * 1024,
+            their_signature_bytes: 8 * 1024,
             calls_in_flight: 64,
             calls_running: 16,
             pending_links: 64,

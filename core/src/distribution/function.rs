@@ -250,7 +250,7 @@ impl<'a> Signature<'a> {
         Self { bytes: self.bytes.get(..length).unwrap_or(self.bytes) }
     }
 
-    #[cfg(feature = "details")]
+    #[cfg(any(feature = "details", feature = "help"))]
     pub(super) fn section(&self, wanted: u8) -> VariableSpecs<'a> {
         let mut rest = self.results().behind();
         while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {

@@ -165,7 +165,8 @@ impl<S: Storage> TheirFunctionList<S> {
         Self { table: Table::new(entries, bytes), only: None, skipped: 0, most: (0, 0) }
     }
 
-    /// Lets it grow to so many functions, and so many bytes of signatures, where the storage has an allocator.
+    /// Lets it grow to so many functions, and so many bytes of signatures, where the storage has an allocator. It keeps help on
+    /// functions then, in the first half of these bytes.
     pub const fn let_grow(&mut self, functions: usize, bytes: usize) {
         self.most = (functions, bytes);
     }
@@ -203,11 +204,11 @@ impl<S: Storage> TheirFunctionList<S> {
             self.skipped = self.skipped.saturating_add(1);
             return Ok(());
         }
-        let mut put = self.put(slot, generation, attributes, signature.as_bytes());
-        if cfg!(feature = "help") && put.is_err() {
-            // Rather the function without its help than none.
-            put = self.put(slot, generation, attributes, signature.without_help().as_bytes());
-        }
+        // Help leaves half of the room to functions, so that none is skipped for it.
+        let with_help = self.table.used_bytes().saturating_add(signature.as_bytes().len());
+        let has_room = cfg!(feature = "help") && with_help <= self.most.1.div_ceil(2);
+        let kept = if has_room { signature } else { signature.without_help() };
+        let put = self.put(slot, generation, attributes, kept.as_bytes());
         if put.is_err() {
             self.skipped = self.skipped.saturating_add(1);
         }

@@ -5,7 +5,7 @@
 //! name of its variable and a blank, as `position m`.
 
 #[cfg(feature = "help")]
-use super::function::{Definition, Signature, VariableSpec};
+use super::function::{Definition, Signature, VariableSpec, VariableSpecs};
 use super::parameters::Type;
 #[cfg(feature = "help")]
 use crate::config::{HELP_BYTES, UNIT_BYTES};
@@ -55,8 +55,12 @@ impl Definition {
     /// unit already.
     pub fn unit(self, variable: &str, unit: &str) -> Result<Self, Error> {
         let signature = self.signature();
-        let all = [signature.arguments(), signature.results(), signature.progress(), signature.failure()];
-        if all.into_iter().all(|specs| specs.named(variable).is_none()) {
+        let has = |specs: VariableSpecs<'_>| specs.named(variable).is_some();
+        #[cfg(feature = "details")]
+        let is_told = has(signature.progress()) || has(signature.failure());
+        #[cfg(not(feature = "details"))]
+        let is_told = false;
+        if !is_told && !has(signature.arguments()) && !has(signature.results()) {
             return Err(Error::UnknownVariable);
         }
         if signature.unit_of(variable).is_some() {

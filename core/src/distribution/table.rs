@@ -145,6 +145,10 @@ impl<S: Storage, H: 'static> Table<S, H> {
         }
     }
 
+    pub(super) const fn used_bytes(&self) -> usize {
+        self.used
+    }
+
     pub(super) fn free_bytes(&self) -> usize {
         self.bytes.len().saturating_sub(self.used)
     }

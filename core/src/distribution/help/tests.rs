@@ -33,22 +33,28 @@ fn what_is_too_long_is_cut_between_two_characters() {
 fn a_signature_without_room_stays_as_it_was() {
     let most = (SIGNATURE_BYTES - 40) / 38;
     let names = |from, to| (from..to).map(|at| format!("{at:0>32}: bool")).collect::<Vec<_>>().join(", ");
-    let (arguments, progress) = (names(0, most.min(16)), names(16, most.max(16)));
-    let progress = if progress.is_empty() { progress } else { format!(" progress ({progress})") };
-    let full = Definition::parse(&format!("f({arguments}){progress}")).unwrap();
+    // A result with the name of an argument is the same variable.
+    let (arguments, results) = (names(0, most.min(16)), names(0, most.saturating_sub(16)));
+    let full = Definition::parse(&format!("f({arguments}) -> ({results})")).unwrap();
     assert_eq!(full.help(&"a".repeat(HELP_BYTES)), Err(Error::Full(Limit::SignatureBytes)));
 }
 
-/// A list with room for the function alone keeps it; one with more keeps the help as well.
+/// Half of the room is for signatures alone, so that help keeps no function away.
 #[test]
-fn a_function_is_rather_kept_without_its_help_than_not() {
-    let lift = lift().help("Lifts the fork.").unwrap();
-    let bare = lift.signature().without_help();
-    for (room, kept) in [(bare.as_bytes().len(), ""), (lift.as_bytes().len(), "Lifts the fork.")] {
-        let mut list = TheirFunctionList::<Boxed>::new([Entry::empty()].into(), std::vec![0; room].into());
-        list.insert(Slot(0), Generation(0), Attributes::default(), lift.as_bytes()).unwrap();
-        assert_eq!((list.named("lift_to").unwrap().signature.help(), list.skipped()), (kept, 0));
+fn a_list_keeps_help_in_the_first_half_of_its_room() {
+    let named = |name: &str| Definition::parse(&format!("{name}(height: float)")).unwrap().help("Lifts.").unwrap();
+    let length = named("a").as_bytes().len();
+    let mut list = TheirFunctionList::<Boxed>::new([].into(), [].into());
+    list.let_grow(3, 4 * length);
+    for (slot, name) in ["a", "b", "c"].into_iter().enumerate() {
+        list.insert(Slot(slot as u16), Generation(0), Attributes::default(), named(name).as_bytes()).unwrap();
     }
+    let kept: Vec<_> = list.iter().map(|function| function.signature.help()).collect();
+    assert_eq!((kept, list.skipped()), (std::vec!["Lifts.", "Lifts.", ""], 0));
+    // One that does not grow, as on a board, has no use for it.
+    let mut fixed = TheirFunctionList::<Boxed>::new([Entry::empty()].into(), std::vec![0; 4 * length].into());
+    fixed.insert(Slot(0), Generation(0), Attributes::default(), named("a").as_bytes()).unwrap();
+    assert_eq!(fixed.named("a").unwrap().signature.help(), "");
 }
 
 #[test]
