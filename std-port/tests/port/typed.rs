@@ -129,9 +129,15 @@ trait Drive {
     #[idempotent]
     fn state(&self) -> State;
 
+    /// Drives there.
     #[actuator(motor)]
     #[lease(ms = 60_000)]
-    fn go_to(&mut self, call: &impl AnyCall, position: [i64; 2], speed: u8) -> Result<(), ServiceError>;
+    fn go_to(
+        &mut self,
+        call: &impl AnyCall,
+        #[unit = "mm"] position: [i64; 2],
+        speed: u8,
+    ) -> Result<(), ServiceError>;
 
     #[priority(emergency)]
     #[actuator(motor)]
@@ -215,6 +221,9 @@ fn typed_and_dynamic_ends_understand_each_other() {
     agv.my_function_list().serve(DriveServer { motor }).unwrap();
     let (peer, _) = meet(&manager, &agv);
     assert!(agv.my_function_list().show_functions().contains("go_to(position: int[2], speed: int)\n"));
+    let go_to = peer.function("go_to").unwrap().definition;
+    let (help, units) = (go_to.signature().help(), go_to.signature().units());
+    assert_eq!((help, units.collect::<Vec<_>>()), ("Drives there.", vec![("position", "mm")]));
     let halt = peer.function("halt").unwrap();
     assert!(halt.attributes.stop && halt.attributes.priority == Priority::Emergency);
     let mut call = Parameters::new();
