@@ -8,9 +8,10 @@
 //!   do, because a list of the host's processes shows arguments;
 //! - `boots=PATH`: the file of the host that stands for the two pages of flash of the board's boot counter and its
 //!   term;
-//! - `at=X,Y`: the cell in which a vehicle of the warehouse stands;
+//! - `at=X,Y`, of the image with the feature `warehouse`: the cell in which its vehicle stands;
 //! - `seed=N` replaces the hardware's noise, for tests in which each boot has the same.
 
+#[cfg(feature = "warehouse")]
 use cara_apps::warehouse::Cell;
 use cara_settings::{Settings, TextError};
 #[cfg(not(feature = "secure"))]
@@ -29,6 +30,7 @@ pub struct Told {
     /// The settings.
     pub settings: Settings,
     /// Where a vehicle of the warehouse stands.
+    #[cfg(feature = "warehouse")]
     pub at: Option<Cell>,
     /// What makes random numbers differ.
     pub noise: u64,
@@ -63,6 +65,7 @@ impl ArgumentError {
 struct Words {
     text: Vec<u8, WORDS>,
     seed: Option<u64>,
+    #[cfg(feature = "warehouse")]
     at: Option<Cell>,
     file: Path,
     boots: Path,
@@ -75,6 +78,7 @@ impl Words {
     fn add(&mut self, word: &str) -> Result<(), ()> {
         match word.split_once('=') {
             Some(("seed", number)) => self.seed = Some(number.parse().map_err(drop)?),
+            #[cfg(feature = "warehouse")]
             Some(("at", cell)) => self.at = Some(cell.parse()?),
             Some(("file", path)) => self.file = String::try_from(path).map_err(drop)?,
             Some(("boots", path)) => self.boots = String::try_from(path).map_err(drop)?,
@@ -100,6 +104,7 @@ pub fn read() -> Result<Told, ArgumentError> {
     let noise = words.seed.unwrap_or_else(clock);
     Ok(Told {
         settings,
+        #[cfg(feature = "warehouse")]
         at: words.at,
         noise,
         #[cfg(feature = "secure")]
