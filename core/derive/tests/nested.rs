@@ -204,8 +204,8 @@ fn a_mismatch_tells_the_way_to_the_difference() {
         assert_eq!(check(ours, theirs), told(way), "{ours} and {theirs}");
     }
     assert_eq!(check("f(a: int[..3]) -> (b: int[..3])", "f(a: int[..2]) -> (b: int[..2])"), None);
-    // Of a longer way the innermost names are left out, and their dots say how deep it is.
-    let long = |kind: &str| format!("f({0}: {{{0}: {{{0}: {{{0}: {{{0}: {kind}}}}}}}}})", "n".repeat(32));
-    let way = format!("argument {}.... is bool there and int here", "n".repeat(32));
+    // A longer way ends at the last name that has room, also where a shorter one is behind it.
+    let long = |kind: &str| format!("f({0}: {{a: {{b{0}: {{c: {kind}}}}}[..2]}})", "n".repeat(31));
+    let way = format!("argument {}.a[] is bool there and int here", "n".repeat(31));
     assert_eq!(check(&long("int"), &long("bool")), told(&way));
 }

@@ -168,14 +168,16 @@ pub(super) fn can_be(one: RawSpec<'_>, other: RawSpec<'_>, bounds: Bounds) -> bo
 /// A type and its size; `None` where there is none.
 type Shape = Option<(Type, u32)>;
 
-/// Where in a variable two units differ: adds the way to it, and returns what each has there.
-pub(super) fn difference(
+/// Where in a variable two units differ: adds the way to it, and returns what each has there. A way without room ends at a
+/// name.
+pub(super) fn difference<const N: usize>(
     ours: Option<VariableSpec<'_>>,
     theirs: Option<VariableSpec<'_>>,
     bounds: Bounds,
-    path: &mut impl fmt::Write,
+    path: &mut heapless::String<N>,
 ) -> (Shape, Shape) {
     let (mut here, mut there) = (ours.map(|spec| spec.raw()), theirs.map(|spec| spec.raw()));
+    let mut has_room = true;
     while let Some((one, other)) = here.zip(there) {
         let (way, next) = if one.kind == Type::List && other.kind == Type::List {
             if bounds == Bounds::Fit && other.size > one.size {
@@ -196,8 +198,12 @@ pub(super) fn difference(
         };
         (here, there) = next;
         let name = here.or(there).map_or(&[][..], |spec| spec.name);
-        // A way is as long as it may be; more of it would be cut off.
-        let _ = write!(path, "{way}{}", core::str::from_utf8(name).unwrap_or_default());
+        // What is behind a name without room is left out as well: it would seem to be in what stands before.
+        let (end, name) = (path.len(), core::str::from_utf8(name).unwrap_or_default());
+        has_room = has_room && path.push_str(way).and_then(|()| path.push_str(name)).is_ok();
+        if !has_room {
+            path.truncate(end);
+        }
         if here.zip(there).is_some_and(|(one, other)| one.name != other.name) {
             there = None;
         }
