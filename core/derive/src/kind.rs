@@ -1,7 +1,8 @@
 //! One variable: its name, its Rust type, and how that is read and set.
 
-use proc_macro2::TokenStream;
-use quote::{ToTokens, quote};
+use proc_macro2::{TokenStream, TokenTree};
+use quote::{ToTokens, quote, quote_spanned};
+use syn::spanned::Spanned;
 use syn::{Error, GenericArgument, LitInt, LitStr, PathArguments, Result, Type};
 
 use crate::attributes::OfVariable;
@@ -114,18 +115,17 @@ impl Variable {
             Kind::Bytes(size) => quote!(#parts::VariableSpec::flat(#name, #parts::Type::Bytes, #size)),
             Kind::List(_, most, element) => {
                 let element = element.spec(root);
-                quote! {
-                    #typed::__list!({
-                        const ELEMENT: #parts::VariableSpec<'static> = #element;
-                        const INNER: [u8; #typed::element_bytes(ELEMENT)] = #typed::element(ELEMENT);
-                        #parts::VariableSpec {
-                            name: #name,
-                            kind: #parts::Type::List,
-                            size: (#most) as u32,
-                            inner: &INNER,
-                        }
-                    })
-                }
+                let spec = quote! {{
+                    const ELEMENT: #parts::VariableSpec<'static> = #element;
+                    const INNER: [u8; #typed::element_bytes(ELEMENT)] = #typed::element(ELEMENT);
+                    #parts::VariableSpec {
+                        name: #name,
+                        kind: #parts::Type::List,
+                        size: (#most) as u32,
+                        inner: &INNER,
+                    }
+                }};
+                self.list(root, &spec)
             }
         }
     }
@@ -205,14 +205,26 @@ impl Variable {
             Kind::Text(_) | Kind::Bytes(_) => quote!(slot.set(&#value[..])),
             Kind::List(_, _, element) => {
                 let write = element.writer(root, &quote!((*element)));
-                quote!(slot.list(|list| {
+                let write = quote!(slot.list(|list| {
                     for element in #value.iter() {
                         list.push_with(|slot| #write)?;
                     }
                     ::core::result::Result::Ok(())
-                }))
+                }));
+                self.list(root, &write)
             }
         }
+    }
+
+    /// An expression for a list: an error at its type where the core does not have them.
+    fn list(&self, root: &TokenStream, list: &TokenStream) -> TokenStream {
+        let span = self.rust.span();
+        let here = |mut token: TokenTree| {
+            token.set_span(span);
+            token
+        };
+        let root: TokenStream = root.clone().into_iter().map(here).collect();
+        quote_spanned!(span => #root::typed::__list!(#list))
     }
 }
 
