@@ -139,7 +139,8 @@ mod tests {
             actuator: 7,
             stop: true,
             reset: true,
-            ..usual
+            #[cfg(feature = "streams")]
+            stream: usual.stream,
         };
         assert_eq!(all.encode(), [0x1C, 7, 0, 0, 0x34, 0x12, 0, 0]);
         assert_eq!(Attributes::decode(&all.encode()), Ok(all));

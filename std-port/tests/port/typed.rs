@@ -539,6 +539,29 @@ fn an_order_that_a_peer_has_no_room_for_is_refused_before_it_is_sent() {
     agv.stop();
 }
 
+/// The unit could have been built without lists.
+#[test]
+fn an_order_is_not_sent_to_a_function_without_lists() {
+    let fleet = fleet();
+    let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap());
+    let plan = Definition::parse("plan(nodes: string[32]) -> (count: int)").unwrap();
+    let run = |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), ServiceError> { unreachable!() };
+    agv.my_function_list().add_service(&plan, ServiceOptions::new(), run).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let sent = manager.counted(LinkCounter::MessagesSent);
+    let told = PlannedClient::at(&peer).plan(Order::of_50_nodes()).unwrap_err();
+    assert_eq!(
+        told.to_string(),
+        "the peer's plan is of another version: its argument nodes is string[32] there and a list of at most 64 here: update one of the two"
+    );
+    let mut order = Parameters::<100_000>::sized();
+    Order::of_50_nodes().to_parameters(&mut order).unwrap();
+    assert_eq!(peer.block_request("plan", &mut order), Err(Error::WrongType { index: 0 }));
+    assert_eq!(manager.counted(LinkCounter::MessagesSent), sent);
+    manager.stop();
+    agv.stop();
+}
+
 /// Bytes of an order's block, of JSON and of postcard. `docs/notes/typed.md` has them.
 #[test]
 fn an_order_of_50_nodes_takes_so_many_bytes() {

@@ -16,7 +16,9 @@ const DONE: VariableSpec<'static> = spec("done", Type::Bool, 1);
 
 const ARGUMENTS: &[VariableSpec<'static>] = &[TEXT, POSITION];
 const RESULTS: &[VariableSpec<'static>] = &[DONE, POSITION, spec("left", Type::Float, 1)];
+#[cfg(feature = "details")]
 const PROGRESS: &[VariableSpec<'static>] = &[spec("left", Type::Float, 1)];
+#[cfg(feature = "details")]
 const FAILS: &[VariableSpec<'static>] = &[spec("at", Type::Int, 2)];
 const DECLARED: Declared<'static> = declared(ARGUMENTS, RESULTS);
 const BYTES: usize = DECLARED.encoded_bytes("go-to");

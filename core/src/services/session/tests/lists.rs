@@ -4,6 +4,9 @@ use super::super::Event;
 use super::pair::Pair;
 use super::setup::Setup;
 use super::{none, x};
+use crate::config::Priority;
+use crate::distribution::function::Attributes;
+use crate::distribution::message::Control;
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
 
@@ -101,6 +104,50 @@ fn functions_beyond_the_readers_room_are_skipped_and_told() {
     pair.settle();
     assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 2 }));
     assert_eq!(pair.manager.counter(LinkCounter::FunctionsSkipped), 2);
+}
+
+/// `follow(x: int[..8])`, as a unit that has lists publishes it.
+const FOLLOW: &[u8] = b"\x06follow\x01\x05\x01\x08\0\0\0x\0\x01\0\0\0\0";
+
+#[test]
+fn a_function_with_lists_is_skipped_by_a_unit_without_them() {
+    let mut pair = Pair::with_position();
+    let attributes = Attributes::default().encode();
+    let publish = Control::Publish { slot: 1, generation: 0, attributes: &attributes, signature: FOLLOW };
+    for control in [publish, Control::ListEnd { serial: 7 }] {
+        pair.manager.hear_message(control.encode(&mut [0; 128]).unwrap(), Priority::High);
+    }
+    pair.settle();
+    let (skipped, refused) = match cfg!(feature = "nested") {
+        true => (0, Error::WrongType { index: 0 }),
+        false => (1, Error::UnknownFunction),
+    };
+    assert!(pair.agv.has(&Event::Acknowledged { serial: 7, skipped }));
+    assert_eq!(pair.manager.counter(LinkCounter::FunctionsSkipped), skipped.into());
+    assert_eq!(pair.manager.call("follow", &x(1)), Err(refused));
+    assert!(pair.block_request("pos_info", &mut *none()).is_ok(), "the others can be called");
+}
+
+/// One that is too long would end the link.
+#[cfg(feature = "nested")]
+#[test]
+fn a_signature_that_the_reader_has_no_buffer_for_is_skipped() {
+    let long = |count| {
+        let fields: std::vec::Vec<_> = (0..count).map(|index| std::format!("{index:0>32}: int")).collect();
+        std::format!("long(x: {{{}}}[..2])", fields.join(", "))
+    };
+    let manager = crate::config::Constraints { message_size: 256, ..crate::config::Constraints::M_UNIT };
+    let mut pair = Pair::with(&Setup { manager, ..Setup::default() });
+    pair.agv.offer(&long(10), |_| Ok(()));
+    pair.agv.offer(&long(11).replace("long", "longer"), |_| Ok(()));
+    pair.agv.offer("short(x: int)", |_| Ok(()));
+    let serial = pair.agv.publish();
+    pair.settle();
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 1 }));
+    assert_eq!(pair.manager.counter(LinkCounter::FunctionsSkipped), 1);
+    assert_eq!(pair.manager.call("longer", &x(1)), Err(Error::UnknownFunction));
+    assert_eq!(pair.manager.call("long", &x(1)), Err(Error::WrongType { index: 0 }));
+    assert_eq!(pair.block_request("short", &mut *x(1)), Ok(()));
 }
 
 #[test]
