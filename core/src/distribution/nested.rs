@@ -228,7 +228,12 @@ pub(super) fn measure(spec: RawSpec<'_>, value: Value<'_>, index: u8) -> Result<
             return Err(Error::WrongType { index });
         }
         if check(spec, value.bytes).is_none_or(|(_, rest)| !rest.is_empty()) {
-            return Err(Error::WrongSize { index, expected: spec.size, found: value.size });
+            // Of a list that has too many elements their count, and not how many it may have.
+            let found = match split_list(value.bytes) {
+                Some((count, ..)) if spec.kind == Type::List && count > spec.size => count,
+                _ => value.size,
+            };
+            return Err(Error::WrongSize { index, expected: spec.size, found });
         }
     }
     Ok(value.bytes.len())
