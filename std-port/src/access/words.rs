@@ -47,11 +47,13 @@ pub(super) fn who(words: &str) -> Result<Who<String>, NotWho> {
 }
 
 /// The verb of a word.
+#[cfg(feature = "access")]
 pub(super) fn verb(word: &str) -> Option<Verb> {
     VERBS.iter().find(|(known, _)| *known == word).map(|&(_, verb)| verb)
 }
 
 /// A rate, as `10/s`, `5/min` or `1/h`.
+#[cfg(any(feature = "access", test))]
 pub(super) fn rate(words: &str) -> Option<Rate> {
     let (calls, span) = words.split_once('/')?;
     let calls: u32 = calls.trim().parse().ok().filter(|calls| *calls > 0)?;

@@ -4,17 +4,13 @@ use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, RwLock};
 
-use cara_core::error::Error;
-use cara_core::services::access::{Access, Bucket, Decision, Principal, Rate, Verb};
+use cara_core::services::access::{Access, Bucket, Decision, Principal, Verb};
 use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use crate::access::AccessTable;
 use crate::locks::{lock, read, write};
-
-/// Functions of which the operator's use of a rate is remembered, before those are forgotten whose rate is whole again.
-const OPERATOR_BUCKETS: usize = 256;
 
 /// The table in force, and what came of it.
 #[derive(Default)]
@@ -88,50 +84,6 @@ impl Guard {
         }
         due
     }
-
-    fn take(&self, now: Instant, function: &str, rate: Rate) -> Result<(), Error> {
-        let mut buckets = lock(&self.operator);
-        if buckets.len() >= OPERATOR_BUCKETS {
-            buckets.retain(|_, bucket| !bucket.is_full(now));
-        }
-        buckets.entry(function.to_owned()).or_default().take(now, rate)
-    }
-}
-
-#[cfg(feature = "control")]
-impl<T: Send + 'static> Engine<T> {
-    /// Whether the operator may do something; a refusal is counted, and told in the log once a second at most.
-    pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
-        let Some(table) = self.guard.table() else { return Ok(()) };
-        let decision = match table.decide(Principal::Operator, function, verb) {
-            Decision::Allowed { rate: Some(rate), .. } if verb == Verb::Call => {
-                self.guard.take(self.now(), function, rate)
-            }
-            Decision::Allowed { .. } => Ok(()),
-            Decision::Denied => Err(Error::NotAllowed),
-        };
-        decision.inspect_err(|error| {
-            self.guard.operator_refused.fetch_add(1, Ordering::Relaxed);
-            if self.guard.may_log(self.now()) {
-                tracing::warn!(function, ?verb, %error, "the access table does not let the operator do this");
-            }
-        })
-    }
-
-    /// Whether the operator may call a function, whatever its rate.
-    pub(crate) fn operator_may_go_on(&self, function: &str) -> bool {
-        self.operator_has(function, Verb::Call)
-    }
-
-    /// Whether the operator may see a function of another node.
-    pub(crate) fn operator_sees(&self, function: &str) -> bool {
-        self.operator_has(function, Verb::Call) || self.operator_has(function, Verb::List)
-    }
-
-    fn operator_has(&self, function: &str, verb: Verb) -> bool {
-        let table = self.guard.table();
-        table.is_none_or(|table| table.decide(Principal::Operator, function, verb).is_allowed())
-    }
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -155,8 +107,66 @@ impl<T: Send + 'static> Engine<T> {
     }
 }
 
+#[cfg(feature = "control")]
+mod operator {
+    use cara_core::error::Error;
+    use cara_core::services::access::Rate;
+
+    use super::*;
+
+    /// Functions of which the operator's use of a rate is remembered, before those are forgotten whose rate is whole again.
+    const OPERATOR_BUCKETS: usize = 256;
+
+    impl Guard {
+        fn take(&self, now: Instant, function: &str, rate: Rate) -> Result<(), Error> {
+            let mut buckets = lock(&self.operator);
+            if buckets.len() >= OPERATOR_BUCKETS {
+                buckets.retain(|_, bucket| !bucket.is_full(now));
+            }
+            buckets.entry(function.to_owned()).or_default().take(now, rate)
+        }
+    }
+
+    impl<T: Send + 'static> Engine<T> {
+        /// Whether the operator may do something; a refusal is counted, and told in the log once a second at most.
+        pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
+            let Some(table) = self.guard.table() else { return Ok(()) };
+            let decision = match table.decide(Principal::Operator, function, verb) {
+                Decision::Allowed { rate: Some(rate), .. } if verb == Verb::Call => {
+                    self.guard.take(self.now(), function, rate)
+                }
+                Decision::Allowed { .. } => Ok(()),
+                Decision::Denied => Err(Error::NotAllowed),
+            };
+            decision.inspect_err(|error| {
+                self.guard.operator_refused.fetch_add(1, Ordering::Relaxed);
+                if self.guard.may_log(self.now()) {
+                    tracing::warn!(function, ?verb, %error, "the access table does not let the operator do this");
+                }
+            })
+        }
+
+        /// Whether the operator may call a function, whatever its rate.
+        pub(crate) fn operator_may_go_on(&self, function: &str) -> bool {
+            self.operator_has(function, Verb::Call)
+        }
+
+        /// Whether the operator may see a function of another node.
+        pub(crate) fn operator_sees(&self, function: &str) -> bool {
+            self.operator_has(function, Verb::Call) || self.operator_has(function, Verb::List)
+        }
+
+        fn operator_has(&self, function: &str, verb: Verb) -> bool {
+            let table = self.guard.table();
+            table.is_none_or(|table| table.decide(Principal::Operator, function, verb).is_allowed())
+        }
+    }
+}
+
 #[cfg(feature = "access")]
 mod following {
+    use cara_core::error::Error;
+
     use super::*;
     use crate::access::watch::FileWatch;
 

@@ -105,6 +105,7 @@ impl<T: Send + 'static> CallFuture<T> {
     }
 
     /// What a call has started that ended well is not wanted any longer than this.
+    #[cfg(any(feature = "async", feature = "control"))]
     pub(crate) const fn release(&mut self) {
         self.has_succeeded = false;
     }
@@ -119,11 +120,13 @@ impl<T: Send + 'static> CallFuture<T> {
     }
 
     /// Why it failed, where its service has said so and it was watched.
+    #[cfg(any(feature = "async", feature = "control"))]
     pub(crate) const fn take_failure(&mut self) -> Option<Box<Failure>> {
         self.failure.take()
     }
 
     /// The newest that it has told, if it is watched; `None` as well where it has ended. Otherwise the task of `cx` is woken.
+    #[cfg(any(feature = "async", feature = "control"))]
     pub(crate) fn poll_progress(&self, cx: &Context<'_>) -> Poll<Option<Box<ParametersView>>> {
         let mut state = self.link.lock();
         let told = state.details.take_progress(self.id);
