@@ -29,7 +29,7 @@ pub(crate) struct Bench {
     image: PathBuf,
     table: Arc<Table>,
     shows_logs: bool,
-    /// Another image, which draws the same random numbers in each boot.
+    /// Another image, which draws the same random numbers in each boot, and has a service that takes lists.
     constant: Option<PathBuf>,
     /// The board's clock counts instructions.
     counts: bool,
@@ -65,7 +65,7 @@ impl Bench {
         Self { image, table, shows_logs, constant: self.constant.clone(), counts, cables, keys }
     }
 
-    /// Has an image beside whose random numbers are constant.
+    /// Has that image beside.
     pub(crate) fn with_constant(self, constant: Option<PathBuf>) -> Self {
         Self { constant, ..self }
     }

@@ -2,6 +2,7 @@
 
 mod calls;
 mod limits;
+mod lists;
 mod losses;
 mod restarts;
 mod security;
@@ -18,7 +19,7 @@ pub(crate) struct Check {
 }
 
 /// All of them.
-pub(crate) const CHECKS: [Check; 19] = [
+pub(crate) const CHECKS: [Check; 21] = [
     Check { name: "it is found by broadcast and shows its functions", run: calls::found },
     Check { name: "it drives where it is sent, and arrives", run: calls::driven },
     Check { name: "it stops when nobody renews its lease", run: calls::not_renewed },
@@ -28,6 +29,8 @@ pub(crate) const CHECKS: [Check; 19] = [
     Check { name: "a best-effort request is served", run: calls::best_effort },
     Check { name: "it calls the manager's mechanic", run: calls::mechanic },
     Check { name: "of forty functions it keeps what it has room for", run: calls::many_functions },
+    Check { name: "it skips a function with lists that it cannot read", run: lists::unreadable_function },
+    Check { name: "an order of 50 nodes is refused before it is sent", run: lists::large_order },
     Check { name: "a call to a hung board ends in time", run: losses::hung },
     Check { name: "an idle cable is pulled and plugged in again", run: losses::idle_cable },
     Check { name: "a pulled cable stops it, and it returns", run: losses::cable },

@@ -36,7 +36,7 @@ struct Arguments {
     /// The AGV's image.
     #[arg(long)]
     image: PathBuf,
-    /// The same with random numbers that are the same in each life.
+    /// The same with random numbers that are the same in each life, and with a service that takes lists.
     #[arg(long)]
     constant: Option<PathBuf>,
     /// How often the board loses power and comes back.

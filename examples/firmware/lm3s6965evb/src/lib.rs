@@ -16,6 +16,8 @@ pub mod executor;
 pub mod fault;
 #[cfg(feature = "faults")]
 pub mod faults;
+#[cfg(feature = "lists")]
+pub mod lists;
 pub mod motor;
 mod register;
 pub mod reset;

@@ -86,8 +86,8 @@ pub(crate) const WAREHOUSE: Image =
     Image { feature: Some("warehouse"), ..Image::plain("warehouse", "warehouse").secured() };
 /// The AGV of the emulated board with a service that makes it fail.
 pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
-/// The AGV of the emulated board with random numbers that are the same in each life.
-pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random"), ..AGV };
+/// The AGV of the emulated board with random numbers that are the same in each life, and with a service that takes lists.
+pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random,lists"), ..AGV };
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 

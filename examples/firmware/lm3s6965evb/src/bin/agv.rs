@@ -51,6 +51,8 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
     #[cfg(feature = "faults")]
     cara_lm3s6965evb::faults::offer(vehicle).map_err(|_| "no room for the test's functions")?;
+    #[cfg(feature = "lists")]
+    cara_lm3s6965evb::lists::offer(vehicle).map_err(|_| "no room for the test's function with lists")?;
     cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
