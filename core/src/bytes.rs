@@ -29,7 +29,8 @@ pub(crate) fn as_text(bytes: &[u8]) -> Option<&str> {
     text.ok()
 }
 
-/// Whether the bytes are UTF-8, with a fast path for ASCII.
+/// Whether the bytes are UTF-8, with a fast path for ASCII. Inlined, its loop would have too few registers.
+#[inline(never)]
 pub(crate) fn is_text(bytes: &[u8]) -> bool {
     (cfg!(not(feature = "simd")) && bytes.is_ascii()) || as_text(bytes).is_some()
 }

@@ -262,15 +262,12 @@ fn each<'s>(
     let mut rest = block;
     let mut refusal = Ok(());
     for (index, spec) in specs.raw().enumerate() {
-        let value;
-        if spec.kind.is_nested() {
-            (value, rest) = nested::check(spec, rest).ok_or(Error::Malformed)?;
-        } else {
-            (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
-            if !is_canonical(spec.kind, value) {
-                return Err(Error::Malformed);
-            }
+        let found = if spec.kind.is_nested() { nested::check(spec, rest) } else { split(spec, rest) };
+        let Some((value, behind)) = found else { return Err(Error::Malformed) };
+        if !is_canonical(spec.kind, value) {
+            return Err(Error::Malformed);
         }
+        rest = behind;
         refusal = refusal.and_then(|()| visit(index as u8, spec, value));
     }
     // A malformed block is the peer's fault, whatever else would be wrong with its values.

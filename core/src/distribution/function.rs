@@ -389,8 +389,7 @@ impl<'a> Iterator for VariableSpecs<'a> {
 impl<'a> RawSpec<'a> {
     #[inline]
     pub(super) fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
-        let (&[kind, length], rest) = bytes.split_first_chunk::<2>()?;
-        let (&size, rest) = rest.split_first_chunk::<4>()?;
+        let (&[kind, length, size @ ..], rest) = bytes.split_first_chunk::<6>()?;
         let (name, rest) = rest.split_at_checked(usize::from(length))?;
         let (kind, size) = (Type::from_wire(kind)?, u32::from_le_bytes(size));
         let (inner, rest) = if kind.is_nested() { nested::split_inner(kind, size, rest)? } else { (&[][..], rest) };

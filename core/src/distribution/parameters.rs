@@ -370,10 +370,13 @@ impl ParametersView {
     fn reserve(&mut self, spec: RawSpec<'_>, nested: usize) -> Result<Target<'_>, Error> {
         let RawSpec { name, kind, size, inner } = spec;
         let index = self.count;
-        let place = self.table.get_mut(self.count as usize).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);
-        let length = if kind.is_nested() { nested } else { kind.bytes_of(size).ok_or(full)? };
-        let (_, mut free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
+        // With `ok_or` each slice would be copied into a `Result` and out of it.
+        let Some(place) = self.table.get_mut(index as usize) else { return Err(Error::Full(Limit::Variables)) };
+        let Some(length) = (if kind.is_nested() { Some(nested) } else { kind.bytes_of(size) }) else {
+            return Err(full);
+        };
+        let Some((_, mut free)) = self.bytes.split_at_mut_checked(self.used as usize) else { return Err(full) };
         let mut value_at = self.used.saturating_add(saturate(name.len()));
         let mut inner_length = 0;
         if kind.is_nested() {
@@ -384,8 +387,8 @@ impl ParametersView {
             // What a variable is made of is part of a signature, or was checked like one.
             inner_length = u16::try_from(inner.len()).map_err(|_| Error::Full(Limit::SignatureBytes))?;
         }
-        let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
-        let value = free.get_mut(..length).ok_or(full)?;
+        let Some((name_place, free)) = free.split_at_mut_checked(name.len()) else { return Err(full) };
+        let Some(value) = free.get_mut(..length) else { return Err(full) };
         copy(name, name_place);
         *place = Entry { value_at, size, length: 0, name_length: name.len() as u8, kind, inner_length };
         self.used = value_at.saturating_add(saturate(length));
