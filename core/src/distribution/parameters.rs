@@ -331,8 +331,8 @@ impl ParametersView {
     #[doc(hidden)]
     pub fn lay_out(&mut self, function: Signature<'_>) -> Result<(), Error> {
         self.clear();
-        for spec in function.arguments() {
-            self.add_checked(spec.raw())?;
+        for spec in function.arguments().raw() {
+            self.add_checked(spec)?;
         }
         prepare_results(function.results(), self)
     }

@@ -12,6 +12,7 @@ use super::function::{Signature, VariableSpec, VariableSpecs};
 use super::nested::{self, Bounds};
 use super::parameters::{Elements, Fields, FromValue, Parameters, ParametersView, Slot, Type};
 use super::value::{Element, Value};
+use crate::bytes::are_same;
 use crate::config::{NAME_BYTES, VARIABLES};
 use crate::error::{Error, ServiceError};
 
@@ -357,7 +358,7 @@ impl Mismatch {
     /// with its type and size, and what is wanted of it must be given. Of text and bytes an argument's length is looked at when
     /// it is sent, and a result must not become longer than is declared here. Progress and values of failures the peer need not have.
     pub fn check(ours: Signature<'_>, theirs: Signature<'_>) -> Result<(), Self> {
-        if ours.as_bytes() == theirs.as_bytes() || ours.without_help() == theirs.without_help() {
+        if are_same(ours.as_bytes(), theirs.as_bytes()) || ours.without_help() == theirs.without_help() {
             return Ok(());
         }
         let found = |name: &str, part, here: Option<VariableSpec<'_>>, there: Option<VariableSpec<'_>>| {
