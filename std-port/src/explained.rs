@@ -1,6 +1,6 @@
 //! Why calls of typed clients fail.
 
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use cara_core::distribution::failure::{CallFailure, Failure};
@@ -59,6 +59,10 @@ impl<T: Send + 'static> Explained<T> {
 impl<T: Send + 'static> Caller for Explained<T> {
     fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
         self.peer.published(function, look)
+    }
+
+    fn room(bytes: usize) -> Option<impl DerefMut<Target = ParametersView> + Send> {
+        Peer::<T>::room(bytes)
     }
 
     fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {

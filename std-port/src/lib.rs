@@ -24,6 +24,7 @@ mod actuator;
 #[cfg(feature = "async")]
 pub mod asynchronous;
 mod builder;
+mod cancellable;
 mod clock;
 mod communication_system;
 mod config;
@@ -69,6 +70,7 @@ pub use actuator::Actuator;
 #[cfg(feature = "async")]
 pub use asynchronous::{CallGivenUp, EventStream, EventsLost, PendingReply, SampleStream};
 pub use builder::{BuildError, Builder};
+pub use cancellable::Cancellable;
 pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT};
 pub use cara_core::distribution::connection_handler::NodeCounter;
 pub use cara_core::distribution::failure::{CallFailure, Failure};

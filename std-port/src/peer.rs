@@ -19,6 +19,7 @@ use cara_core::time::Duration;
 use core::net::SocketAddr;
 
 use crate::builder;
+use crate::cancellable::Cancellable;
 #[cfg(feature = "control")]
 use crate::control::protocol::LinkInfo;
 #[cfg(feature = "control")]
@@ -337,7 +338,7 @@ impl<T: Send + 'static> Peer<T> {
         self.block_request_watched(function, parameters, options, &Canceller::new(), &mut on_progress)
     }
 
-    /// The same for a call that another thread may give up.
+    /// The same for a call that another thread may give up. Typed clients have [`cancelled_by`](Self::cancelled_by).
     pub fn block_request_cancellable(
         &self,
         function: &str,
@@ -352,6 +353,11 @@ impl<T: Send + 'static> Peer<T> {
         };
         let parameters = self.with_room(function, parameters);
         self.block_request_watched(function, parameters, options, canceller, &mut told)
+    }
+
+    /// This peer for typed clients, whose calls another thread may give up.
+    pub fn cancelled_by(&self, canceller: &Canceller) -> Cancellable<T> {
+        Cancellable { peer: self.clone(), canceller: canceller.clone() }
     }
 
     /// The parameters of a call, with room for its results where they grow.
@@ -369,7 +375,7 @@ impl<T: Send + 'static> Peer<T> {
         parameters.view_mut()
     }
 
-    fn block_request_watched(
+    pub(crate) fn block_request_watched(
         &self,
         function: &str,
         parameters: &mut ParametersView,
@@ -380,7 +386,10 @@ impl<T: Send + 'static> Peer<T> {
         let mut watch = Watch { on_progress, canceller, failure: None };
         let link = self.link().map_err(|error| Box::new(error.into()))?;
         let result = self.engine.block_request_watched(&link, function, parameters, options, &mut watch);
-        result.map_err(|error| Box::new(CallFailure { error, failure: watch.failure.map(|failure| *failure) }))
+        match result {
+            Ok(_) => Ok(()),
+            Err(error) => Err(Box::new(CallFailure { error, failure: watch.failure.map(|failure| *failure) })),
+        }
     }
 
     /// As [`block_request_with`](Self::block_request_with); what the call has started goes on until the returned guard is
@@ -404,7 +413,7 @@ impl<T: Send + 'static> Peer<T> {
         options: &RequestOptions,
     ) -> Result<Hold<T>, Error> {
         let parameters = self.with_room(function, parameters);
-        self.engine.hold(self.link()?, function, parameters, options).map(Hold::new)
+        self.engine.hold(self.link()?, function, parameters, options, None).map(Hold::new)
     }
 
     /// What has become of the newest call of a leased function by this unit, as the node tells after it has joined again: for

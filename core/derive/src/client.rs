@@ -177,13 +177,15 @@ fn blocking(interface: &Interface, function: &Function, root: &TokenStream) -> T
         (inputs(function), function.returned(), prepared(interface, function, root), help(function));
     let hold = function.attributes.lease.as_ref().map(|_| {
         let hold = format_ident!("hold_{}", crate::attributes::plain(ident));
-        let about = format!("As [`{ident}`](Self::{ident}); what the call has started goes on until what is returned is dropped.");
+        let about = format!(
+            "As [`{ident}`](Self::{ident}); what the call has started goes on until what is returned, which has the results, is dropped."
+        );
         quote! {
             #[doc = #about]
-            #visibility fn #hold(&self, #(#inputs),*) -> ::core::result::Result<P::Hold, #typed::CallError> {
+            #visibility fn #hold(&self, #(#inputs),*) -> ::core::result::Result<#typed::Held<P::Hold, #returned>, #typed::CallError> {
                 #prepared
-                let held = #typed::BlockingCaller::block_and_hold(self.client.peer(), #name, parameters, self.client.options())?;
-                ::core::result::Result::Ok(held)
+                let hold = #typed::BlockingCaller::block_and_hold(self.client.peer(), #name, parameters, self.client.options())?;
+                ::core::result::Result::Ok(#typed::Held { results: #holder::#take(parameters)?, hold })
             }
         }
     });

@@ -59,7 +59,11 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 ///
 /// `call: &impl TypedCall<Left, Blocked>` declares also what calls tell while they run, and the values of their failures: structs that
 /// derive `Variables`, or `()` for nothing. Clients have `watch_go_to` beside `go_to` then: it hands each `Left` to a closure, and
-/// fails with a `Failed<Blocked>`. It needs the feature `details` of the core, which Linux has always.
+/// fails with a `Failed<Blocked>`. It needs the feature `details` of the core, which Linux has always. On a board a function with
+/// `call: &impl LongCall<Left, Blocked, State = Agv>` declares the same, and takes the call for a task.
+///
+/// The client for threads has `hold_go_to` of a function with a lease, which returns a `Held`: its results, and what goes on until that is
+/// dropped.
 ///
 /// | a function | has the state |
 /// |---|---|

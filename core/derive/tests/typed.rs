@@ -17,7 +17,8 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_core::typed::{
-    AwaitedCaller, BAD_ARGUMENT, BlockingCaller, CallError, Caller, Free, Functions, Interface, Method, WatchingCaller,
+    AwaitedCaller, BAD_ARGUMENT, BlockingCaller, CallError, Caller, Free, Functions, Held, Interface, Method,
+    WatchingCaller,
 };
 use cara_core::{AnyCall, Error, Parameters, ParametersView, ServiceError, TypedCall, Variables, interface};
 
@@ -461,7 +462,7 @@ fn options_holds_and_requests_go_through() {
     let mut unit = unit();
     let wanted = RequestOptions { timeout: Some(Duration::from_secs(9)), ..RequestOptions::new() };
     let agv = AgvClient::at(&unit).with(wanted).renewing(Renew::Process);
-    assert_eq!(agv.hold_go_to([1, 2]), Ok("held"));
+    assert_eq!(agv.hold_go_to([1, 2]), Ok(Held { results: (), hold: "held" }));
     assert_eq!(agv.request_add(1, 2), Ok(CallId(1)));
     assert_eq!(*unit.sent.borrow(), [RequestOptions { renew: Renew::Process, ..wanted }; 2]);
     unit.ended = Some(Ended);

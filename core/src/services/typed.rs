@@ -9,7 +9,7 @@ use core::fmt;
 use core::future::Future;
 #[cfg(feature = "details")]
 use core::ops::ControlFlow;
-use core::ops::DerefMut;
+use core::ops::{Deref, DerefMut};
 
 #[cfg(feature = "details")]
 use crate::config::FAILURE_TEXT_BYTES;
@@ -105,12 +105,19 @@ pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
     /// What the service returns for a failure with this code, whose text and values go to the caller. Text and bytes that are longer
     /// than they are declared keep the values from it.
     fn fail_with(&self, code: u16, text: &str, values: &F) -> ServiceError {
-        let mut failure = Failure::new(code, text);
-        if values.to_parameters(failure.values_mut()).is_err() {
-            failure = Failure::new(code, text);
-        }
-        self.fail(failure)
+        self.fail(failure(code, text, values))
     }
+}
+
+/// A failure with values, or without them where text and bytes are longer than they are declared.
+#[cfg(feature = "details")]
+#[doc(hidden)]
+pub fn failure(code: u16, text: &str, values: &impl Variables) -> Failure {
+    let mut failure = Failure::new(code, text);
+    if values.to_parameters(failure.values_mut()).is_err() {
+        failure = Failure::new(code, text);
+    }
+    failure
 }
 
 #[cfg(feature = "details")]
@@ -272,6 +279,24 @@ impl From<CallError> for ServiceError {
             CallError::Mismatch(_) => Self::NotReady,
             CallError::Call(error) => error.into(),
         }
+    }
+}
+
+/// What a call that is held has given, and what gives it up when this is dropped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[must_use = "dropped, it is released at once"]
+pub struct Held<H, R> {
+    /// The results; `()` of a function without any.
+    pub results: R,
+    /// What the call has started goes on until this is dropped.
+    pub hold: H,
+}
+
+impl<H, R> Deref for Held<H, R> {
+    type Target = H;
+
+    fn deref(&self) -> &H {
+        &self.hold
     }
 }
 

@@ -15,7 +15,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use super::awaiting::CallFuture;
-use super::details::Watch;
+use super::details::{Canceller, Watch};
 use super::inbound::OwnCall;
 use super::link::{LinkCell, LinkState, Outcome, Wake};
 use super::reader::{Cause, Token};
@@ -74,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
         let options = RequestOptions { progress: false, ..*options };
         let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
-            let begun = self.begin_call(link, function, parameters, &options)?;
+            let begun = self.begin_call(link, function, parameters, &options, None)?;
             let id = begun.id;
             self.await_reply(link, begun, parameters, None).map(|()| id)
         });
@@ -92,20 +92,20 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &mut ParametersView,
         options: &RequestOptions,
         watch: &mut Watch<'_>,
-    ) -> Result<(), Error> {
+    ) -> Result<CallId, Error> {
         let noted = self.noted(link, function, options);
         let options = RequestOptions { progress: true, ..*options };
         let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
-            let mut begun = self.begin_call(link, function, parameters, &options)?;
+            let mut begun = self.begin_call(link, function, parameters, &options, Some(watch.canceller))?;
             let id = begun.id;
             begun.state.details.watch(id);
             let result = self.await_reply(link, begun, parameters, Some(&mut *watch));
             watch.failure = link.lock().details.unwatch(id).filter(|_| result.is_err());
-            result
+            result.map(|()| id)
         });
         if let Some(noted) = noted {
-            noted.ended(result);
+            noted.ended(result.map(drop));
         }
         result
     }
@@ -117,24 +117,32 @@ impl<T: Send + 'static> Engine<T> {
         function: &str,
         parameters: &mut ParametersView,
         options: &RequestOptions,
+        watch: Option<&mut Watch<'_>>,
     ) -> Result<CallFuture<T>, Error> {
-        let id = self.block_request(&link, function, parameters, options)?;
+        let id = match watch {
+            Some(watch) => self.block_request_watched(&link, function, parameters, options, watch),
+            None => self.block_request(&link, function, parameters, options),
+        }?;
         Ok(CallFuture::held(self.clone(), link, id))
     }
 
-    /// Sends the request as soon as the interval and the room allow, within the deadline.
+    /// Sends the request as soon as the interval and the room allow, within the deadline, unless it is given up before.
     fn begin_call<'l>(
         &self,
         link: &'l Arc<LinkCell>,
         function: &str,
         parameters: &ParametersView,
         options: &RequestOptions,
+        canceller: Option<&Canceller>,
     ) -> Result<Begun<'l>, Error> {
         let mut now = self.now();
         let mut state = link.lock();
         let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
         let deadline = now + timeout;
         loop {
+            if canceller.is_some_and(Canceller::is_cancelled) {
+                return Err(Error::Cancelled);
+            }
             // Before the request goes out: a thread of the pool must not wake for the reply.
             let token = self.take_token(now, link, &mut state);
             let options = RequestOptions { timeout: Some(deadline.since(now)), ..*options };
@@ -151,7 +159,7 @@ impl<T: Send + 'static> Engine<T> {
                 return Err(error);
             }
             state = link.lock();
-            state = state.wait(&link.room, wait);
+            state = state.wait(&link.room, if canceller.is_some() { wait.min(PAUSE) } else { wait });
             now = self.now();
         }
     }

@@ -209,6 +209,8 @@ impl Serving {
 /// let outcome = agv.block_request_cancellable("go_to", &mut Parameters::new(), &options, &canceller, |_| {});
 /// # Ok::<(), cara_std::BuildError>(())
 /// ```
+///
+/// Typed clients take it with their peer: [`Peer::cancelled_by`](crate::Peer::cancelled_by).
 #[derive(Clone, Debug, Default)]
 pub struct Canceller(Arc<AtomicBool>);
 
@@ -218,7 +220,7 @@ impl Canceller {
         Self::default()
     }
 
-    /// The call ends with [`Error::Cancelled`] within 20 ms, and its callee is told.
+    /// The call ends with [`Error::Cancelled`] within 20 ms, and its callee is told. What has not been sent yet is not sent.
     pub fn cancel(&self) {
         self.0.store(true, Ordering::SeqCst);
     }

@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use cara_std::{
-    Call, CallFailure, Canceller, CommunicationSystem, Error, Failure, LeaseWatch, Parameters, ParametersView, Peer,
-    RequestOptions, ServiceError, ServiceOptions, Stage, Unit,
+    Call, CallFailure, Canceller, CommunicationSystem, Constraints, Error, Failure, LeaseWatch, LinkCounter,
+    Parameters, ParametersView, Peer, RequestOptions, ServiceError, ServiceOptions, Stage, Unit,
 };
 
 use crate::support::{Gate, PATIENCE, counter, held, meet, number, pair, until, value};
@@ -216,6 +216,28 @@ fn another_thread_gives_a_call_up_and_its_order_ends() {
     vehicle.agv.stop();
     vehicle.manager.stop();
     assert_eq!(vehicle.hooks(), 1);
+}
+
+#[test]
+fn a_call_that_is_given_up_before_it_is_sent_is_not_sent() {
+    let (manager, agv) = pair();
+    serve(&agv, "go", ServiceOptions::new(), |_, _| Ok(()));
+    let (peer, _) = meet(&manager, &agv);
+    // The next call waits so long.
+    let interval = cara_std::Duration::from_secs(60);
+    manager.set_constraints(Constraints { minimum_interval: interval, ..manager.constraints() }).unwrap();
+    peer.block_request("go", &mut number(1)).unwrap();
+    let (canceller, sent) = (Canceller::new(), manager.counted(LinkCounter::MessagesSent));
+    let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(120)), ..Default::default() };
+    let failed = std::thread::scope(|scope| {
+        let call = scope.spawn(|| peer.block_request_cancellable("go", &mut number(1), &options, &canceller, |_| {}));
+        std::thread::sleep(std::time::Duration::from_millis(100));
+        canceller.cancel();
+        until("it ends", || call.is_finished());
+        call.join().unwrap()
+    });
+    assert_eq!(failed.unwrap_err().error, Error::Cancelled);
+    assert_eq!(manager.counted(LinkCounter::MessagesSent), sent);
 }
 
 #[test]

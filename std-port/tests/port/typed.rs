@@ -7,11 +7,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use cara_core::distribution::block::{self, SliceWriter};
 use cara_std::typed::{BAD_ARGUMENT, Part};
 use cara_std::{
-    AnyCall, CallError, Constraints, Definition, Duration, Error, Explained, Failure, LeaseWatch, LinkCounter,
-    Parameters, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, TypedCall, Variables, interface,
+    AnyCall, CallError, Canceller, Constraints, Definition, Duration, Error, Explained, Failure, LeaseWatch,
+    LinkCounter, Parameters, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, TypedCall, Variables,
+    interface,
 };
 
-use crate::support::{fleet, meet, system, unit, until};
+use crate::support::{PATIENCE, fleet, meet, system, unit, until};
 
 #[derive(Variables, Clone, Copy, Debug, Default, PartialEq)]
 enum Mode {
@@ -112,6 +113,91 @@ fn progress_and_failures_come_typed() {
     let told = NewestDockClient::at(&peer).dock(1).unwrap_err();
     assert!(matches!(&told, CallError::Mismatch(what) if what.part == Part::Failure), "{told}");
     assert!(told.to_string().contains("its failure's at is int[2] there and int[3] here"), "{told}");
+    manager.stop();
+    agv.stop();
+}
+
+#[test]
+fn another_thread_gives_typed_calls_up() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(Gate::default()).build().unwrap();
+    agv.my_function_list().serve(DockServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let cancelled = CallError::Call(Error::Cancelled);
+    // Runs until it is given up, far behind the end of the test.
+    let ask = |watched: bool, canceller: &Canceller| {
+        let peer = peer.cancelled_by(canceller);
+        let client =
+            DockClient::at(&peer).with(RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() });
+        if watched {
+            client.watch_dock(5_000, |_| ControlFlow::Continue(())).map_err(|failed| failed.error)
+        } else {
+            client.dock(5_000)
+        }
+    };
+    for (count, watched) in [(1, false), (2, true)] {
+        let canceller = Canceller::new();
+        std::thread::scope(|scope| {
+            let (told, call) = (agv.counted(LinkCounter::ProgressSent), scope.spawn(|| ask(watched, &canceller)));
+            until("its service runs", || agv.counted(LinkCounter::ProgressSent) > told);
+            canceller.cancel();
+            assert_eq!(call.join().unwrap(), Err(cancelled.clone()), "watched: {watched}");
+        });
+        until("its service is told", || agv.with_state(|gate| gate.given_up).unwrap() == count);
+        assert_eq!(ask(watched, &canceller), Err(cancelled.clone()), "all calls behind it are given up");
+        assert_eq!(DockClient::at(&peer).dock(1), Ok(()), "others are not");
+    }
+    manager.stop();
+    agv.stop();
+}
+
+/// What tells how high it is, and does not stop by itself above 100.
+#[interface]
+trait Crane {
+    #[actuator(motor)]
+    #[lease(ms = 60_000)]
+    #[returns(height)]
+    fn hoist(&mut self, call: &impl AnyCall, height: u32) -> u32;
+}
+
+impl Crane for u32 {
+    fn hoist(&mut self, call: &impl AnyCall, height: u32) -> u32 {
+        if height > 100 {
+            until("it is given up", || call.is_cancelled());
+        }
+        *self += height;
+        *self
+    }
+}
+
+#[test]
+fn a_typed_call_that_is_held_gives_its_results_too() {
+    let fleet = fleet();
+    let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).state(5_u32).build().unwrap());
+    let motor = agv.my_function_list().actuator(|| ()).unwrap();
+    let order = motor.watch();
+    agv.my_function_list().serve(CraneServer { motor }).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let canceller = Canceller::new();
+    let cancellable = peer.cancelled_by(&canceller);
+    let client = CraneClient::at(&cancellable).renewing(Renew::Process);
+    let held = client.hold_hoist(3).unwrap();
+    assert!(held.results == 8 && held.is_held() && order.is_live());
+    canceller.cancel();
+    assert_eq!(client.hold_hoist(4).unwrap_err(), CallError::Call(Error::Cancelled));
+    assert!(held.is_held() && order.is_live(), "what was held before stays so");
+    drop(held);
+    until("it is released", || !order.is_live());
+    let canceller = Canceller::new();
+    std::thread::scope(|scope| {
+        let peer = peer.cancelled_by(&canceller);
+        let call = scope.spawn(move || CraneClient::at(&peer).renewing(Renew::Process).hold_hoist(101).map(|_| ()));
+        until("it moves", || order.is_live());
+        canceller.cancel();
+        assert_eq!(call.join().unwrap(), Err(CallError::Call(Error::Cancelled)));
+    });
+    until("it stops", || !order.is_live());
     manager.stop();
     agv.stop();
 }
@@ -510,6 +596,9 @@ fn an_order_of_50_nodes_comes_as_it_was_sent() {
     let order = Order::of_50_nodes();
     assert_eq!(client.planned(), Ok(Order::default()));
     assert_eq!(client.plan(order.clone()), Ok((50, order.nodes.last().cloned())));
+    // It takes more than a client puts on its stack.
+    assert_eq!(PlannedClient::at(&Explained::new(peer.clone())).planned(), Ok(order.clone()));
+    assert_eq!(PlannedClient::at(&peer.cancelled_by(&Canceller::new())).planned(), Ok(order.clone()));
     assert_eq!(client.planned(), Ok(order.clone()));
     let none = Order { nodes: vec![], ..order };
     assert_eq!(client.plan(none.clone()), Ok((0, None)));
