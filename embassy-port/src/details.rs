@@ -1,10 +1,12 @@
 //! What is told of calls beside their results: why they fail, how far they are, and that their callers have given them up.
 
 use core::future::poll_fn;
+use core::ops::ControlFlow;
 use core::task::Poll;
 
+use cara_core::config::FAILURE_VALUES_BYTES;
 use cara_core::distribution::failure::Failure;
-use cara_core::distribution::parameters::ParametersView;
+use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::RequestOptions;
 
@@ -76,10 +78,47 @@ impl<T> Peer<T> {
         options: &RequestOptions,
         why: &mut Option<Failure>,
     ) -> Result<(), Error> {
+        // Nothing here would look at it.
+        let options = &RequestOptions { progress: false, ..*options };
+        self.await_told(function, parameters, options, |_| ControlFlow::Continue(()), why).await
+    }
+
+    /// The same, with what the call tells while it runs: the newest progress that the task has not looked at, and none after
+    /// the reply. Where `on_progress` returns `Break`, the call is given up and ends with [`Error::Cancelled`]: what it moves
+    /// stops, and its handler is told.
+    ///
+    /// The unit has room for what one call tells, and none while a reply waits there: what another call tells before the task
+    /// has looked takes its place. Values that take more than [`FAILURE_VALUES_BYTES`] are passed over.
+    pub async fn block_request_with_progress(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error> {
+        let options = &RequestOptions { progress: true, ..*options };
+        self.await_told(function, parameters, options, on_progress, why).await
+    }
+
+    async fn await_told(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        why: &mut Option<Failure>,
+    ) -> Result<(), Error> {
         *why = None;
         let timeout = options.timeout.unwrap_or(self.unit.constraints().request_timeout);
         let mut call = self.begin(function, parameters, options, now() + timeout).await?;
         poll_fn(|cx| {
+            let mut told = Parameters::<FAILURE_VALUES_BYTES>::sized();
+            // What it does may use the unit.
+            let is_told = self.unit.shared.machine.borrow_mut().take_told(&call.call, &mut told);
+            if is_told && on_progress(&told).is_break() {
+                return Poll::Ready(Err(Error::Cancelled));
+            }
             let mut machine = self.unit.shared.machine.borrow_mut();
             let Some(outcome) = machine.outcome(&call.call, parameters, cx.waker()) else { return Poll::Pending };
             *why = machine.reply.take_failure(&call.call);

@@ -23,6 +23,8 @@ use crate::event::{Name, UnitEvent};
 use crate::line::{Progress, address_of};
 use crate::machine::{LinkSession, Machine};
 use crate::replies::ended;
+#[cfg(feature = "details")]
+use crate::replies::told;
 #[cfg(feature = "streams")]
 use crate::subscriptions::came;
 use crate::time::now;
@@ -77,6 +79,8 @@ impl<T> Machine<T> {
         }
         let event = session.poll(&mut cx)?;
         ended(link, reply, &event, &[]);
+        #[cfg(feature = "details")]
+        told(link, reply, &event, &[]);
         #[cfg(feature = "streams")]
         came(&self.readings, link, now(), &event, &[]);
         Some(event)
@@ -103,6 +107,8 @@ impl<T> Machine<T> {
         let receipt = session.receive(&mut cx, lent, arguments);
         if let Some(event) = &receipt.event {
             ended(link, reply, event, lent);
+            #[cfg(feature = "details")]
+            told(link, reply, event, lent);
             #[cfg(feature = "streams")]
             came(&self.readings, link, now(), event, lent);
         }

@@ -32,6 +32,9 @@ pub struct Call<T: 'static> {
     /// What the handler has said of its failure.
     #[cfg(feature = "details")]
     pub(crate) failure: core::cell::Cell<Option<cara_core::distribution::failure::Failure>>,
+    /// The call, unless the handler has taken it.
+    #[cfg(feature = "details")]
+    pub(crate) running: core::cell::Cell<Option<crate::taken::Running>>,
 }
 
 impl<T> fmt::Debug for Call<T> {

@@ -163,7 +163,6 @@ impl<T> AwaitedCaller for Peer<T> {
     }
 }
 
-/// A board hears nothing of a call while it runs; it hears why it has failed.
 #[cfg(feature = "details")]
 impl<T> cara_core::typed::AwaitedWatcher for Peer<T> {
     async fn call_watched(
@@ -171,9 +170,9 @@ impl<T> cara_core::typed::AwaitedWatcher for Peer<T> {
         function: &str,
         parameters: &mut ParametersView,
         options: &RequestOptions,
-        _: impl FnMut(&ParametersView) -> ControlFlow<()>,
+        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
         why: &mut Option<Failure>,
     ) -> Result<(), Error> {
-        self.block_request_explained(function, parameters, options, why).await
+        self.block_request_with_progress(function, parameters, options, on_progress, why).await
     }
 }

@@ -107,6 +107,8 @@ mod streams;
 #[cfg(feature = "streams")]
 mod subscriptions;
 mod taken;
+#[cfg(feature = "details")]
+mod taking;
 mod time;
 
 pub use calls::Hold;
@@ -134,4 +136,6 @@ pub use streams::{Publisher, Stream, StreamCell};
 #[cfg(feature = "streams")]
 pub use subscriptions::{Subscription, SubscriptionCell, SubscriptionInner};
 pub use taken::TakenCall;
+#[cfg(feature = "details")]
+pub use taking::{LongCall, TypedTaken};
 pub use time::now;

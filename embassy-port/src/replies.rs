@@ -8,6 +8,7 @@ use core::task::Waker;
 use cara_core::distribution::block;
 #[cfg(feature = "details")]
 use cara_core::distribution::failure::Failure;
+use cara_core::distribution::function::Signature;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -45,6 +46,9 @@ pub(crate) struct ReplyBox {
     /// What the service has said of the failure that came last.
     #[cfg(feature = "details")]
     failure: Option<(InFlight, Failure)>,
+    /// What a call has told last while it runs: it waits in the same room, and makes way for a reply.
+    #[cfg(feature = "details")]
+    told: Option<(InFlight, usize)>,
 }
 
 impl ReplyBox {
@@ -54,6 +58,8 @@ impl ReplyBox {
             held: None,
             #[cfg(feature = "details")]
             failure: None,
+            #[cfg(feature = "details")]
+            told: None,
         }
     }
 
@@ -67,7 +73,24 @@ impl ReplyBox {
             return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
         }
         self.held = Some((call, copy(block, self.bytes)));
+        #[cfg(feature = "details")]
+        {
+            self.told = None;
+        }
         Ok(())
+    }
+
+    #[cfg(feature = "details")]
+    fn tell(&mut self, call: InFlight, block: &[u8]) {
+        if self.held.is_none() && block.len() <= self.bytes.len() {
+            self.told = Some((call, copy(block, self.bytes)));
+        }
+    }
+
+    #[cfg(feature = "details")]
+    fn take_told(&mut self, call: &InFlight) -> Option<&[u8]> {
+        let (_, length) = self.told.take_if(|(told, _)| told == call)?;
+        self.bytes.get(..length)
     }
 
     #[cfg(feature = "details")]
@@ -100,11 +123,35 @@ impl Waiter {
     fn end(&mut self, outcome: Result<(), Error>) {
         if self.outcome.is_none() {
             self.outcome = Some(outcome);
-            if let Some(waker) = self.waker.take() {
-                waker.wake();
-            }
+            self.wake();
         }
     }
+
+    fn wake(&mut self) {
+        if let Some(waker) = self.waker.take() {
+            waker.wake();
+        }
+    }
+}
+
+/// Keeps what a call has told for the task that waits for it, if that is what happened and there is one.
+#[cfg(feature = "details")]
+pub(crate) fn told(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: &[u8]) {
+    let Event::Progress(id, values) = event else { return };
+    let (serial, session) = (link.serial, &link.session);
+    let mut waiting = link.waiters.iter_mut().flatten();
+    let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == *id) else { return };
+    if let Some(Ok(block)) = session.as_ref().map(|session| session.progress_values(values, lent)) {
+        reply.tell(waiter.call, block.bytes());
+        waiter.wake();
+    }
+}
+
+/// The function that a call is of, as long as it is the one that was called.
+fn called<'l>(links: &'l [Link], call: &InFlight) -> Option<Signature<'l>> {
+    let link = links.get(usize::from(call.link)).filter(|link| link.serial == call.serial)?;
+    let function = link.session.as_ref()?.their_function_list().function(call.slot)?;
+    (function.generation == call.generation).then_some(function.signature)
 }
 
 /// Stores the outcome of a call for the task that waits for it, if that is what happened and there is one.
@@ -162,13 +209,15 @@ impl<T> Machine<T> {
     fn read(&mut self, call: &InFlight, parameters: &mut ParametersView) -> Result<(), Error> {
         let Self { links, reply, .. } = self;
         let bytes = reply.take(call).ok_or(Error::ResultLost)?;
-        let link = links.get(usize::from(call.link)).filter(|link| link.serial == call.serial);
-        let session = link.and_then(|link| link.session.as_ref()).ok_or(Error::ResultLost)?;
-        let function = session.their_function_list().function(call.slot).ok_or(Error::ResultLost)?;
-        if function.generation != call.generation {
-            return Err(Error::ResultLost);
-        }
-        block::read(function.signature.results(), bytes, parameters)
+        block::read(called(links, call).ok_or(Error::ResultLost)?.results(), bytes, parameters)
+    }
+
+    /// Reads what a call has told last into `values`, once; `false` when there is nothing new, or no room for it.
+    #[cfg(feature = "details")]
+    pub(crate) fn take_told(&mut self, call: &InFlight, values: &mut ParametersView) -> bool {
+        let Self { links, reply, .. } = self;
+        let (told, called) = (reply.take_told(call), called(links, call));
+        told.zip(called).is_some_and(|(bytes, called)| block::read(called.progress(), bytes, values).is_ok())
     }
 
     /// Nothing waits for a call any more, and what it started is not wanted.

@@ -228,10 +228,14 @@ impl<T> Runner<T> {
                 unit: Handle { shared: self.shared },
                 #[cfg(feature = "details")]
                 failure: Default::default(),
+                #[cfg(feature = "details")]
+                running: Some(running).into(),
             };
             (told, handler)
         };
         let result = handler.run(&self.shared.state, &told, self.arguments);
+        #[cfg(feature = "details")]
+        told.running.take()?;
         // Where it cannot be kept now, its code waits alone.
         #[cfg(feature = "details")]
         if let Some(failure) = told.failure.take()

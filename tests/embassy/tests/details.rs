@@ -1,7 +1,10 @@
 //! Failures with text and values, progress, and calls that are given up, between boards.
 
 use std::cell::{Cell, RefCell};
+use std::ops::ControlFlow;
+use std::pin::pin;
 use std::rc::Rc;
+use std::task::{Context, Waker};
 
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
@@ -46,6 +49,8 @@ impl Pair {
         agv.my_function_list().add_service(GO, ServiceOptions::new(), Handler::task()).unwrap();
         let refuse = Handler::free(&|call, _| Err(call.fail(Failure::new(4, "not at this time"))));
         agv.my_function_list().add_service("refuse()", ServiceOptions::new(), refuse).unwrap();
+        let echo = Handler::free(&|_, _| Ok(()));
+        agv.my_function_list().add_service("echo(number: int) -> (number: int)", ServiceOptions::new(), echo).unwrap();
         agv.publish_my_function_list().unwrap();
         boards[1].spawn(async move {
             let mut parameters = Parameters::<512>::sized();
@@ -55,9 +60,26 @@ impl Pair {
             }
         });
         let pair = Self { bench, boards, manager, agv };
-        let knows = || pair.manager.peer("agv").is_ok_and(|agv| agv.their_function_list().contains("refuse"));
+        let knows = || pair.manager.peer("agv").is_ok_and(|agv| agv.their_function_list().contains("echo"));
         assert!(pair.bench.run_until(knows, LONG));
         pair
+    }
+
+    /// How a call of the manager ends, and what it has told.
+    fn watch(&self, go_on: impl Fn(i64) -> ControlFlow<()> + 'static) -> (Result<(), Error>, Vec<i64>) {
+        let (ended, heard) = (Rc::<Cell<Option<_>>>::default(), Rc::<RefCell<Vec<_>>>::default());
+        let (end, hear, agv) = (ended.clone(), heard.clone(), self.manager.peer("agv").unwrap());
+        self.boards[0].spawn(async move {
+            let on_progress = |told: &ParametersView| {
+                hear.borrow_mut().push(told.variable("left").unwrap());
+                go_on(*hear.borrow().last().unwrap())
+            };
+            let (mut parameters, options, mut why) = (one("number", 1), RequestOptions::new(), None);
+            let call = agv.block_request_with_progress("go", &mut parameters, &options, on_progress, &mut why);
+            end.set(Some(call.await));
+        });
+        assert!(self.bench.run_until(|| ended.get().is_some(), LONG));
+        (ended.get().unwrap(), heard.take())
     }
 
     /// How a call of the manager ends, and what it is told of its failure.
@@ -109,7 +131,7 @@ fn a_failure_brings_its_text_and_its_values() {
 }
 
 #[test]
-fn a_task_tells_how_far_it_is() {
+fn a_task_tells_how_far_it_is_and_its_caller_hears_it() {
     let told = Rc::<RefCell<Vec<_>>>::default();
     let tells = told.clone();
     let pair = Pair::met(2, async move |call: TakenCall<()>, arguments: &ParametersView| {
@@ -118,9 +140,10 @@ fn a_task_tells_how_far_it_is() {
         }
         embassy_time::Timer::after_millis(50).await;
         tells.borrow_mut().push(call.progress(&one("left", 0)));
+        embassy_time::Timer::after_millis(50).await;
         call.reply(Ok(arguments)).await;
     });
-    assert_eq!(pair.ask("go", RequestOptions { progress: true, ..RequestOptions::new() }).0, Ok(()));
+    assert_eq!(pair.watch(|_| ControlFlow::Continue(())), (Ok(()), vec![2, 0]));
     let told = told.take();
     let full = Err(Error::Full(Limit::SendQueue));
     assert_eq!((told[0], told[1], told[3]), (Ok(()), full, Ok(())));
@@ -128,8 +151,49 @@ fn a_task_tells_how_far_it_is() {
     assert_eq!(pair.agv.counted(LinkCounter::ProgressSent), 2);
     assert_eq!(pair.manager.counted(LinkCounter::ProgressReceived), 2);
     // A caller that does not want to know is sent nothing.
-    assert_eq!(pair.ask("go", RequestOptions::new()).0, Ok(()));
+    assert_eq!(pair.ask("go", RequestOptions { progress: true, ..RequestOptions::new() }).0, Ok(()));
     assert_eq!(pair.agv.counted(LinkCounter::ProgressSent), 2);
+}
+
+#[test]
+fn a_caller_gives_a_call_up_by_what_it_hears() {
+    let ended = Rc::new(Cell::new(0));
+    let count = ended.clone();
+    let pair = Pair::met(4, async move |call: TakenCall<()>, arguments: &ParametersView| {
+        let mut left = 9;
+        while !call.is_cancelled() {
+            left -= 1;
+            let _ = call.progress(&one("left", left));
+            embassy_time::Timer::after_millis(50).await;
+        }
+        count.set(count.get() + 1);
+        call.reply(Ok(arguments)).await;
+    });
+    let outcome = pair.watch(|left| if left > 6 { ControlFlow::Continue(()) } else { ControlFlow::Break(()) });
+    assert_eq!(outcome, (Err(Error::Cancelled), vec![8, 7, 6]));
+    assert!(pair.bench.run_until(|| ended.get() == 1, LONG), "its service is told");
+    assert_eq!(pair.agv.counted(LinkCounter::RunningCancelled), 1);
+}
+
+/// What is told waits in the room for replies, and holds none of them up.
+#[test]
+fn what_a_call_tells_makes_way_for_the_reply_of_another_one() {
+    let pair = Pair::met(5, async move |call: TakenCall<()>, arguments: &ParametersView| {
+        call.progress(&one("left", 1)).unwrap();
+        embassy_time::Timer::after_millis(200).await;
+        call.reply(Ok(arguments)).await;
+    });
+    let agv = pair.manager.peer("agv").unwrap();
+    let mut waits = pin!(async {
+        let (mut parameters, options, mut why) = (one("number", 1), RequestOptions::new(), None);
+        let heard = |_: &ParametersView| ControlFlow::Break(());
+        agv.block_request_with_progress("go", &mut parameters, &options, heard, &mut why).await
+    });
+    let mut look = || waits.as_mut().poll(&mut Context::from_waker(Waker::noop()));
+    assert!(look().is_pending());
+    assert!(pair.bench.run_until(|| pair.manager.counted(LinkCounter::ProgressReceived) == 1, LONG));
+    assert_eq!(pair.ask("echo", RequestOptions::new()).0, Ok(()));
+    assert!(look().is_pending(), "the reply has taken its place");
 }
 
 #[test]

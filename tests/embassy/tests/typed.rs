@@ -10,8 +10,8 @@ use cara_core::services::heart::Renew;
 use cara_core::services::lease::Lease;
 use cara_core::time::Duration;
 use cara_embassy::{
-    Actuator, AnyCall, AsyncState, CallError, Config, Handle, Handler, Limits, ServiceOptions, TypedCall, Variables,
-    interface, resources,
+    Actuator, AnyCall, AsyncState, CallError, Config, Handle, Handler, Limits, LongCall, ServiceOptions, TypedCall,
+    TypedTaken, Variables, interface, resources,
 };
 use cara_embassy_host::{Bench, Board, keys};
 
@@ -23,7 +23,11 @@ const LIMITS: Limits = Limits { links: 4, message_buffers: 6, calls: 8, ..Limits
 struct Fork {
     height: f64,
     losses: u32,
+    driving: Option<Driving>,
 }
+
+/// What has been taken, and how many metres are left.
+type Driving = (TypedTaken<Fork, Left, TooHeavy>, u8);
 
 #[derive(Variables, Debug, PartialEq)]
 struct Load {
@@ -62,6 +66,56 @@ trait Lift {
     fn load(&mut self) -> Load;
 
     fn tilt(&mut self, call: &impl TypedCall<Left, TooHeavy>, degrees: u8) -> Result<(), ServiceError>;
+}
+
+#[derive(Variables, Debug, PartialEq)]
+struct Arrived {
+    metres: u8,
+}
+
+/// Its calls are taken.
+#[interface]
+trait Drive {
+    fn drive(
+        &mut self,
+        call: &impl LongCall<Left, TooHeavy, State = Fork>,
+        metres: u8,
+    ) -> Result<Arrived, ServiceError>;
+}
+
+impl Drive for Fork {
+    fn drive(
+        &mut self,
+        call: &impl LongCall<Left, TooHeavy, State = Fork>,
+        metres: u8,
+    ) -> Result<Arrived, ServiceError> {
+        if metres == 0 {
+            return Ok(Arrived { metres });
+        }
+        self.driving = Some((call.take(), metres));
+        // It has no caller any more.
+        let second = call.take();
+        assert!(second.is_cancelled());
+        Err(ServiceError::NotReady)
+    }
+}
+
+/// Drives a metre each 50 ms, and none above 9 metres.
+async fn drive(unit: Unit) {
+    loop {
+        embassy_time::Timer::after_millis(50).await;
+        let Some((call, left)) = unit.with_state(|fork| fork.driving.take()).unwrap() else { continue };
+        if call.is_cancelled() {
+            unit.with_state(|fork| fork.losses += 1).unwrap();
+        } else if left > 9 {
+            call.fail_with(3, "it is too far", &TooHeavy { kilograms: 900 }).await;
+        } else if left == 0 {
+            call.finish(&Arrived { metres: 7 }).await;
+        } else {
+            call.progress(&Left { left: f32::from(left) }).unwrap();
+            unit.with_state(|fork| fork.driving = Some((call, left - 1))).unwrap();
+        }
+    }
 }
 
 /// How a program for Linux would serve `tilt`.
@@ -118,15 +172,21 @@ fn start(bench: &Bench, identity: &Identity, config: impl FnOnce(cara_embassy::S
 
 /// A manager and the fork, which publishes what `offer` adds.
 fn pair(bench: &Bench, offer: impl FnOnce(Unit)) -> (Board, Unit, Unit) {
+    let (board, calling, serving, _) = pair_with_boards(bench, offer);
+    (board, calling, serving)
+}
+
+/// The same, with the board of the fork.
+fn pair_with_boards(bench: &Bench, offer: impl FnOnce(Unit)) -> (Board, Unit, Unit, Board) {
     let (manager, agv) = (Identity::m_unit("manager", 1).unwrap(), Identity::s_unit("agv", 7).unwrap());
     let (board, calling) = start(bench, &manager, |keys| Config::m_unit("manager", 1, keys).unwrap());
-    let (_, serving) = start(bench, &agv, |keys| Config::s_unit("agv", 7, "manager", 1, keys).unwrap());
+    let (at_fork, serving) = start(bench, &agv, |keys| Config::s_unit("agv", 7, "manager", 1, keys).unwrap());
     offer(serving);
     serving.publish_my_function_list().unwrap();
     let knows =
         || calling.peer("agv").is_ok_and(|peer| peer.their_function_list().len() == serving.my_function_list().len());
     assert!(bench.run_until(knows, LONG), "they meet");
-    (board, calling, serving)
+    (board, calling, serving, at_fork)
 }
 
 fn finish<R: 'static>(bench: &Bench, board: &Board, future: impl Future<Output = R> + 'static) -> R {
@@ -183,6 +243,32 @@ fn another_version_is_told_before_anything_is_sent() {
     let told = finish(&bench, &board, async move { LiftAsyncClient::at(&peer).lift_to(1.5).await });
     let told = told.unwrap_err().to_string();
     assert!(told.contains("lift_to") && told.contains("height is int there and float here"), "{told}");
+}
+
+#[test]
+fn a_method_takes_its_call_and_a_task_tells_how_far_it_is() {
+    let bench = Bench::new(4);
+    let (board, manager, fork, at_fork) =
+        pair_with_boards(&bench, |unit| unit.my_function_list().serve(DriveServer).unwrap());
+    at_fork.spawn(drive(fork));
+    let peer = manager.peer("agv").unwrap();
+    finish(&bench, &board, async move {
+        let client = DriveAsyncClient::at(&peer);
+        let mut told = Vec::new();
+        let heard = |Left { left }| {
+            told.push(left);
+            ControlFlow::Continue(())
+        };
+        assert_eq!(client.watch_drive(3, heard).await, Ok(Arrived { metres: 7 }));
+        assert_eq!(told, [3.0, 2.0, 1.0]);
+        let failed = client.watch_drive(10, |_| unreachable!("it does not begin")).await.unwrap_err();
+        assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(3))));
+        assert_eq!((failed.text.as_str(), failed.values), ("it is too far", Some(TooHeavy { kilograms: 900 })));
+        assert_eq!(client.drive(0).await, Ok(Arrived { metres: 0 }), "without taking it");
+        let failed = client.watch_drive(9, |_| ControlFlow::Break(())).await.unwrap_err();
+        assert_eq!(failed.error, CallError::Call(Error::Cancelled));
+    });
+    assert!(bench.run_until(|| fork.with_state(|fork| fork.losses).unwrap() == 1, LONG), "its service sees it");
 }
 
 /// A service that the runner runs tells no progress, since it has ended before anything can be sent.
