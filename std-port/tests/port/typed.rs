@@ -218,12 +218,7 @@ trait Drive {
     /// Drives there.
     #[actuator(motor)]
     #[lease(ms = 60_000)]
-    fn go_to(
-        &mut self,
-        call: &impl AnyCall,
-        #[unit = "mm"] position: [i64; 2],
-        speed: u8,
-    ) -> Result<(), ServiceError>;
+    fn go_to(&mut self, call: &impl AnyCall, #[unit = "mm"] position: [i64; 2], speed: u8) -> Result<(), ServiceError>;
 
     #[priority(emergency)]
     #[actuator(motor)]
