@@ -2,7 +2,7 @@
 //!
 //! A signature exists in one encoding, which is stored and travels as it is: name length u8, name, number of
 //! arguments u8, arguments, number of results u8, results; where declared, a section u8, its number of variables u8 and
-//! those, for the progress of calls (1) and for the values of failures (2), behind which [help](super::help) may stand; each variable: type u8, name length u8, size u32
+//! those, for the progress of calls (1) and for the values of failures (2), behind which help may stand; each variable: type u8, name length u8, size u32
 //! little-endian, name, and what a list or record is made of. [`Definition`] owns one, [`Signature`] borrows one.
 
 use core::fmt;
