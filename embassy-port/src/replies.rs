@@ -212,11 +212,15 @@ impl<T> Machine<T> {
         block::read(called(links, call).ok_or(Error::ResultLost)?.results(), bytes, parameters)
     }
 
-    /// Reads what a call has told last into `values`, once; `false` when there is nothing new, or no room for it.
+    /// Reads what a call has told last into `values`, once; `false` when there is nothing new, no room for it, or when the call
+    /// has ended.
     #[cfg(feature = "details")]
     pub(crate) fn take_told(&mut self, call: &InFlight, values: &mut ParametersView) -> bool {
         let Self { links, reply, .. } = self;
-        let (told, called) = (reply.take_told(call), called(links, call));
+        let goes_on = |waiter: &Waiter| waiter.call == *call && waiter.outcome.is_none();
+        let link = links.get(usize::from(call.link));
+        let goes_on = link.is_some_and(|link| link.waiters.iter().flatten().any(goes_on));
+        let (told, called) = (reply.take_told(call), called(links, call).filter(|_| goes_on));
         told.zip(called).is_some_and(|(bytes, called)| block::read(called.progress(), bytes, values).is_ok())
     }
 
