@@ -12,7 +12,7 @@ pub struct Capacities {
     pub published_to_one: usize,
     /// Functions kept of each peer's list.
     pub their_functions: usize,
-    /// Bytes for their signatures, per peer. Help on functions is kept in the first half of them.
+    /// Bytes for their signatures, per peer. Help on functions is kept as long as all functions have room.
     pub their_signature_bytes: usize,
     /// Blocking calls in flight to one peer.
     pub calls_in_flight: usize,

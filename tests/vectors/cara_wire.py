@@ -547,12 +547,14 @@ def decode_signature(data):
     name = read_name(reader, reader.u8())
     arguments = read_variables(reader)
     results = read_variables(reader)
-    sections, people, last, end = {}, [], 0, len(data)
+    sections, people, last, end, whole = {}, [], 0, len(data), len(data)
     while reader.at < len(data):
         section = reader.u8()
         require(section > last)
         if section >= HELP > last:
             end = reader.at - 1
+        if section > HELP >= last:
+            whole = reader.at - 1
         last = section
         if section in SECTIONS:
             sections[SECTIONS[section][0]] = read_variables(reader)
@@ -566,11 +568,17 @@ def decode_signature(data):
     text = text_form(name, arguments, results, sections)
     require(end <= 1024)
     # Too long with its help, it is kept without.
-    people = people if len(data) <= 1024 else []
-    said = {"help": next((text for number, text in people if number == 0), "")}
-    said["units"] = [text.split(" ", 1) for number, text in people if number == 1 and " " in text]
+    people = people if whole <= 1024 else []
+    said = {"help": cut(next((text for number, text in people if number == 0), ""), 160)}
+    units = [text.split(" ", 1) for number, text in people if number == 1 and " " in text]
+    said["units"] = [[variable, cut(unit, 16)] for variable, unit in units]
     said = {key: value for key, value in said.items() if value}
     return {"name": name, "arguments": arguments, "results": results, **sections, **said, "text": text}
+
+
+def cut(text, most):
+    """As much of it as so many bytes of UTF-8 hold."""
+    return text.encode()[:most].decode(errors="ignore")
 
 
 def encode_signature(signature):

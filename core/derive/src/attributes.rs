@@ -78,15 +78,16 @@ pub(crate) fn text(attribute: &Attribute) -> Result<LitStr> {
 
 /// The documentation's first paragraph as one line, with as much of it as a line of help may have.
 pub(crate) fn first_line(attributes: &[Attribute]) -> String {
-    let line = |attribute: &Attribute| match &attribute.meta {
+    let text = |attribute: &Attribute| match &attribute.meta {
         Meta::NameValue(pair) if attribute.path().is_ident("doc") => match &pair.value {
-            Expr::Lit(ExprLit { lit: Lit::Str(text), .. }) => Some(text.value().trim().to_owned()),
+            Expr::Lit(ExprLit { lit: Lit::Str(text), .. }) => Some(text.value()),
             _ => None,
         },
         _ => None,
     };
-    let paragraph =
-        attributes.iter().filter_map(line).take_while(|line| !line.is_empty()).collect::<Vec<_>>().join(" ");
+    let text = attributes.iter().filter_map(text).collect::<Vec<_>>().join("\n");
+    let lines = text.lines().map(str::trim).skip_while(|line| line.is_empty());
+    let paragraph = lines.take_while(|line| !line.is_empty()).collect::<Vec<_>>().join(" ");
     if paragraph.len() <= HELP_BYTES {
         return paragraph;
     }

@@ -167,7 +167,8 @@ fn prepared(interface: &Interface, function: &Function, root: &TokenStream) -> T
 
 /// The documentation of a call.
 fn help(function: &Function) -> String {
-    if function.help.is_empty() { format!("Calls `{}`.", function.name) } else { function.help.clone() }
+    // A line of help that is an attribute may be another node's, which is no documentation: rustdoc would run code in it.
+    if function.about.is_empty() { format!("Calls `{}`.", function.name) } else { function.about.clone() }
 }
 
 fn blocking(interface: &Interface, function: &Function, root: &TokenStream) -> TokenStream {

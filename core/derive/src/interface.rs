@@ -33,7 +33,9 @@ pub(crate) struct Function {
     /// It returns a `Result`.
     pub(crate) can_fail: bool,
     pub(crate) attributes: Attributes,
-    /// A line of it.
+    /// The first paragraph of its documentation.
+    pub(crate) about: String,
+    /// What people at other nodes are told.
     pub(crate) help: String,
 }
 
@@ -164,9 +166,10 @@ impl Function {
             return Err(Error::new(span, "an argument with #[variables] is the only one"));
         }
         let (results, can_fail) = read_results(&signature.output, returns)?;
-        let help = help.unwrap_or_else(|| first_line(&item.attrs));
+        let about = first_line(&item.attrs);
+        let help = help.unwrap_or_else(|| about.clone());
         let name = name.unwrap_or_else(|| plain(&ident));
-        let function = Self { ident, name, takes_state, is_async, inputs, results, can_fail, attributes, help };
+        let function = Self { ident, name, takes_state, is_async, inputs, results, can_fail, attributes, about, help };
         function.check(span)?;
         make_future(item);
         Ok(function)

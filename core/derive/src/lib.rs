@@ -50,7 +50,7 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// | `#[lease(ms = 400)]` | how long it moves it after the caller's last sign that it wants it |
 /// | `#[stop]`, `#[reset]` | it stops, or lets move again, its actuator or, without one, all |
 /// | `#[idempotent]` | running it twice is as good as running it once |
-/// | `#[help = "…"]` | what it does, in a line for people; the first paragraph of its documentation otherwise |
+/// | `#[help = "…"]` | what it does, in a line for people; the first paragraph of its documentation otherwise. Every peer that may see the function reads it: `#[help = ""]` keeps it back |
 /// | `#[name = "go-to"]` | its name, where it is not the method's |
 ///
 /// Arguments have `#[size(200)]`, `#[name = "…"]` and `#[unit = "m"]` as fields do, and names of results too: `#[returns(#[unit = "%"] charge)]`. One

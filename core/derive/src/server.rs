@@ -137,11 +137,10 @@ fn arguments(function: &Function, root: &TokenStream) -> (Vec<TokenStream>, Vec<
             Input::Call(call) if call.is_state => passed.push(quote!(&state)),
             Input::Call(_) if function.is_async => passed.push(quote!(&call)),
             Input::Call(_) => passed.push(quote!(call)),
-            Input::Variable(argument, variable) => {
+            Input::Variable(_, variable) => {
                 let read = variable.argument(root, place);
                 let local = format_ident!("argument_{}", place);
                 place += 1;
-                let _ = argument;
                 reads.push(quote!(let #local = #read?;));
                 passed.push(quote!(#local));
             }

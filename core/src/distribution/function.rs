@@ -198,8 +198,10 @@ impl<'a> Signature<'a> {
     pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
         let (name, arguments, results) = Self::split(bytes).ok_or(Error::Malformed)?;
         let whole = Self { bytes };
-        let has_room = cfg!(feature = "help") && bytes.len() <= SIGNATURE_BYTES;
-        let this = if has_room { whole } else { whole.without_help() };
+        // What a later version may have behind it is of no use.
+        let with_help = whole.in_front_of(help::SECTION.saturating_add(1));
+        let has_room = cfg!(feature = "help") && with_help.bytes.len() <= SIGNATURE_BYTES;
+        let this = if has_room { with_help } else { whole.without_help() };
         if this.bytes.len() > SIGNATURE_BYTES {
             return Err(Error::Malformed);
         }
@@ -239,9 +241,14 @@ impl<'a> Signature<'a> {
 
     /// What people read is not in it.
     pub(crate) fn without_help(self) -> Self {
+        self.in_front_of(help::SECTION)
+    }
+
+    /// All in front of this section and those with greater numbers.
+    fn in_front_of(self, end: u8) -> Self {
         let mut rest = self.results().behind();
         while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {
-            if section >= help::SECTION {
+            if section >= end {
                 break;
             }
             rest = VariableSpecs::of_checked(Some(behind)).behind();

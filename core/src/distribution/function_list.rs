@@ -166,7 +166,7 @@ impl<S: Storage> TheirFunctionList<S> {
     }
 
     /// Lets it grow to so many functions, and so many bytes of signatures, where the storage has an allocator. It keeps help on
-    /// functions then, in the first half of these bytes.
+    /// functions then, as long as there is room for all functions.
     pub const fn let_grow(&mut self, functions: usize, bytes: usize) {
         self.most = (functions, bytes);
     }
@@ -204,11 +204,14 @@ impl<S: Storage> TheirFunctionList<S> {
             self.skipped = self.skipped.saturating_add(1);
             return Ok(());
         }
-        // Help leaves half of the room to functions, so that none is skipped for it.
-        let with_help = self.table.used_bytes().saturating_add(signature.as_bytes().len());
-        let has_room = cfg!(feature = "help") && with_help <= self.most.1.div_ceil(2);
-        let kept = if has_room { signature } else { signature.without_help() };
-        let put = self.put(slot, generation, attributes, kept.as_bytes());
+        // A list that does not grow, as on a board, has no use for help. Rather all without it than one function skipped.
+        let keeps_help = cfg!(feature = "help") && self.most.1 > 0;
+        let kept = if keeps_help { signature } else { signature.without_help() };
+        let mut put = self.put(slot, generation, attributes, kept.as_bytes());
+        if keeps_help && put == Err(Error::Full(Limit::SignatureBytes)) {
+            self.table.forget_help();
+            put = self.put(slot, generation, attributes, signature.without_help().as_bytes());
+        }
         if put.is_err() {
             self.skipped = self.skipped.saturating_add(1);
         }

@@ -95,7 +95,7 @@ fn cut(text: &str, most: usize) -> &str {
 impl<'a> Signature<'a> {
     /// What the function does, in a line for people; empty where nothing is said.
     pub fn help(&self) -> &'a str {
-        self.lines().find(|line| line.size == HELP).map_or("", |line| line.name)
+        self.lines().find(|line| line.size == HELP).map_or("", |line| cut(line.name, HELP_BYTES))
     }
 
     /// The unit of the variable of this name, as `m`.
@@ -105,7 +105,8 @@ impl<'a> Signature<'a> {
 
     /// The variables that have units, and these.
     pub fn units(&self) -> impl Iterator<Item = (&'a str, &'a str)> + use<'a> {
-        self.lines().filter(|line| line.size == UNIT).filter_map(|line| line.name.split_once(' '))
+        let units = self.lines().filter(|line| line.size == UNIT).filter_map(|line| line.name.split_once(' '));
+        units.map(|(variable, unit)| (variable, cut(unit, UNIT_BYTES)))
     }
 
     /// The lines in the form of variables, whose names are the texts.

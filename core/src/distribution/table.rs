@@ -145,10 +145,6 @@ impl<S: Storage, H: 'static> Table<S, H> {
         }
     }
 
-    pub(super) const fn used_bytes(&self) -> usize {
-        self.used
-    }
-
     pub(super) fn free_bytes(&self) -> usize {
         self.bytes.len().saturating_sub(self.used)
     }
@@ -182,18 +178,35 @@ impl<S: Storage, H: 'static> Table<S, H> {
     pub(super) fn take(&mut self, index: usize) -> Option<Stored<H>> {
         let removed = self.entries.get_mut(index)?.function.take()?;
         self.len = self.len.saturating_sub(1);
-        let length = usize::from(removed.length);
-        if let Some(tail) = self.bytes.get_mut(removed.at as usize..self.used) {
+        self.cut_out(removed.at, usize::from(removed.length));
+        Some(removed)
+    }
+
+    /// Closes a gap in the arena.
+    fn cut_out(&mut self, at: u32, length: usize) {
+        if let Some(tail) = self.bytes.get_mut(at as usize..self.used) {
             let end = tail.len();
             move_down(tail, length..end);
         }
         self.used = self.used.saturating_sub(length);
         for stored in self.entries.iter_mut().filter_map(|entry| entry.function.as_mut()) {
-            if stored.at > removed.at {
-                stored.at = stored.at.saturating_sub(u32::from(removed.length));
+            if stored.at > at {
+                stored.at = stored.at.saturating_sub(saturate(length));
             }
         }
-        Some(removed)
+    }
+
+    /// Keeps all functions without their help.
+    pub(super) fn forget_help(&mut self) {
+        for index in 0..self.entries.len() {
+            let bare = self.function(index).map(|function| function.signature.without_help().as_bytes().len());
+            let stored = self.entries.get_mut(index).and_then(|entry| entry.function.as_mut());
+            let Some((bare, stored)) = bare.zip(stored) else { continue };
+            let gap = usize::from(stored.length).saturating_sub(bare);
+            stored.length = bare as u16;
+            let behind = stored.at.saturating_add(saturate(bare));
+            self.cut_out(behind, gap);
+        }
     }
 
     pub(super) fn clear(&mut self) {

@@ -178,8 +178,11 @@ pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     let stream = stream.finish();
     #[cfg(feature = "help")]
     let stream = {
-        let stream = if V::HELP.is_empty() { stream } else { stream.help(V::HELP)? };
-        V::UNITS.iter().try_fold(stream, |stream, (variable, unit)| stream.unit(variable, unit))?
+        // What there is no room for is the help.
+        let told = if V::HELP.is_empty() { Ok(stream.clone()) } else { stream.clone().help(V::HELP) };
+        let mut units = V::UNITS.iter();
+        let told = told.and_then(|told| units.try_fold(told, |told, (variable, unit)| told.unit(variable, unit)));
+        told.unwrap_or(stream)
     };
     Ok(stream)
 }

@@ -1,5 +1,7 @@
 //! Units, nodes, refusals and events in the control socket's form.
 
+use std::collections::BTreeMap;
+
 use crate::Finding;
 use cara_core::config::{Constraints, Priority, VERSIONS};
 use cara_core::distribution::identity::{Epoch, Identity};
@@ -92,12 +94,16 @@ pub(super) fn refused(finding: &Finding, age: Duration) -> RefusedInfo {
 
 pub(super) fn function(function: &TheirFunction) -> FunctionInfo {
     let signature = function.definition.signature();
+    let mut units = BTreeMap::new();
+    for (variable, unit) in signature.units() {
+        units.entry(variable.to_owned()).or_insert_with(|| unit.to_owned());
+    }
     FunctionInfo {
         name: signature.name().to_owned(),
         signature: signature.to_string(),
         attributes: function.attributes,
         help: signature.help().to_owned(),
-        units: signature.units().map(|(variable, unit)| (variable.to_owned(), unit.to_owned())).collect(),
+        units,
     }
 }
 

@@ -39,18 +39,20 @@ fn a_signature_without_room_stays_as_it_was() {
     assert_eq!(full.help(&"a".repeat(HELP_BYTES)), Err(Error::Full(Limit::SignatureBytes)));
 }
 
-/// Half of the room is for signatures alone, so that help keeps no function away.
+/// Rather all functions without help than one of them skipped.
 #[test]
-fn a_list_keeps_help_in_the_first_half_of_its_room() {
+fn help_keeps_no_function_away() {
     let named = |name: &str| Definition::parse(&format!("{name}(height: float)")).unwrap().help("Lifts.").unwrap();
     let length = named("a").as_bytes().len();
     let mut list = TheirFunctionList::<Boxed>::new([].into(), [].into());
-    list.let_grow(3, 4 * length);
-    for (slot, name) in ["a", "b", "c"].into_iter().enumerate() {
+    list.let_grow(3, 3 * length - 1);
+    for (slot, (name, kept)) in [("a", "Lifts."), ("b", "Lifts."), ("c", "")].into_iter().enumerate() {
         list.insert(Slot(slot as u16), Generation(0), Attributes::default(), named(name).as_bytes()).unwrap();
+        let shown: Vec<_> = list.iter().map(|function| (function.name(), function.signature.help())).collect();
+        let wanted = ["a", "b", "c"].into_iter().take(slot + 1).map(|name| (name, kept)).collect::<Vec<_>>();
+        assert_eq!(shown, wanted);
     }
-    let kept: Vec<_> = list.iter().map(|function| function.signature.help()).collect();
-    assert_eq!((kept, list.skipped()), (std::vec!["Lifts.", "Lifts.", ""], 0));
+    assert_eq!((list.named("c").unwrap().signature.arguments().count(), list.skipped()), (1, 0));
     // One that does not grow, as on a board, has no use for it.
     let mut fixed = TheirFunctionList::<Boxed>::new([Entry::empty()].into(), std::vec![0; 4 * length].into());
     fixed.insert(Slot(0), Generation(0), Attributes::default(), named("a").as_bytes()).unwrap();
@@ -66,6 +68,12 @@ fn what_arrives_in_another_form_is_refused_or_read() {
     // A unit without a name, and a line of a later version.
     assert_eq!(with(&[3, 1, 2, 1, 1, 0, 0, 0, b'm']), Ok(0));
     assert_eq!(with(&[3, 1, 2, 1, 9, 0, 0, 0, b'm']), Ok(0));
+    // What stands behind it is not kept, so that a line that is added stands in it.
+    let later =
+        Signature::decode(&[plain.as_bytes(), &[4, 1, 0, 1, 1, 0, 0, 0, b'x']].concat()).unwrap().to_definition();
+    assert_eq!(later.help("Lifts.").unwrap().signature().help(), "Lifts.");
+    let long = [plain.as_bytes(), &[3, 1, 2, 200, 0, 0, 0, 0], &[b'a'; 200]].concat();
+    assert_eq!(Signature::decode(&long).unwrap().help().len(), HELP_BYTES);
     assert_eq!(with(&[3, 0]), Err(Error::Malformed));
     assert_eq!(with(&[3, 1, 2, 2, 0, 0, 0, 0, b'm']), Err(Error::Malformed));
     assert_eq!(with(&[3, 1, 2, 1, 0, 0, 0, 0, 0xff]), Err(Error::Malformed));

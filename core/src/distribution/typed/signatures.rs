@@ -30,7 +30,9 @@ impl Declared<'_> {
         let fixed = name.len().saturating_add(3);
         let bytes = fixed.saturating_add(bytes_of_specs(self.arguments)).saturating_add(bytes_of_specs(self.results));
         let bytes = bytes.saturating_add(bytes_of_section(self.progress)).saturating_add(bytes_of_section(self.fails));
-        bytes.saturating_add(self.bytes_of_help())
+        let with_help = bytes.saturating_add(self.bytes_of_help());
+        // What there is no room for is the help.
+        if with_help > SIGNATURE_BYTES { bytes } else { with_help }
     }
 
     /// None where the core is built without help.
@@ -247,7 +249,7 @@ impl<const BYTES: usize> Encoded<BYTES> {
         let rest = put_specs(rest, declared.results);
         let rest = put_section(rest, 1, declared.progress);
         let rest = put_section(rest, 2, declared.fails);
-        let rest = put_help(rest, &declared);
+        let rest = if rest.is_empty() { rest } else { put_help(rest, &declared) };
         if rest.is_empty() && BYTES == declared.encoded_bytes(name) {
             Ok(Self { bytes })
         } else {
@@ -319,14 +321,20 @@ const fn check(name: &str, declared: &Declared<'_>) -> Result<(), &'static str> 
         return Err("a line of help has at most `HELP_BYTES` bytes");
     }
     let mut units = EachUnit { now: &[], later: units };
-    while let Some((_, unit)) = units.next() {
+    while let Some((variable, unit)) = units.next() {
         if unit.len() > UNIT_BYTES {
             return Err("a unit has at most `UNIT_BYTES` bytes");
+        }
+        let mut others = EachUnit { now: units.now, later: units.later };
+        while let Some((other, theirs)) = others.next() {
+            if is_same(variable, other) && !is_same(unit, theirs) {
+                return Err("variables of one name have one unit");
+            }
         }
     }
     if declared.encoded_bytes(name) > SIGNATURE_BYTES {
         return Err(
-            "the names of a function and its variables, its help and its units are too long together: `SIGNATURE_BYTES` bytes with 6 for each",
+            "the names of a function, its arguments and its results are too long together: `SIGNATURE_BYTES` bytes with 6 for each",
         );
     }
     Ok(())

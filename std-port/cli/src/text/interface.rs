@@ -23,7 +23,10 @@ const KEYWORDS: [&str; 46] = [
 pub(crate) fn interface(node: &str, functions: &[FunctionInfo]) -> Result<String, String> {
     let name = trait_name(node);
     // A record is made of something, so it is none of these.
-    let known = [&*name, "ServiceError", "TypedCall"].map(|taken| (Vec::new(), taken.to_owned())).to_vec();
+    let made = ["Server", "Client", "AsyncClient"].map(|what| format!("{name}{what}"));
+    let used = [&*name, "ServiceError", "TypedCall", "Variables", "Result", "Option", "String", "Vec"];
+    let known =
+        used.into_iter().chain(made.iter().map(String::as_str)).map(|taken| (Vec::new(), taken.to_owned())).collect();
     let (mut methods, mut taken, mut structs) = (String::new(), Vec::new(), Structs { known, source: String::new() });
     let mut streams = String::new();
     for function in functions {
@@ -86,7 +89,7 @@ impl Structs {
             let rust = rust_type(&field, false, &format!("{way} {}", field.name), self);
             source += &format!("    pub {ident}: {rust},\n");
         }
-        self.source += &documentation(help, "");
+        self.source += &comment(help);
         self.source += &format!("#[derive(Variables, Clone, Debug, PartialEq)]\npub struct {name} {{\n{source}}}\n\n");
         name
     }
@@ -101,7 +104,9 @@ fn method(
 ) -> fmt::Result {
     let (name, signature) = (definition.name(), definition.signature());
     let ident = identifier(name, taken);
-    source.push_str(&documentation(help, "    "));
+    if !help.is_empty() {
+        writeln!(source, "    #[help = {help:?}]")?;
+    }
     if plain(&ident) != name {
         writeln!(source, "    #[name = \"{name}\"]")?;
     }
@@ -179,7 +184,9 @@ fn key(fields: VariableSpecs<'_>, units: &Units) -> Vec<u8> {
         key.extend(size.to_le_bytes());
         key.extend(name.as_bytes());
         key.extend(inner);
-        key.extend(units.get(name).into_iter().flat_map(|unit| unit.bytes()));
+        let unit = units.get(name).map_or("", String::as_str);
+        key.push(unit.len() as u8);
+        key.extend(unit.bytes());
     }
     key
 }
@@ -196,10 +203,11 @@ fn said(spec: &VariableSpec<'_>, units: &Units) -> String {
     size(spec).into_iter().chain(unit).map(|attribute| attribute + " ").collect()
 }
 
-/// The line of documentation that a line of help becomes. What would begin another line is left out: a node says what it likes.
-fn documentation(help: &str, indent: &str) -> String {
+/// A line of help as a comment. It is no documentation, whose code rustdoc would run, and has no line breaks: a node says what
+/// it likes.
+fn comment(help: &str) -> String {
     let shown: String = help.chars().map(|character| if is_hidden(character) { ' ' } else { character }).collect();
-    if shown.is_empty() { shown } else { format!("{indent}/// {shown}\n") }
+    if shown.is_empty() { shown } else { format!("// {shown}\n") }
 }
 
 /// `#[size(50, 32)]` of a list of 50 texts of 32 bytes. That of one at most is an `Option`, which has no size.

@@ -1,13 +1,16 @@
 //! Functions and values in the form of the page. Whole numbers are text there: a page's numbers are exact to 53 bits only.
 //! Every other type has the form of the control socket, so that a type that comes later passes through as it is.
 
-use cara_std::Definition;
 use cara_std::control::protocol::{Argument, CallQuestion, FunctionInfo};
+use cara_std::{Definition, Shown};
 use serde_json::{Value, json};
 
 /// A function with what it takes and returns, each with name, type and size; null where its signature cannot be read.
 pub(crate) fn function(info: &FunctionInfo) -> Value {
     let mut told = json!(info);
+    if !info.help.is_empty() {
+        told["help"] = Shown(&info.help).to_string().into();
+    }
     let definition = Definition::parse(&info.signature).ok();
     let variables = |results: bool| {
         let signature = definition.as_ref()?.signature();
@@ -17,7 +20,7 @@ pub(crate) fn function(info: &FunctionInfo) -> Value {
                 .map(|spec| {
                     let mut variable = json!({ "name": spec.name, "type": spec.kind.to_string(), "size": spec.size });
                     if let Some(unit) = info.units.get(spec.name) {
-                        variable["unit"] = unit.as_str().into();
+                        variable["unit"] = Shown(unit).to_string().into();
                     }
                     variable
                 })

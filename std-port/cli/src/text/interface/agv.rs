@@ -39,7 +39,7 @@ pub struct DockFailure {
 
 #[interface]
 pub trait Agv17 {
-    /// Tells where it is, or goes to be.
+    #[help = "Tells where it is, or goes \"to be\"."]
     #[idempotent]
     #[returns(#[unit = "m"] position)]
     fn pos_info(&mut self, #[unit = "m"] position: [i64; 2]) -> Result<[i64; 2], ServiceError>;

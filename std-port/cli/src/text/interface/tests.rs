@@ -91,7 +91,7 @@ fn streams_are_printed_as_structs() {
     let source = interface("agv/17", &functions).unwrap();
     let derive = "#[derive(Variables, Clone, Debug, PartialEq)]\npub struct";
     let structs = format!(
-        "/// Where it is now.\n{derive} Pose {{\n    #[unit = \"m\"]\n    pub position: [f64; 2],\n}}\n\n\
+        "// Where it is now.\n{derive} Pose {{\n    #[unit = \"m\"]\n    pub position: [f64; 2],\n}}\n\n\
          {derive} AtDock {{\n    pub position: [f64; 2],\n}}\n\n"
     );
     let streams = "// Values of the stream `pose` are a `Pose`.\n// Values of the stream `at_dock` are a `AtDock`.\n\

@@ -203,8 +203,7 @@ const READ = {
 };
 
 function field(name, input) {
-  const { type, size, unit, help } = input;
-  const more = [unit, help].filter(Boolean).join(", ");
+  const { type, size, unit: more } = input;
   if (type === "string" || type === "bytes") return textField(input, more);
   if (type === "bool" && size <= FIELDS) return truths(input, more);
   if (READ[type]) return numbers(input, more);
