@@ -199,10 +199,10 @@ pub(super) fn difference<const N: usize>(
         (here, there) = next;
         let name = here.or(there).map_or(&[][..], |spec| spec.name);
         // What is behind a name without room is left out as well: it would seem to be in what stands before.
-        let (end, name) = (path.len(), core::str::from_utf8(name).unwrap_or_default());
-        has_room = has_room && path.push_str(way).and_then(|()| path.push_str(name)).is_ok();
-        if !has_room {
-            path.truncate(end);
+        let name = core::str::from_utf8(name).unwrap_or_default();
+        has_room &= path.len().saturating_add(way.len()).saturating_add(name.len()) <= N;
+        if has_room {
+            let _ = path.push_str(way).and_then(|()| path.push_str(name));
         }
         if here.zip(there).is_some_and(|(one, other)| one.name != other.name) {
             there = None;
