@@ -161,6 +161,13 @@ impl Function {
             }
         }
         let span = signature.ident.span();
+        let tells = |input: &&Input| matches!(input, Input::Call(call) if !call.is_state);
+        if inputs.iter().filter(tells).count() > 1 {
+            return Err(Error::new(
+                span,
+                "a function has one argument that tells about its call: join the bounds with `+`",
+            ));
+        }
         let variables = inputs.iter().filter(|input| !matches!(input, Input::Call(_))).count();
         if variables > 1 && inputs.iter().any(|input| matches!(input, Input::Struct(..))) {
             return Err(Error::new(span, "an argument with #[variables] is the only one"));
