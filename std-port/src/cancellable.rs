@@ -61,7 +61,7 @@ impl<T: Send + 'static> BlockingCaller for Cancellable<T> {
     type Hold = Hold<T>;
 
     fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error> {
-        let outcome = self.peer.block_request_cancellable(function, parameters, options, &self.canceller, |_| {});
+        let outcome = self.peer.block_request_watched(function, parameters, options, &self.canceller, None);
         outcome.map_err(|failed| failed.error)
     }
 
@@ -71,8 +71,7 @@ impl<T: Send + 'static> BlockingCaller for Cancellable<T> {
         parameters: &mut ParametersView,
         options: &RequestOptions,
     ) -> Result<Hold<T>, Error> {
-        let on_progress = &mut |_: &ParametersView| ControlFlow::Continue(());
-        let mut watch = Watch { on_progress, canceller: &self.canceller, failure: None };
+        let mut watch = Watch { on_progress: None, canceller: &self.canceller, failure: None };
         let held = self.peer.engine.hold(self.peer.link()?, function, parameters, options, Some(&mut watch));
         held.map(Hold::new)
     }
@@ -88,7 +87,7 @@ impl<T: Send + 'static> WatchingCaller for Cancellable<T> {
         why: &mut Option<Failure>,
     ) -> Result<(), Error> {
         let Self { peer, canceller } = self;
-        let outcome = peer.block_request_watched(function, parameters, options, canceller, &mut on_progress);
+        let outcome = peer.block_request_watched(function, parameters, options, canceller, Some(&mut on_progress));
         outcome.map_err(|failed| {
             let CallFailure { error, failure } = *failed;
             *why = failure;

@@ -24,7 +24,7 @@ use crate::cancellable::Cancellable;
 use crate::control::protocol::LinkInfo;
 #[cfg(feature = "control")]
 use crate::engine::CallFuture;
-use crate::engine::details::{Canceller, Watch};
+use crate::engine::details::{Canceller, OnProgress, Watch};
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
 use crate::engine::{Engine, pairs};
@@ -335,7 +335,7 @@ impl<T: Send + 'static> Peer<T> {
         mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
     ) -> Result<(), Box<CallFailure>> {
         let parameters = self.with_room(function, parameters);
-        self.block_request_watched(function, parameters, options, &Canceller::new(), &mut on_progress)
+        self.block_request_watched(function, parameters, options, &Canceller::new(), Some(&mut on_progress))
     }
 
     /// The same for a call that another thread may give up. Typed clients have [`cancelled_by`](Self::cancelled_by).
@@ -352,7 +352,7 @@ impl<T: Send + 'static> Peer<T> {
             ControlFlow::Continue(())
         };
         let parameters = self.with_room(function, parameters);
-        self.block_request_watched(function, parameters, options, canceller, &mut told)
+        self.block_request_watched(function, parameters, options, canceller, Some(&mut told))
     }
 
     /// This peer for typed clients, whose calls another thread may give up.
@@ -375,13 +375,13 @@ impl<T: Send + 'static> Peer<T> {
         parameters.view_mut()
     }
 
-    pub(crate) fn block_request_watched(
+    pub(crate) fn block_request_watched<'w>(
         &self,
         function: &str,
         parameters: &mut ParametersView,
         options: &RequestOptions,
-        canceller: &Canceller,
-        on_progress: &mut dyn FnMut(&ParametersView) -> ControlFlow<()>,
+        canceller: &'w Canceller,
+        on_progress: Option<OnProgress<'w>>,
     ) -> Result<(), Box<CallFailure>> {
         let mut watch = Watch { on_progress, canceller, failure: None };
         let link = self.link().map_err(|error| Box::new(error.into()))?;

@@ -94,7 +94,7 @@ impl<T: Send + 'static> Engine<T> {
         watch: &mut Watch<'_>,
     ) -> Result<CallId, Error> {
         let noted = self.noted(link, function, options);
-        let options = RequestOptions { progress: true, ..*options };
+        let options = RequestOptions { progress: watch.on_progress.is_some(), ..*options };
         let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
             let mut begun = self.begin_call(link, function, parameters, &options, Some(watch.canceller))?;
@@ -196,10 +196,10 @@ impl<T: Send + 'static> Engine<T> {
                 let told = state.details.take_progress(id).filter(|_| !watch.canceller.is_cancelled());
                 let is_told = told.is_some();
                 let mut flow = ControlFlow::Continue(());
-                if let Some(told) = told {
+                if let Some((told, on_progress)) = told.zip(watch.on_progress.as_mut()) {
                     // What it does may take its time: others read the link meanwhile.
                     self.leave(link, state, token.take());
-                    flow = (watch.on_progress)(&told);
+                    flow = on_progress(&told);
                     state = link.lock();
                     now = self.now();
                 }

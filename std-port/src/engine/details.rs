@@ -231,9 +231,13 @@ impl Canceller {
     }
 }
 
+/// Hears what a call tells; `Break` gives it up.
+pub(crate) type OnProgress<'w> = &'w mut dyn FnMut(&ParametersView) -> ControlFlow<()>;
+
 /// What watches a call whose caller blocks.
 pub(crate) struct Watch<'w> {
-    pub(crate) on_progress: &'w mut dyn FnMut(&ParametersView) -> ControlFlow<()>,
+    /// `None` for a call whose progress nobody asks for.
+    pub(crate) on_progress: Option<OnProgress<'w>>,
     pub(crate) canceller: &'w Canceller,
     pub(crate) failure: Option<Box<Failure>>,
 }

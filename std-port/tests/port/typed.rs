@@ -62,10 +62,13 @@ pub(crate) trait NewestDock {
 #[derive(Default)]
 pub(crate) struct Gate {
     pub(crate) given_up: u32,
+    /// How many have begun.
+    begun: Arc<AtomicUsize>,
 }
 
 impl Dock for Gate {
     fn dock(&mut self, call: &impl TypedCall<Left, Blocked>, from: u32) -> Result<(), ServiceError> {
+        self.begun.fetch_add(1, Ordering::SeqCst);
         for left in (0..from).rev() {
             call.progress(&Left { left })?;
             std::thread::sleep(std::time::Duration::from_millis(20));
@@ -121,7 +124,9 @@ fn progress_and_failures_come_typed() {
 fn another_thread_gives_typed_calls_up() {
     let fleet = fleet();
     let manager = system(fleet).build().unwrap();
-    let agv = unit("agv", 7, fleet).state(Gate::default()).build().unwrap();
+    let gate = Gate::default();
+    let begun = gate.begun.clone();
+    let agv = unit("agv", 7, fleet).state(gate).build().unwrap();
     agv.my_function_list().serve(DockServer).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let cancelled = CallError::Call(Error::Cancelled);
@@ -139,12 +144,16 @@ fn another_thread_gives_typed_calls_up() {
     for (count, watched) in [(1, false), (2, true)] {
         let canceller = Canceller::new();
         std::thread::scope(|scope| {
-            let (told, call) = (agv.counted(LinkCounter::ProgressSent), scope.spawn(|| ask(watched, &canceller)));
-            until("its service runs", || agv.counted(LinkCounter::ProgressSent) > told);
+            let told = || agv.counted(LinkCounter::ProgressSent);
+            let (before, told_before) = (begun.load(Ordering::SeqCst), told());
+            let call = scope.spawn(|| ask(watched, &canceller));
+            until("its service runs", || begun.load(Ordering::SeqCst) > before);
+            until("it tells", || !watched || told() > told_before);
             canceller.cancel();
             assert_eq!(call.join().unwrap(), Err(cancelled.clone()), "watched: {watched}");
         });
         until("its service is told", || agv.with_state(|gate| gate.given_up).unwrap() == count);
+        assert!(watched || agv.counted(LinkCounter::ProgressSent) == 0, "nobody asked for it");
         assert_eq!(ask(watched, &canceller), Err(cancelled.clone()), "all calls behind it are given up");
         assert_eq!(DockClient::at(&peer).dock(1), Ok(()), "others are not");
     }
