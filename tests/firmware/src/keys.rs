@@ -158,6 +158,8 @@ impl Keys {
             words.extend(["--keys".as_ref(), keys.as_os_str()]);
         }
         self.run(words)?;
+        // As the file is left when the power goes while the board makes it.
+        std::fs::write(&boots, [0xFF; 100])?;
         Ok((told, boots))
     }
 

@@ -64,12 +64,13 @@ fn open(path: &Path) -> Result<fs::File, Refused> {
     if path.is_empty() {
         return Err(Refused);
     }
-    if let Ok(file) = fs::File::options().read(true).write(true).open(path) {
-        return Ok(file);
-    }
-    let file = fs::File::options().read(true).write(true).create(true).truncate(true).open(path);
+    let mut options = fs::File::options();
+    options.read(true).write(true);
+    let file = options.open(path).or_else(|_| options.create(true).truncate(true).open(path));
     let mut file = file.map_err(|_| Refused)?;
-    erase(&mut file, 2 * PAGE)?;
+    // Flash is all there from the beginning. The file is not: the power may have gone while it was made.
+    let length = file.seek(SeekFrom::End(0)).map_err(|_| Refused)?;
+    erase(&mut file, (2 * PAGE).saturating_sub(length as u32))?;
     Ok(file)
 }
 
