@@ -2,7 +2,7 @@
 
 use std::ops::{ControlFlow, DerefMut};
 
-use cara_core::distribution::failure::{CallFailure, Failure};
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::Signature;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -12,6 +12,7 @@ use cara_core::typed::{BlockingCaller, Caller, WatchingCaller};
 
 use crate::engine::details::{Canceller, Watch};
 use crate::heart::Hold;
+use crate::interfaces::parted;
 use crate::peer::Peer;
 
 /// A peer for typed clients whose calls another thread may give up: [`Peer::cancelled_by`] makes it.
@@ -88,10 +89,6 @@ impl<T: Send + 'static> WatchingCaller for Cancellable<T> {
     ) -> Result<(), Error> {
         let Self { peer, canceller } = self;
         let outcome = peer.block_request_watched(function, parameters, options, canceller, Some(&mut on_progress));
-        outcome.map_err(|failed| {
-            let CallFailure { error, failure } = *failed;
-            *why = failure;
-            error
-        })
+        outcome.map_err(|failed| parted(failed, why))
     }
 }

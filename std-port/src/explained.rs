@@ -3,13 +3,13 @@
 use std::ops::{ControlFlow, DerefMut};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use cara_core::distribution::failure::{CallFailure, Failure};
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::Signature;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
-use cara_core::typed::{BlockingCaller, Caller};
+use cara_core::typed::{BlockingCaller, Caller, WatchingCaller};
 
 use crate::heart::Hold;
 use crate::peer::Peer;
@@ -76,12 +76,10 @@ impl<T: Send + 'static> BlockingCaller for Explained<T> {
     fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error> {
         *self.last() = None;
         let go_on = |_: &ParametersView| ControlFlow::Continue(());
-        let outcome = self.peer.block_request_with_progress(function, parameters, options, go_on);
-        outcome.map_err(|failed| {
-            let CallFailure { error, failure } = *failed;
-            *self.last() = failure;
-            error
-        })
+        let mut why = None;
+        let outcome = self.peer.block_watched(function, parameters, options, go_on, &mut why);
+        *self.last() = why;
+        outcome
     }
 
     fn block_and_hold(

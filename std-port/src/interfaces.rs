@@ -185,6 +185,13 @@ impl<T: Send + 'static> BlockingCaller for Peer<T> {
     }
 }
 
+/// The error of a call, and in `why` what its service has said of it.
+pub(crate) fn parted(failed: Box<CallFailure>, why: &mut Option<Failure>) -> Error {
+    let CallFailure { error, failure } = *failed;
+    *why = failure;
+    error
+}
+
 impl<T: Send + 'static> WatchingCaller for Peer<T> {
     fn block_watched(
         &self,
@@ -194,11 +201,8 @@ impl<T: Send + 'static> WatchingCaller for Peer<T> {
         on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
         why: &mut Option<Failure>,
     ) -> Result<(), Error> {
-        self.block_request_with_progress(function, parameters, options, on_progress).map_err(|failed| {
-            let CallFailure { error, failure } = *failed;
-            *why = failure;
-            error
-        })
+        let outcome = self.block_request_with_progress(function, parameters, options, on_progress);
+        outcome.map_err(|failed| parted(failed, why))
     }
 }
 
