@@ -55,6 +55,9 @@ pub const DATAGRAM_BYTES: usize = 1400;
 /// The buffer that each link owns: partial frames and handshakes up to this length need no buffer of the pool.
 pub const LINK_BUFFER_BYTES: usize = 512;
 
+/// Managers whose highest claim a unit keeps. Costs 144 bytes each; the claim of a further one is not kept, which is counted.
+pub const OBEYED_MANAGERS: usize = 4;
+
 /// Leases that one peer may hold here, and this unit at one peer. Costs 32 bytes each per link.
 pub const LEASES: usize = 4;
 
@@ -144,6 +147,8 @@ pub struct Constraints {
     pub keep_alive: Duration,
     /// Calls that one peer may have waiting or running here; the next one is answered with `Busy`.
     pub calls_per_peer: u16,
+    /// How long orders of a manager go on once another one of its identity, with a higher claim, wants to command.
+    pub handover: Duration,
     /// Streams of this unit that one peer may be subscribed to; the next subscription is refused.
     #[cfg(feature = "streams")]
     pub subscriptions_per_peer: u16,
@@ -162,6 +167,7 @@ impl Constraints {
         chunk_size: CHUNK_BYTES as u16,
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 64,
+        handover: Duration::from_secs(10),
         #[cfg(feature = "streams")]
         subscriptions_per_peer: 1_024,
         #[cfg(feature = "streams")]
@@ -176,6 +182,7 @@ impl Constraints {
         chunk_size: 1024,
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 8,
+        handover: Duration::from_secs(10),
         #[cfg(feature = "streams")]
         subscriptions_per_peer: 8,
         #[cfg(feature = "streams")]

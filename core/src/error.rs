@@ -137,11 +137,14 @@ pub enum Refusal {
     /// The two have no cipher suite in common.
     #[error("the two units have no cipher suite in common: update one of the two")]
     Suite,
-    /// The manager's term is older than one that the vehicle has obeyed, which the vehicle's hello says.
+    /// The vehicle has obeyed a higher claim of another manager of the same identity.
     #[error(
-        "another manager of this name and id has taken over: find out which of the two is to command, and stop the other one before this one starts again"
+        "the vehicle is under another manager of this name and id: find out which of the two is to command; `--take-over` brings the vehicle here"
     )]
     Fenced,
+    /// The vehicle has an order of another manager of the same identity, and joins this one afterwards.
+    #[error("the vehicle has an order of another manager of this name and id: it joins when that has ended")]
+    Driving,
 }
 
 impl Refusal {
@@ -160,6 +163,7 @@ impl Refusal {
             Self::NoKey => 10,
             Self::Suite => 11,
             Self::Fenced => 12,
+            Self::Driving => 13,
         }
     }
 
@@ -178,6 +182,7 @@ impl Refusal {
             10 => Self::NoKey,
             11 => Self::Suite,
             12 => Self::Fenced,
+            13 => Self::Driving,
             _ => Self::Malformed,
         }
     }
@@ -444,6 +449,11 @@ pub enum Error {
     /// Another process owns the port.
     #[error("the port is in use by a program that does not share it: choose another port, or end that program")]
     PortInUse,
+    /// The keys of an m_unit lack its key with itself, with which it makes its claims.
+    #[error(
+        "the keys of this m_unit lack its key with itself, without which it can claim no vehicle: provision it anew"
+    )]
+    NoOwnKey,
     /// The system does not let this user have the port.
     #[error(
         "the system does not permit this port: below 1024 it takes root or CAP_NET_BIND_SERVICE; choose another one"
@@ -472,6 +482,7 @@ impl Error {
             | Self::TooLarge { .. }
             | Self::WouldDeadlock
             | Self::BadConstraint
+            | Self::NoOwnKey
             | Self::DoesNotFit { .. }
             | Self::SlowHeart { .. }
             | Self::EmergencyWaits => Cause::Configuration,

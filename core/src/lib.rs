@@ -66,7 +66,6 @@ pub mod error;
 mod fmt;
 pub mod random;
 pub mod storage;
-pub mod term;
 pub mod time;
 
 pub mod distribution;

@@ -1,12 +1,12 @@
 //! Configuration of a unit before it starts.
 
 use cara_core::config::Constraints;
+use cara_core::distribution::claim::{Claim, StoredClaim};
 use cara_core::distribution::connection_handler::{NodeConfig, Target};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::services::access::Access;
-use cara_core::term::Term;
 use core::fmt;
 use core::net::SocketAddrV4;
 
@@ -19,8 +19,10 @@ pub struct Config {
     pub(crate) constraints: Option<Constraints>,
     pub(crate) security: Security,
     pub(crate) access: Table,
-    pub(crate) term: Term,
-    pub(crate) keep_term: Option<fn(Term)>,
+    pub(crate) claim: Claim,
+    pub(crate) store_own: Option<fn(Claim) -> bool>,
+    pub(crate) obeyed: StoredClaim,
+    pub(crate) store: Option<fn(&StoredClaim) -> bool>,
 }
 
 /// The access table, if there is one.
@@ -51,7 +53,17 @@ impl Config {
         let (seed, udp_port) = (security.0.seed(), security.0.mode().port());
         let (fleet, epoch, constraints) = (Fleet(0), Epoch(seed), Constraints::S_UNIT);
         let node = NodeConfig { identity, fleet, epoch, target, tcp_port: 0, udp_port, constraints, seed };
-        Self { node, constraints: None, security, access: Table(None), term: Term::NONE, keep_term: None }
+        let (claim, obeyed) = (Claim::NONE, StoredClaim::default());
+        let access = Table(None);
+        Self { node, constraints: None, security, access, claim, store_own: None, obeyed, store: None }
+    }
+
+    /// The manager of an s_unit.
+    pub(crate) fn manager(&self) -> Option<Identity> {
+        match &self.node.target {
+            Target::Everybody => None,
+            Target::Manager(manager) | Target::Fixed(manager, _) => Identity::m_unit(&manager.name, manager.id).ok(),
+        }
     }
 
     /// Units of different fleets on one network do not meet; 0 unless set.
@@ -101,13 +113,19 @@ impl Config {
         self
     }
 
-    /// The term that the board has kept, and what keeps another one. Of an s_unit that is the newest that it has obeyed: `keep` is
-    /// called when a manager with a newer one has joined, before a call of it runs and while no order is live, so that it may
-    /// write to flash. It must not use the unit. Without this, a board that restarts forgets which managers it has to refuse.
-    ///
-    /// An m_unit says `kept`, which its program has claimed and kept before; `keep` is not called.
-    pub fn term(mut self, kept: Term, keep: fn(Term)) -> Self {
-        (self.term, self.keep_term) = (kept, Some(keep));
+    /// The claim that the board has stored in an earlier life, and what stores another one; the default is none. `store` is called before
+    /// the first moving call under another claim and while no order is live, so that it may write to flash; it returns whether it
+    /// is stored, and must not use the unit. Without this, and in plain mode, a board that restarts forgets which managers it has
+    /// to refuse.
+    pub fn obeyed_claim(mut self, stored: StoredClaim, store: fn(&StoredClaim) -> bool) -> Self {
+        (self.obeyed, self.store) = (stored, Some(store));
+        self
+    }
+
+    /// The claim of an m_unit: [raised](Claim::raised) above the last one, and stored, before this; and what stores a higher one, which
+    /// returns whether it is stored. Without this an m_unit begins with the first term in each life.
+    pub fn claim(mut self, claim: Claim, store: fn(Claim) -> bool) -> Self {
+        (self.claim, self.store_own) = (claim, Some(store));
         self
     }
 

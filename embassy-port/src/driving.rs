@@ -5,7 +5,8 @@
 //! once, though only one runs at a time.
 
 use cara_core::distribution::authenticator::Authenticator as _;
-use cara_core::distribution::connection_handler::{Command, NewerTerm, NodeCounter};
+use cara_core::distribution::claim::{Claim, StoredClaim};
+use cara_core::distribution::connection_handler::{ClaimEvent, Command, NodeCounter};
 use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
@@ -150,25 +151,47 @@ impl<T> Machine<T> {
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
             self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
-        self.look_at_terms();
         Some(None)
     }
 
-    /// An s_unit keeps a newer term before a call of the manager runs; an m_unit that is fenced stops.
+    /// Does what the node wants done about claims; whether anything was.
     #[inline(never)]
-    fn look_at_terms(&mut self) {
-        match self.hub.node.take_newer_term() {
+    pub(crate) fn look_at_claims(&mut self) {
+        match self.hub.node.take_claim_event() {
             None => {}
-            Some(NewerTerm::Obeyed(term)) => {
-                if let Some(keep) = self.keep_term {
-                    keep(term);
-                }
+            Some(ClaimEvent::Keep(manager, tagged)) => self.unstored = Some((manager, tagged)),
+            Some(ClaimEvent::Unkept(peer, claim)) => self.tell(UnitEvent::ClaimNotKept { peer, claim }),
+            Some(ClaimEvent::Raise(above)) => {
+                let claimant = self.proof.seed();
+                self.raise_claim(above.raised(claimant));
             }
-            Some(NewerTerm::AtVehicle(term) | NewerTerm::OfManager(term)) => {
+            Some(ClaimEvent::StepDown(by)) => {
                 self.stop();
-                self.tell(UnitEvent::Fenced { term });
+                self.tell(UnitEvent::Fenced { claim: by.claim });
             }
+            Some(_) => {}
         }
+        // Writing to flash may hold up the processor.
+        if !self.moves()
+            && let Some((manager, tagged)) = self.unstored.take()
+        {
+            let key = self.proof.key_of(&manager);
+            let stored = self.store.zip(key).is_some_and(|(store, key)| store(&StoredClaim { tagged, key }));
+            self.hub.node.claim_kept(&manager, tagged.claim, stored);
+        }
+    }
+
+    /// An m_unit's claim is stored, and counts from then on.
+    fn raise_claim(&mut self, claim: Claim) {
+        let identity = self.hub.node.identity().clone();
+        let is_stored = self.store_own.is_none_or(|store| store(claim));
+        let Some(tagged) = claim.tagged(&identity, self.proof.codes()).filter(|_| is_stored) else { return };
+        self.hub.node.set_claim(tagged);
+        for index in self.indices() {
+            self.with(index, |session, cx| session.announce_claim(cx));
+        }
+        self.hub.node.broadcast(now());
+        self.tell(UnitEvent::Raised { claim });
     }
 
     /// Ends every connection in an orderly way, and searches no more.
@@ -306,9 +329,6 @@ impl<T> Machine<T> {
         let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
         let name = |name: &str| Name::try_from(name).unwrap_or_default();
         let Some(told) = UnitEvent::of(event, session, &self.functions, name) else { return };
-        if event == Event::Joined {
-            self.look_at_terms();
-        }
         match &told {
             UnitEvent::Joined { peer } => log!("{} has joined", peer.name()),
             UnitEvent::Left { peer, .. } => log!("{} has left", peer.name()),
@@ -356,7 +376,6 @@ impl<T> Machine<T> {
         self.wakers.leases.wake();
         self.hang_up(index);
         self.hub.node.left(now(), LinkId(index), reason);
-        self.look_at_terms();
         had_joined.then_some(Job::Lost)
     }
 

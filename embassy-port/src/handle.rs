@@ -7,6 +7,7 @@ use core::task::Poll;
 
 use cara_core::config::Constraints;
 use cara_core::counters::Counter;
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::connection_handler::{Finding, NodeCounter};
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
@@ -14,7 +15,6 @@ use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Access;
 use cara_core::services::requests::CallId;
-use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use crate::config::Table;
@@ -70,9 +70,9 @@ impl<T> Handle<T> {
         self.act(Machine::stop);
     }
 
-    /// The term of an m_unit, or the newest that an s_unit has obeyed.
-    pub fn term(&self) -> Term {
-        self.look(|machine| machine.hub.node.term())
+    /// The claim of an m_unit, or the highest that an s_unit has obeyed.
+    pub fn claim(&self) -> Claim {
+        self.look(|machine| machine.hub.node.claim())
     }
 
     // --- peers

@@ -1,6 +1,7 @@
 //! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
 
 use cara_core::counters::Counters;
+use cara_core::distribution::claim::{Claim, StoredClaim, TaggedClaim};
 use cara_core::distribution::connection_handler::Command;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Identity, Role};
@@ -10,7 +11,6 @@ use cara_core::services::hub::Hub;
 use cara_core::services::session::{Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
@@ -88,8 +88,12 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) proof: Proof,
     /// The access table.
     pub(crate) access: Table,
-    /// Keeps a newer term.
-    pub(crate) keep_term: Option<fn(Term)>,
+    /// Stores the claim of an m_unit.
+    pub(crate) store_own: Option<fn(Claim) -> bool>,
+    /// Stores a claim that is obeyed.
+    pub(crate) store: Option<fn(&StoredClaim) -> bool>,
+    /// One that is to be stored as soon as nothing moves.
+    pub(crate) unstored: Option<(Identity, TaggedClaim)>,
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
     pub(crate) links: &'static mut [Link],

@@ -6,9 +6,11 @@ use core::net::SocketAddrV4;
 
 use cara_core::config::{HANDSHAKE_LIFE, LINK_BUFFER_BYTES, Mode};
 use cara_core::counters::Counters;
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeStorage, Order};
 use cara_core::distribution::datagram::SEARCH_BYTES;
 use cara_core::distribution::function_list::{Entry, FunctionList};
+use cara_core::distribution::identity::Role;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
 use cara_core::services::CallHead;
@@ -249,8 +251,19 @@ impl<
             findings: self.findings.write([const { None }; FINDINGS]).as_mut_slice(),
         };
         let (port, tcp_port) = (config.node.udp_port, config.node.tcp_port);
+        let (seed, manager) = (config.node.seed, config.manager());
         let mut node = Node::new(now(), config.node, storage);
-        node.set_term(config.term);
+        if node.identity().role() == Role::MUnit {
+            let claim = if config.claim == Claim::NONE { Claim::NONE.raised(seed) } else { config.claim };
+            let identity = node.identity().clone();
+            node.set_claim(claim.tagged(&identity, config.security.0.codes()).ok_or(Error::NoOwnKey)?);
+        }
+        if let Some(manager) = manager.filter(|_| config.store.is_some() && config.security.0.mode() == Mode::Secured) {
+            if config.security.0.has_key(&manager, &config.obeyed.key) && config.obeyed.tagged.claim != Claim::NONE {
+                node.keep_obeyed(now(), &manager, config.obeyed.tagged);
+            }
+            node.store_claims();
+        }
         let pool = self.pool.write([const { None }; BUFFERS]);
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
@@ -266,7 +279,9 @@ impl<
                 },
                 proof: config.security.0,
                 access: config.access,
-                keep_term: config.keep_term,
+                store_own: config.store_own,
+                store: config.store,
+                unstored: None,
                 functions: FunctionList::new(
                     self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
                     self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),

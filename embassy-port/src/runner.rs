@@ -103,12 +103,12 @@ impl<T> Runner<T> {
         // Answers before new bytes: a call that waits for room holds the parameters that the next call needs.
         self.answer_again(machine);
         machine.look_at_lines();
-        if is_due
-            && !machine.stopped
-            && let Some(command) = machine.poll_node()
-        {
-            machine.act(command);
-            return Step::Again;
+        if is_due && !machine.stopped {
+            if let Some(command) = machine.poll_node() {
+                machine.act(command);
+                return Step::Again;
+            }
+            machine.look_at_claims();
         }
         if let Some(event) = machine.read_datagram(self.scratch, context) {
             let job = event.and_then(|(index, event)| machine.noted(index, event));

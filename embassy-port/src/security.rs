@@ -40,6 +40,7 @@ impl fmt::Debug for Security {
 #[cfg(feature = "secure")]
 mod secured {
     use cara_core::config::Mode;
+    use cara_core::distribution::claim::KEY_FINGERPRINT_BYTES;
     use cara_core::distribution::hello::Hello;
     use cara_core::distribution::identity::Identity;
     use cara_core::services::Keys;
@@ -121,6 +122,19 @@ mod secured {
             }
         }
 
+        /// The fingerprint of the key in use with a peer.
+        pub(crate) fn key_of(&self, peer: &Identity) -> Option<[u8; KEY_FINGERPRINT_BYTES]> {
+            let Self::Keys { codes: Codes::Keyed(ring), .. } = self else { return None };
+            ring.pair(peer).map(|(key, _)| key.fingerprint())
+        }
+
+        /// Whether the key with this fingerprint is one of this unit and a peer.
+        pub(crate) fn has_key(&self, peer: &Identity, key: &[u8; KEY_FINGERPRINT_BYTES]) -> bool {
+            let Self::Keys { codes: Codes::Keyed(ring), .. } = self else { return false };
+            let is_key = |known: &PairKey| known.fingerprint() == *key;
+            ring.pair(peer).is_some_and(|(used, other)| is_key(&used) || other.as_ref().is_some_and(is_key))
+        }
+
         /// Whether the step that has ended computed a proof: other tasks have their turn before the next one.
         pub(crate) fn has_computed(&mut self) -> bool {
             match self {
@@ -145,7 +159,9 @@ mod secured {
 #[cfg(not(feature = "secure"))]
 mod plain {
     use cara_core::config::Mode;
+    use cara_core::distribution::claim::KEY_FINGERPRINT_BYTES;
     use cara_core::distribution::hello::Hello;
+    use cara_core::distribution::identity::Identity;
     use cara_core::host::secure::Plain;
     use cara_core::services::Keys;
 
@@ -179,6 +195,14 @@ mod plain {
 
         pub(crate) fn codes(&self) -> &Plain {
             &Plain
+        }
+
+        pub(crate) const fn key_of(&self, _: &Identity) -> Option<[u8; KEY_FINGERPRINT_BYTES]> {
+            None
+        }
+
+        pub(crate) const fn has_key(&self, _: &Identity, _: &[u8; KEY_FINGERPRINT_BYTES]) -> bool {
+            false
         }
 
         pub(crate) const fn has_computed(&mut self) -> bool {

@@ -20,6 +20,7 @@ use crate::access::AccessTable;
 #[cfg(feature = "access")]
 use crate::access::{AccessError, watch::FileWatch};
 use crate::config::Capacities;
+use crate::engine::claims::TakeOver;
 use crate::engine::{Engine, EngineParts, HubCell, Keys, message_buffer_bytes, node_storage};
 use crate::error::StartError;
 use crate::error::system_refused;
@@ -64,7 +65,7 @@ pub struct Builder<T, R> {
     access_file: Option<FileWatch>,
     asks_for_itself: bool,
     state_folder: Option<PathBuf>,
-    takes_over: bool,
+    take_over: TakeOver,
     state: T,
     role: PhantomData<fn() -> R>,
 }
@@ -110,8 +111,8 @@ impl<R> Builder<(), R> {
             #[cfg(feature = "access")]
             access_file: None,
             asks_for_itself: true,
-            state_folder: crate::terms::folder(),
-            takes_over: false,
+            state_folder: crate::claims::folder(),
+            take_over: TakeOver::No,
             state: (),
             role: PhantomData,
         }
@@ -133,11 +134,17 @@ impl<T: Send + 'static> Builder<T, MUnit> {
         self
     }
 
-    /// It starts although a live one of its name and id answers, with the next [term](crate::Term): the other one steps down, its
-    /// orders end, and its s_units come to this one. A decision of the operator's: between two that both take over, the later one
-    /// wins.
+    /// It starts although a live one of its name and id answers, with a higher [claim](crate::Claim): the other one steps down, its
+    /// orders end, and its s_units come to this one. Until it has had the highest claim once, it raises its claim above any other. A
+    /// decision of the operator's, refused where another one has taken over within the last minute.
     pub fn take_over(mut self, takes_over: bool) -> Self {
-        self.takes_over = takes_over;
+        self.take_over = if takes_over { TakeOver::Yes } else { TakeOver::No };
+        self
+    }
+
+    /// The same also where another one has taken over within the last minute.
+    pub fn force_take_over(mut self) -> Self {
+        self.take_over = TakeOver::Forced;
         self
     }
 
@@ -228,9 +235,9 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
-    /// The folder in which the unit keeps its [term](crate::Term), made if it is not there; what `CARA_STATE` names unless set, or
-    /// systemd's `STATE_DIRECTORY`. Without one, an m_unit begins with the first term again, and an s_unit forgets with its end
-    /// which managers it has to refuse.
+    /// The folder in which the unit stores its [claims](crate::Claim), made if it is not there; what `CARA_STATE` names unless set,
+    /// or systemd's `STATE_DIRECTORY`. Without one, an m_unit begins with the first term again, and an s_unit forgets with its end
+    /// which managers it has to refuse. A unit in plain mode stores nothing that it obeys.
     pub fn state_folder(mut self, folder: impl Into<PathBuf>) -> Self {
         self.state_folder = Some(folder.into());
         self
@@ -272,7 +279,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             access_file: self.access_file,
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
-            takes_over: self.takes_over,
+            take_over: self.take_over,
             state,
             role: PhantomData,
         }
@@ -358,7 +365,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             maximum_links,
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
-            takes_over: self.takes_over,
+            take_over: self.take_over,
             #[cfg(feature = "control")]
             audit: self.audit,
         };

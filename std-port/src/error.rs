@@ -40,9 +40,32 @@ pub enum StartError {
         /// The socket.
         path: PathBuf,
     },
-    /// An m_unit cannot keep its term, which it must before it speaks with it.
-    #[error("the term of this manager cannot be kept: {0}; name another folder of state (CARA_STATE), or none")]
-    Term(String),
+    /// Another manager of this name, id and fleet has taken over within the last minute.
+    #[error(
+        "another manager {identity} of fleet {} has taken over within the last minute, and runs {}: wait, or force it \
+         (`--force-take-over`)",
+        fleet.0, place(at)
+    )]
+    JustTakenOver {
+        /// The identity of both.
+        identity: Identity,
+        /// Their fleet.
+        fleet: Fleet,
+        /// The address at which it takes links.
+        at: SocketAddr,
+    },
+    /// The key file of an m_unit has no key of the m_unit with itself, with which it makes its claims.
+    #[error(
+        "the file with the keys of {identity} has no key of it with itself, without which it can claim no vehicle: `cara keys \
+         derive` on the provisioning host makes the file anew; bring it here"
+    )]
+    NoOwnKey {
+        /// Its identity.
+        identity: Identity,
+    },
+    /// An m_unit cannot store its claim, which it must before it speaks with it.
+    #[error("the claim of this manager cannot be stored: {0}; name another folder of state (CARA_STATE), or none")]
+    Claim(String),
     /// Something about the unit itself, or what the system refuses.
     #[error(transparent)]
     Unit(#[from] Error),
@@ -53,20 +76,22 @@ impl StartError {
     /// a supervisor should not start them again.
     pub const ALREADY_RUNNING_EXIT: u8 = 5;
 
-    /// The exit code with which `cara node` and the examples end where a manager with a newer term has taken over
+    /// The exit code with which `cara node` and the examples end where a live manager with a higher claim commands
     /// ([`UnitEvent::Fenced`](crate::UnitEvent::Fenced)): a supervisor should not start them again.
     pub const FENCED_EXIT: u8 = 6;
 
     /// Whether another one of this identity is why it does not start.
     pub fn is_running_already(&self) -> bool {
-        matches!(self, Self::AlreadyRunning { .. } | Self::SocketHeld { .. })
+        matches!(self, Self::AlreadyRunning { .. } | Self::SocketHeld { .. } | Self::JustTakenOver { .. })
     }
 
     /// The error's name, for programs.
     pub fn code(&self) -> String {
         match self {
             Self::AlreadyRunning { .. } | Self::SocketHeld { .. } => "AlreadyRunning".to_owned(),
-            Self::Term(_) => "Term".to_owned(),
+            Self::JustTakenOver { .. } => "JustTakenOver".to_owned(),
+            Self::NoOwnKey { .. } => "NoOwnKey".to_owned(),
+            Self::Claim(_) => "Claim".to_owned(),
             Self::Unit(error) => format!("{error:?}"),
         }
     }

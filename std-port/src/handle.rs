@@ -10,11 +10,11 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 
 use cara_core::config::{Constraints, Mode};
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
-use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use crate::access::AccessTable;
@@ -240,9 +240,9 @@ impl<T: Send + 'static, R> Handle<T, R> {
         WeakHandle { owner: Arc::downgrade(&self.owner), role: PhantomData }
     }
 
-    /// The term of an m_unit, or the newest that an s_unit has obeyed.
-    pub fn term(&self) -> Term {
-        self.engine().hub().hub.node.term()
+    /// The claim of an m_unit, or the highest that an s_unit has obeyed.
+    pub fn claim(&self) -> Claim {
+        self.engine().hub().hub.node.claim()
     }
 
     /// This unit's identity.

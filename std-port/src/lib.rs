@@ -25,6 +25,7 @@ mod actuator;
 pub mod asynchronous;
 mod builder;
 mod cancellable;
+mod claims;
 mod clock;
 mod communication_system;
 mod config;
@@ -59,7 +60,6 @@ mod stream;
 pub mod survey;
 #[doc(hidden)]
 pub mod sys;
-mod terms;
 #[cfg(test)]
 mod testing;
 mod threads;
@@ -72,6 +72,7 @@ pub use asynchronous::{CallGivenUp, EventStream, EventsLost, PendingReply, Sampl
 pub use builder::{BuildError, Builder};
 pub use cancellable::Cancellable;
 pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT};
+pub use cara_core::distribution::claim::Claim;
 pub use cara_core::distribution::connection_handler::NodeCounter;
 pub use cara_core::distribution::failure::{CallFailure, Failure};
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec, VariableSpecs};
@@ -87,7 +88,6 @@ pub use cara_core::services::heart::Renew;
 pub use cara_core::services::lease::{ActuatorState, Ended, LastOrder, Latch, LeaseEnd, OrderOutcome, Stage};
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
-pub use cara_core::term::Term;
 pub use cara_core::time::Duration;
 pub use cara_core::typed::{self, AnyCall, AsyncState, CallError, Failed, Mismatch, TypedCall, Variables};
 #[cfg(feature = "derive")]

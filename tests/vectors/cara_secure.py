@@ -21,7 +21,7 @@ TAG_BYTES = 16
 FRAMES_PER_KEY = 1 << 20
 HELLO, PROOF, CONFIRM = 1, 7, 8
 CODE_BYTES = 16
-SHORTEST_DISCOVERY = 140
+SHORTEST_DISCOVERY = 176
 DATAGRAM_HEADER = 24
 # The longest frame body before the other end's confirm frame has opened.
 LONGEST_BEFORE_CONFIRM = 317

@@ -12,6 +12,7 @@ import os
 import secrets
 import select
 import socket
+import struct
 import sys
 import time
 
@@ -50,7 +51,8 @@ def options_of(description, name, number):
     parser.add_argument("--name", default=name)
     parser.add_argument("--id", type=int, default=number)
     parser.add_argument("--fleet", type=int, default=0)
-    parser.add_argument("--term", type=int, default=0, help="a manager's own, or the newest that a vehicle has obeyed")
+    parser.add_argument("--term", type=int, default=0, help="of a manager's own claim, or of one that a vehicle says it has obeyed")
+    parser.add_argument("--claim", help="that one whole, as TERM:CLAIMANT:TAG")
     parser.add_argument("--address", default="127.0.0.1", help="own address; loopback unless set")
     parser.add_argument("--broadcast", default="127.255.255.255", help="where who-has is sent")
     parser.add_argument("--port", type=int, help="UDP port of broadcasts")
@@ -85,7 +87,7 @@ class Unit:
     def __init__(self, options, role, functions):
         self.options, self.functions = options, functions
         self.identity = {"id": options.id, "name": options.name, "role": role}
-        self.epoch, self.sequence, self.term = secrets.randbits(64), 0, options.term
+        self.epoch, self.sequence = secrets.randbits(64), 0
         if options.insecure:
             self.ring, self.magic, self.suites = None, wire.MAGIC, 0
         else:
@@ -93,18 +95,33 @@ class Unit:
                 sys.exit("either --keys or --insecure must be given")
             self.ring = keys.Ring(options.keys, options.fleet, self.identity)
             self.magic, self.suites = secure.MAGIC, secure.SUITES
+        self.claim, self.obeyed = self.claims(options)
         self.port = options.port or (wire.PORT if self.ring is None else secure.PORT)
         self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.udp.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self.udp.bind((options.address, 0))
         self.next_id = 1
 
+    def claims(self, options):
+        """A manager's own claim, and the highest one that a vehicle has obeyed: that one's tag is not genuine unless given."""
+        claim = {"term": options.term, "claimant": secrets.randbits(64), "tag": bytes(16).hex(), "since": 2**32 - 1}
+        if options.claim:
+            term, claimant, tag = options.claim.split(":")
+            claim.update(term=int(term), claimant=int(claimant), tag=tag)
+        if self.identity["role"] == "s_unit":
+            return None, claim if claim["term"] else None
+        claim["term"] = claim["term"] or 1
+        if self.ring is not None:
+            text = b"claim" + struct.pack("<QQ", claim["term"], claim["claimant"])
+            claim["tag"] = secure.code(self.ring.pair_keys(self.identity)[0], b"pmac", text).hex()
+        return claim, None
+
     # --- discovery (sections 3 and 17)
 
     def discovery(self, kind, to=None, **fields):
         """A who-has, or an announce to a unit."""
         self.sequence += 1
-        value = {"identity": self.identity, "epoch": self.epoch, "term": self.term, "sequence": self.sequence, **fields}
+        value = {"identity": self.identity, "epoch": self.epoch, "claim": self.claim, "sequence": self.sequence, **fields}
         if self.ring is None:
             return wire.encode_datagram({kind: value}, self.options.fleet)
         return secure.encode_discovery({kind: value}, self.options.fleet, self.ring, to)
@@ -154,7 +171,7 @@ class Unit:
         self.nonce = secrets.randbits(64)
         hello = {
             "fleet": self.options.fleet, "identity": self.identity, "wanted": self.wanted, "epoch": self.epoch,
-            "term": self.term,
+            "claim": self.claim, "obeyed": self.obeyed,
             "nonce": self.nonce, "versions": wire.VERSIONS, "capabilities": 0, "message_size": MESSAGE_SIZE,
             "chunk_size": CHUNK_SIZE, "calls": 8, "minimum_interval": 0, "link": 0, "udp_port": self.udp.getsockname()[1],
             "stamp": clock(), "keep_alive": int(KEEP_ALIVE * 1000),
@@ -219,11 +236,11 @@ class Unit:
         if not self.belongs(peer):
             return REFUSED_MANAGER
         if self.identity["role"] == "s_unit":
-            if wire.is_newer(self.term, peer["term"]):
+            if wire.rank(peer["claim"]) < wire.rank(self.obeyed):
                 return REFUSED_FENCED
-            # As long as it runs: one that moves keeps the term.
-            self.term = peer["term"] if wire.is_newer(peer["term"], self.term) else self.term
-        elif peer["identity"]["role"] == "s_unit" and wire.is_newer(peer["term"], self.term):
+            # As long as it runs: one that moves stores the claim.
+            self.obeyed = peer["claim"] and {**peer["claim"], "since": 0}
+        elif wire.rank(peer["obeyed"]) > wire.rank(self.claim):
             return REFUSED_FENCED
         return None
 

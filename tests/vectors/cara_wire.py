@@ -137,6 +137,7 @@ def item(kind, body):
     return struct.pack("<HH", kind, len(body)) + body + bytes(-len(body) % 4)
 
 
+CLAIM = [("term", 64), ("claimant", 64), ("tag", "tag"), ("since", 32)]
 # kind: (name, fields and their encodings)
 ITEMS = {
     1: ("unit", [("id", 32), ("name", "name"), ("role", "role"), ("epoch", 64)]),
@@ -146,11 +147,12 @@ ITEMS = {
     5: ("search", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("expected", 16)]),
     6: ("known", None),
     7: ("answer", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("room", 16), ("expected", 16)]),
-    8: ("authority", [("term", 32)]),
+    8: ("claim", CLAIM),
+    9: ("obeyed", CLAIM),
 }
-HELLO_ITEMS = ("unit", "wanted", "link", "limits", "authority")
+HELLO_ITEMS = ("unit", "wanted", "link", "limits", "claim", "obeyed")
 WHO_HAS_ITEMS = ("unit", "wanted", "search", "known")
-ANNOUNCE_ITEMS = ("unit", "answer", "authority")
+ANNOUNCE_ITEMS = ("unit", "answer", "claim", "obeyed")
 
 
 def read_fields(reader, fields):
@@ -174,6 +176,8 @@ def read_fields(reader, fields):
             how, holder, link, call = (reader.varint(32) for _ in range(4))
             end = None if how < 2 else LEASE_ENDS[how - 2] if how - 2 < len(LEASE_ENDS) else "expired"
             value[name] = {"holder": holder, "link": link, "call": call, "end": end} if how else None
+        elif encoding == "tag":
+            value[name] = reader.fixed("16s")[0].hex()
         elif encoding == "bytes":
             value[name] = reader.sized().hex()
         else:
@@ -199,6 +203,8 @@ def write_fields(value, fields):
             order = value[name] or {"holder": 0, "link": 0, "call": 0, "end": None}
             how = LEASE_ENDS.index(order["end"]) + 2 if order["end"] else int(value[name] is not None)
             out += b"".join(varint(number) for number in (how, order["holder"], order["link"], order["call"]))
+        elif encoding == "tag":
+            out += bytes.fromhex(value[name])
         elif encoding == "bytes":
             out += sized(bytes.fromhex(value[name]))
         else:
@@ -232,7 +238,7 @@ def read_items(data, wanted, needed):
     require(all(name in found for name in needed))
     require(is_node_name(found["unit"]["name"]))
     found["skipped"] = skipped
-    found["term"] = found.get("authority", {"term": 0})["term"]
+    found["claims"] = {name: found.get(name) for name in ("claim", "obeyed")}
     found["identity"] = {name: found["unit"][name] for name in ("id", "name", "role")}
     return found
 
@@ -245,10 +251,8 @@ def write_items(value, names):
             continue
         if name == "unit":
             out += item(kind, write_fields({**value, **value["identity"]}, fields))
-        elif name == "authority":
-            out += item(kind, write_fields(value, fields)) if value.get("term") else b""
-        elif name == "wanted":
-            out += item(kind, write_fields(value[name], fields)) if value[name] else b""
+        elif name in ("claim", "obeyed", "wanted"):
+            out += item(kind, write_fields(value[name], fields)) if value.get(name) else b""
         elif name == "known":
             out += item(kind, struct.pack("<%dI" % len(value[name]), *value[name])) if value[name] else b""
         else:
@@ -277,9 +281,9 @@ def short_hash(identity):
     return number
 
 
-def is_newer(term, other):
-    """Whether a manager of this term commands, and one of the other term does not."""
-    return term != 0 and (other == 0 or 0 < (term - other) % 2**32 < 2**31)
+def rank(claim):
+    """By which claims are compared; below all others without one."""
+    return (claim["term"], claim["claimant"]) if claim else (0, 0)
 
 
 # --- the hello (section 7)
@@ -298,7 +302,7 @@ def decode_hello(data, magic=MAGIC, suites=0):
     require(found["limits"]["chunk_size"] >= MINIMUM_CHUNK)
     return {
         "versions": versions, "capabilities": capabilities, "fleet": fleet, "identity": found["identity"],
-        "wanted": found.get("wanted"), "epoch": found["unit"]["epoch"], "term": found["term"],
+        "wanted": found.get("wanted"), "epoch": found["unit"]["epoch"], **found["claims"],
         **found["link"], **found["limits"],
         "skipped": found["skipped"],
     }
@@ -340,7 +344,7 @@ def read_datagram(data, items, own):
     if own == "search":
         value.update(wanted=found.get("wanted"), known=found.get("known", []))
     else:
-        value.update(term=found["term"])
+        value.update(found["claims"])
     return value
 
 
@@ -395,6 +399,7 @@ CONTROLS = {
     7: ("actuator", [("slot", 16), ("latch", "latch"), ("last", "order")]),
     8: ("subscribe", [("slot", 16), ("generation", 16), ("interval", 32)]),
     9: ("subscribed", [("slot", 16), ("generation", 16), ("interval", 32), ("bytes", 32), ("refusal", "refusal")]),
+    10: ("claimed", CLAIM),
 }
 # Behind one of these nothing follows in a message.
 LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator", "subscribed")

@@ -8,9 +8,6 @@ use crate::keys::{DiscoveryKey, PairKey};
 use crate::link::Credentials;
 use crate::mac::Authenticates;
 
-/// Keeps the code with which a unit without a key for itself speaks to its own identity apart from the fleet's codes.
-const OWN: &[u8; 4] = b"self";
-
 /// The keys of one unit, wherever they are kept. While the keys of a fleet are changed a unit has two of each: what it
 /// says is said with the first, and what it hears may be of either.
 pub trait Keyring {
@@ -19,11 +16,6 @@ pub trait Keyring {
 
     /// The keys of this unit and `peer`. `None` where there are none.
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)>;
-
-    /// Whether this is the identity of the unit that has the keys.
-    fn is_own(&self, _identity: &Identity) -> bool {
-        false
-    }
 
     /// What proves this unit to `peer` on one link. `fresh` is 32 bytes drawn for this link alone.
     fn credentials(&self, peer: &Identity, fresh: [u8; 32]) -> Option<Credentials> {
@@ -61,20 +53,11 @@ impl<K: Keyring> Authenticator for Codes<K> {
     }
 
     fn sign_for(&self, peer: &Identity, datagram: &[u8]) -> Option<[u8; CODE_BYTES]> {
-        let keyring = self.keyring()?;
-        match keyring.pair(peer) {
-            Some((key, _)) => Some(key.code(&[datagram])),
-            None => keyring.is_own(peer).then(|| keyring.discovery().0.code(&[OWN, datagram])),
-        }
+        self.keyring()?.pair(peer).map(|(key, _)| key.code(&[datagram]))
     }
 
     fn is_of(&self, peer: &Identity, datagram: &[u8], code: &[u8; CODE_BYTES]) -> bool {
-        let Some(keyring) = self.keyring() else { return false };
-        match keyring.pair(peer) {
-            Some((key, other)) => {
-                key.is_code(&[datagram], code) || other.is_some_and(|key| key.is_code(&[datagram], code))
-            }
-            None => keyring.is_own(peer) && keyring.discovery().0.is_code(&[OWN, datagram], code),
-        }
+        let Some((key, other)) = self.keyring().and_then(|keyring| keyring.pair(peer)) else { return false };
+        key.is_code(&[datagram], code) || other.is_some_and(|key| key.is_code(&[datagram], code))
     }
 }

@@ -2,6 +2,7 @@
 //! and both directions of its encoding, an [item](super::items) each.
 
 use super::compact::{Reader, Writer};
+use super::hello::ClaimReport;
 use super::items::{Item, Malformed};
 use super::message::CONTROL;
 use crate::error::Error;
@@ -95,6 +96,11 @@ controls! {
         latch: Option<Latch>,
         /// The order that it has, or had last.
         last: Option<LastOrder>,
+    }
+    /// The sender has raised its claim.
+    10 => Claimed {
+        /// What it is now.
+        report: ClaimReport,
     }
     /// The sender wants values of a stream of the reader, or no more of them.
     8 if "streams" => Subscribe {
@@ -275,6 +281,16 @@ impl LeaseEnd {
 trait Field<'b> {
     fn put(self, writer: &mut Writer<'_>);
     fn take(reader: &mut Reader<'b>) -> Self;
+}
+
+impl Field<'_> for ClaimReport {
+    fn put(self, writer: &mut Writer<'_>) {
+        self.put_fields(writer);
+    }
+
+    fn take(reader: &mut Reader<'_>) -> Self {
+        Self::take(reader)
+    }
 }
 
 impl Field<'_> for u16 {

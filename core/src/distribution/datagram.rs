@@ -17,12 +17,11 @@
 
 use super::authenticator::{Authenticator, CODE_BYTES};
 use super::compact::{Reader, Writer};
-use super::hello::{Manager, kind, put_term, take_term};
+use super::hello::{ClaimReport, Manager, kind};
 use super::identity::{Epoch, Fleet, Identity, Role};
 use super::items::{self, Items, Malformed};
 use crate::config::{Mode, VERSIONS, Versions};
 use crate::host::mailman::LinkId;
-use crate::term::Term;
 
 const WHO_HAS: u8 = 1;
 const ANNOUNCE: u8 = 2;
@@ -37,7 +36,7 @@ pub const KNOWN_NODES: usize = 64;
 /// Longest [`WhoHas`].
 pub const SEARCH_BYTES: usize = 512;
 /// Longest [`Announce`] of secured mode, and the shortest [`WhoHas`].
-pub const ANSWER_BYTES: usize = 140;
+pub const ANSWER_BYTES: usize = 176;
 
 /// A search, broadcast (paper: "one node broadcasts a message containing its identifier").
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -69,8 +68,10 @@ pub struct Announce {
     pub identity: Identity,
     /// Its boot.
     pub epoch: Epoch,
-    /// Its term.
-    pub term: Term,
+    /// The claim of an m_unit.
+    pub claim: Option<ClaimReport>,
+    /// The highest claim of the reader's identity that a vehicle has obeyed.
+    pub obeyed: Option<ClaimReport>,
     /// Rises with each announce of this boot.
     pub sequence: u32,
     /// The nonce of the search that is answered; 0 in a broadcast.
@@ -366,13 +367,14 @@ impl WhoHas {
 
 impl Announce {
     fn take(body: &[u8]) -> Result<Self, DatagramError> {
-        let (mut unit, mut answer, mut term, mut skipped) = (None, None, Term::NONE, 0);
+        let (mut unit, mut answer, mut claim, mut obeyed, mut skipped) = (None, None, None, None, 0);
         for item in Items::new(body) {
             let item = item?;
             match item.kind {
                 kind::UNIT => unit = Some(item.read(Identity::take)?),
                 kind::ANSWER => answer = Some(item.read(Answer::take)?),
-                kind::AUTHORITY => term = item.read(take_term)?,
+                kind::CLAIM => claim = Some(item.read(ClaimReport::take)?),
+                kind::OBEYED => obeyed = Some(item.read(ClaimReport::take)?),
                 _ => item.skip(&mut skipped)?,
             }
         }
@@ -381,7 +383,7 @@ impl Announce {
             return Err(DatagramError::Malformed);
         }
         let Answer { sequence, nonce, tcp_port, room, expected } = answer;
-        Ok(Self { identity, epoch, term, sequence, nonce, tcp_port, room, expected, skipped })
+        Ok(Self { identity, epoch, claim, obeyed, sequence, nonce, tcp_port, room, expected, skipped })
     }
 
     /// The datagram, in `out`; `None` where it does not fit, or in secured mode where it answers `to` and there is no key
@@ -403,7 +405,8 @@ impl Announce {
         writer.number(self.nonce);
         writer.numbers(&[self.tcp_port.into(), self.room.into(), self.expected.into()]);
         writer.end(item);
-        put_term(self.term, &mut writer);
+        ClaimReport::put(self.claim.as_ref(), kind::CLAIM, &mut writer);
+        ClaimReport::put(self.obeyed.as_ref(), kind::OBEYED, &mut writer);
         let mut length = writer.finish()?;
         if mode == Mode::Secured {
             length = match to {

@@ -11,11 +11,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::authenticator::CODE_BYTES;
 use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
 use super::items::{Items, Malformed};
 use crate::config::{Constraints, LATER, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
-use crate::term::Term;
+use crate::distribution::claim::{Claim, TaggedClaim};
 
 /// Bytes before the items.
 const PREFIX_BYTES: usize = 20;
@@ -36,8 +37,10 @@ pub(super) mod kind {
     pub(in crate::distribution) const KNOWN: u16 = 6;
     /// An answer.
     pub(in crate::distribution) const ANSWER: u16 = 7;
-    /// The term of a manager, or the newest that an s_unit has obeyed.
-    pub(in crate::distribution) const AUTHORITY: u16 = 8;
+    /// The claim of a manager.
+    pub(in crate::distribution) const CLAIM: u16 = 8;
+    /// The highest claim of the reader's identity that the sender has obeyed.
+    pub(in crate::distribution) const OBEYED: u16 = 9;
 }
 
 /// Which manager an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
@@ -88,8 +91,10 @@ pub struct Hello {
     pub wanted: Option<Manager>,
     /// This life of the unit.
     pub epoch: Epoch,
-    /// The term of an m_unit, or the newest that an s_unit has obeyed.
-    pub term: Term,
+    /// The claim of an m_unit.
+    pub claim: Option<ClaimReport>,
+    /// The highest claim of the reader's identity that the sender has obeyed.
+    pub obeyed: Option<ClaimReport>,
     /// Fresh for each link; the peer's session datagrams carry it.
     pub nonce: u64,
     /// What the unit takes.
@@ -141,18 +146,45 @@ impl Manager {
     }
 }
 
-/// The item that says a term, if there is one.
-pub(super) fn put_term(term: Term, writer: &mut Writer<'_>) {
-    if term != Term::NONE {
-        let item = writer.begin(kind::AUTHORITY);
-        writer.number(term.0.into());
-        writer.end(item);
-    }
+/// A claim, as a manager makes it or as a vehicle has obeyed it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClaimReport {
+    /// The claim, with the tag that shows that a manager of its identity made it.
+    pub tagged: TaggedClaim,
+    /// In milliseconds: of a manager's own claim, since it took over from a live one, [`NEVER`](Self::NEVER) if it did not; of one
+    /// that was obeyed, since its manager was last heard.
+    pub since: u32,
 }
 
-/// What an item [`kind::AUTHORITY`] says.
-pub(super) fn take_term(reader: &mut Reader<'_>) -> Term {
-    Term(reader.u32())
+impl ClaimReport {
+    /// As [`since`](Self::since): it did not take over, or was not heard for 49 days.
+    pub const NEVER: u32 = u32::MAX;
+
+    /// The claim.
+    pub const fn claim(&self) -> Claim {
+        self.tagged.claim
+    }
+
+    /// The item that says it, if there is one.
+    pub(super) fn put(report: Option<&Self>, kind: u16, writer: &mut Writer<'_>) {
+        let Some(report) = report else { return };
+        let item = writer.begin(kind);
+        report.put_fields(writer);
+        writer.end(item);
+    }
+
+    pub(super) fn put_fields(&self, writer: &mut Writer<'_>) {
+        writer.number(self.tagged.claim.term);
+        writer.number(self.tagged.claim.claimant);
+        writer.bytes(&self.tagged.tag);
+        writer.number(self.since.into());
+    }
+
+    pub(super) fn take(reader: &mut Reader<'_>) -> Self {
+        let claim = Claim { term: reader.u64(), claimant: reader.u64() };
+        let tag = reader.bytes(CODE_BYTES).first_chunk().copied().unwrap_or_default();
+        Self { tagged: TaggedClaim { claim, tag }, since: reader.u32() }
+    }
 }
 
 /// What an item [`kind::LINK`] says.
@@ -208,7 +240,8 @@ impl Hello {
         let item = writer.begin(kind::LIMITS);
         writer.numbers(&[message_size, chunk_size.into(), calls.into(), minimum_interval]);
         writer.end(item);
-        put_term(self.term, &mut writer);
+        ClaimReport::put(self.claim.as_ref(), kind::CLAIM, &mut writer);
+        ClaimReport::put(self.obeyed.as_ref(), kind::OBEYED, &mut writer);
         writer.finish()
     }
 
@@ -229,7 +262,7 @@ impl Hello {
             return Err(HelloError::Suite);
         }
         let (mut unit, mut wanted, mut link, mut limits) = (None, None, None, None);
-        let (mut term, mut skipped) = (Term::NONE, 0);
+        let (mut claim, mut obeyed, mut skipped) = (None, None, 0);
         for item in Items::new(items) {
             let item = item?;
             match item.kind {
@@ -237,7 +270,8 @@ impl Hello {
                 kind::WANTED => wanted = Some(item.read(Manager::take)?),
                 kind::LINK => link = Some(item.read(Link::take)?),
                 kind::LIMITS => limits = Some(item.read(Limits::take)?),
-                kind::AUTHORITY => term = item.read(take_term)?,
+                kind::CLAIM => claim = Some(item.read(ClaimReport::take)?),
+                kind::OBEYED => obeyed = Some(item.read(ClaimReport::take)?),
                 _ => item.skip(&mut skipped)?,
             }
         }
@@ -255,7 +289,8 @@ impl Hello {
             identity,
             wanted,
             epoch,
-            term,
+            claim,
+            obeyed,
             nonce,
             limits,
             link,
@@ -274,8 +309,16 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const ROOM: usize = 256;
+    const ROOM: usize = 300;
     const PLAIN: Mode = Mode::Plain;
+
+    /// Bytes of the longest item with a claim.
+    const CLAIM: usize = 48;
+
+    fn highest() -> ClaimReport {
+        let claim = Claim { term: u64::MAX, claimant: u64::MAX };
+        ClaimReport { tagged: TaggedClaim { claim, tag: [0xFF; CODE_BYTES] }, since: u32::MAX }
+    }
 
     fn longest() -> Hello {
         let name = "a-manager-with-a-name-of-32-byte";
@@ -286,7 +329,8 @@ mod tests {
             identity: Identity::s_unit(name, u32::MAX).unwrap(),
             wanted: Some(Manager { name: name.try_into().unwrap(), id: u32::MAX }),
             epoch: Epoch(u64::MAX),
-            term: Term(u32::MAX),
+            claim: Some(highest()),
+            obeyed: Some(highest()),
             nonce: u64::MAX,
             limits: Limits {
                 message_size: u32::MAX,
@@ -311,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_hello_fits_256_bytes_and_survives() {
+    fn the_longest_hello_fits_300_bytes_and_survives() {
         let mut out = [0; ROOM];
         let length = longest().encode(PLAIN, &mut out).unwrap();
         assert_eq!(Hello::decode(&out[..length], PLAIN), Ok(longest()));
@@ -340,8 +384,8 @@ mod tests {
         assert_eq!(with(3, b's'), Err(HelloError::Mode));
         assert_eq!(with(4, 3), Err(HelloError::Version(Versions { first: 3, last: 3 })));
         assert_eq!(with(4, 1), Err(HelloError::Version(Versions { first: 1, last: 1 })), "it has its fleet in byte 5");
-        // The term, which is last, may be missing.
-        for cut in (0..length).filter(|cut| *cut != length - 12) {
+        // The two claims, which are last, may be missing.
+        for cut in (0..length).filter(|cut| ![length - CLAIM, length - 2 * CLAIM].contains(cut)) {
             assert_eq!(Hello::decode(&out[..cut], PLAIN), Err(HelloError::Malformed), "{cut}");
         }
         let small = Limits { chunk_size: (MINIMUM_CHUNK_BYTES - 1) as u16, ..longest().limits };

@@ -3,6 +3,7 @@
 mod attributes;
 pub mod authenticator;
 pub mod block;
+pub mod claim;
 pub(crate) mod compact;
 pub mod connection_handler;
 mod control;

@@ -5,10 +5,9 @@
 
 use super::authenticator::Authenticator;
 use super::datagram::{Announce, Datagram, SEARCH_BYTES, WhoHas};
-use super::hello::Manager;
+use super::hello::{ClaimReport, Manager};
 use super::identity::{Epoch, Fleet, Identity};
 use crate::host::endpoint::Endpoint;
-use crate::term::Term;
 use crate::time::Duration;
 
 /// How long a manager waits for an answer before it starts. A unit that is alive answers at once.
@@ -37,8 +36,8 @@ pub enum Heard<'o, E> {
     Running {
         /// Where it can be dialled.
         at: E,
-        /// Its term: one that takes over claims the next.
-        term: Term,
+        /// Its claim, if it is genuine: one that takes over claims a higher one.
+        claim: Option<ClaimReport>,
     },
 }
 
@@ -80,7 +79,8 @@ impl Presence {
     ) -> Heard<'o, E> {
         match Datagram::decode(bytes, self.fleet, authenticator) {
             Ok(Datagram::Announce(announce)) if self.is_answer(&announce) => {
-                Heard::Running { at: from.at_port(announce.tcp_port), term: announce.term }
+                let is_genuine = |claim: &ClaimReport| claim.tagged.is_genuine(&self.identity, authenticator);
+                Heard::Running { at: from.at_port(announce.tcp_port), claim: announce.claim.filter(is_genuine) }
             }
             Ok(Datagram::WhoHas(who_has)) if self.gives_way(&who_has) => {
                 self.answer(who_has.nonce, authenticator, out).map_or(Heard::Nothing, Heard::Answer)
@@ -108,7 +108,8 @@ impl Presence {
         let announce = Announce {
             identity: self.identity.clone(),
             epoch: self.epoch,
-            term: Term::NONE,
+            claim: None,
+            obeyed: None,
             sequence: self.sequence,
             nonce,
             tcp_port: 0,

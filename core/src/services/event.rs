@@ -1,12 +1,12 @@
 //! What a unit tells its application: one type for all ports.
 
+use crate::distribution::claim::Claim;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
 use crate::services::lease::{Latch, LeaseEnd};
 use crate::services::requests::CallId;
 use crate::services::session::{Event, Session};
 use crate::services::{OwnFunctions, Port};
-use crate::term::Term;
 
 /// Something happened that no call returned.
 ///
@@ -37,12 +37,24 @@ pub enum UnitEvent<F, N, E> {
         /// Why.
         reason: CloseReason,
     },
-    /// A manager with this m_unit's name and id and a newer term commands: this one is fenced. Its links have ended, and with
-    /// them what it ordered; it does nothing more, and is to be stopped. Where it is started again while the other one runs,
-    /// it does not start unless it is to take over.
+    /// A live manager with this m_unit's name and id and a higher claim has shown itself: this one has stepped down. Its links
+    /// have ended, and with them what it ordered; it does nothing more, and is to be stopped. Where it is started again while
+    /// the other one runs, it does not start unless it is to take over.
     Fenced {
-        /// The newer term.
-        term: Term,
+        /// The higher claim.
+        claim: Claim,
+    },
+    /// This manager has raised its claim above one that vehicles obeyed and whose manager is not there any more.
+    Raised {
+        /// Its claim.
+        claim: Claim,
+    },
+    /// The claim of this manager is obeyed until this unit's next start only: it could not be stored, or not in time.
+    ClaimNotKept {
+        /// The manager.
+        peer: Identity,
+        /// Its claim.
+        claim: Claim,
     },
     /// The network that this unit can use has changed, and it searches again by itself. On Linux also when the unit finds
     /// none at its start; a board's first address is not reported, and its links have ended.

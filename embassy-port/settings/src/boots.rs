@@ -2,35 +2,37 @@
 //! even where the board's noise does not.
 //!
 //! Each boot appends a record; when a page is full the other one is erased, so that the record with the highest count
-//! is never in a page that is being erased. A record has 32 bytes:
+//! is never in a page that is being erased. A record has 64 bytes:
 //!
 //! | offset | size | field |
 //! |---|---|---|
 //! | 0 | 4 | `CARb` |
 //! | 4 | 8 | the count, little-endian, from 1 |
-//! | 12 | 4 | the term that the unit keeps, little-endian; 0 for none |
-//! | 16 | 12 | zero |
-//! | 28 | 4 | CRC-32 (ISO-HDLC) of all before, little-endian |
+//! | 12 | 16 | the highest claim that the unit has obeyed: term and claimant, little-endian; zero for none |
+//! | 28 | 16 | its tag |
+//! | 44 | 6 | the fingerprint of the pair key |
+//! | 50 | 10 | zero |
+//! | 60 | 4 | CRC-32 (ISO-HDLC) of all before, little-endian |
 //!
-//! A term that is kept is a record with a count of its own; each later one repeats it, so that it is where the count is.
+//! A claim that is stored is a record with a count of its own; each later one repeats it, so that it is where the count is.
 //!
 //! A count is returned once its record has been read back, and counts only rise: wherever power is cut, no count is
 //! returned twice. Nothing else erases the pages; a full chip erase takes the keys with them.
 
-use cara_core::term::Term;
+use cara_core::distribution::claim::{Claim, StoredClaim, TaggedClaim};
 use cara_secure::random::BootCounter;
 use embedded_storage::nor_flash::NorFlash;
 
 use crate::page::SUM;
 
 /// Bytes of a record, which are written at once: a multiple of what any of these chips writes at once.
-pub const RECORD_BYTES: usize = 32;
+pub const RECORD_BYTES: usize = 64;
 /// Most bytes of a page that are used: the pages of some chips are far longer than need be.
 const USED_BYTES: u32 = 16 * 1024;
 
 const MAGIC: [u8; 4] = *b"CARb";
 const COUNT: core::ops::Range<usize> = 4..12;
-const TERM: core::ops::Range<usize> = 12..16;
+const CLAIM: core::ops::Range<usize> = 12..50;
 const SUMMED: usize = RECORD_BYTES - 4;
 const ERASED: [u8; RECORD_BYTES] = [0xFF; RECORD_BYTES];
 
@@ -63,8 +65,8 @@ pub struct Boots<F> {
 struct Seen {
     /// The highest count, or 0.
     newest: u64,
-    /// The term beside it.
-    term: Term,
+    /// The claim beside it.
+    claim: StoredClaim,
     /// Where the page is erased from.
     free: u32,
 }
@@ -90,14 +92,14 @@ impl<F: NorFlash> Boots<F> {
     }
 
     fn look(&mut self, page: u32) -> Result<Seen, F::Error> {
-        let mut seen = Seen { newest: 0, term: Term::NONE, free: 0 };
+        let mut seen = Seen { newest: 0, claim: StoredClaim::default(), free: 0 };
         for offset in self.offsets() {
             let record = self.read(page + offset)?;
             if record != ERASED {
                 seen.free = offset + RECORD_BYTES as u32;
             }
-            if let Some((count, term)) = count(&record).filter(|(count, _)| *count > seen.newest) {
-                (seen.newest, seen.term) = (count, term);
+            if let Some((count, claim)) = count(&record).filter(|(count, _)| *count > seen.newest) {
+                (seen.newest, seen.claim) = (count, claim);
             }
         }
         Ok(seen)
@@ -121,16 +123,16 @@ impl<F: NorFlash> Boots<F> {
 }
 
 impl<F: NorFlash> Boots<F> {
-    /// The term that is kept.
-    pub fn term(&mut self) -> Result<Term, BootError<F::Error>> {
-        Ok(self.newest()?.1.term)
+    /// The claim that is stored.
+    pub fn claim(&mut self) -> Result<StoredClaim, BootError<F::Error>> {
+        Ok(self.newest()?.1.claim)
     }
 
-    /// Keeps a term, which costs one record; nothing where it is kept already. When a page is full the other one is erased, for
+    /// Stores a claim, which costs one record; nothing where it is stored already. When a page is full the other one is erased, for
     /// which the processor may stand still: not while anything moves.
-    pub fn keep_term(&mut self, term: Term) -> Result<(), BootError<F::Error>> {
-        if self.term()? != term {
-            self.append(Some(term))?;
+    pub fn store_claim(&mut self, claim: &StoredClaim) -> Result<(), BootError<F::Error>> {
+        if self.claim()? != *claim {
+            self.append(Some(claim))?;
         }
         Ok(())
     }
@@ -142,11 +144,11 @@ impl<F: NorFlash> Boots<F> {
         Ok(if second.newest > first.newest { (two, second, one) } else { (one, first, two) })
     }
 
-    /// Writes the next count, with the term that is kept or another one.
-    fn append(&mut self, term: Option<Term>) -> Result<u64, BootError<F::Error>> {
+    /// Writes the next count, with the claim that is stored or another one.
+    fn append(&mut self, claim: Option<&StoredClaim>) -> Result<u64, BootError<F::Error>> {
         let (page, seen, other) = self.newest()?;
         let next = seen.newest.checked_add(1).ok_or(BootError::Worn)?;
-        let record = record(next, term.unwrap_or(seen.term));
+        let record = record(next, claim.unwrap_or(&seen.claim));
         if self.put(page, seen.free, &record)? {
             return Ok(next);
         }
@@ -155,22 +157,22 @@ impl<F: NorFlash> Boots<F> {
     }
 }
 
-/// The term in [`Boots`], whatever the flash: a program of several boards has one static for it.
-pub trait TermStore: Send {
-    /// The term that is kept; `None` if the flash cannot be read.
-    fn stored(&mut self) -> Option<Term>;
+/// The claim in [`Boots`], whatever the flash: a program of several boards has one static for it.
+pub trait ClaimStore: Send {
+    /// The claim that is stored; `None` if the flash cannot be read.
+    fn stored(&mut self) -> Option<StoredClaim>;
 
-    /// Keeps a term, as [`Boots::keep_term`] does; whether it is kept.
-    fn store(&mut self, term: Term) -> bool;
+    /// Stores a claim, as [`Boots::store_claim`] does; whether it is stored.
+    fn store(&mut self, claim: &StoredClaim) -> bool;
 }
 
-impl<F: NorFlash + Send> TermStore for Boots<F> {
-    fn stored(&mut self) -> Option<Term> {
-        self.term().ok()
+impl<F: NorFlash + Send> ClaimStore for Boots<F> {
+    fn stored(&mut self) -> Option<StoredClaim> {
+        self.claim().ok()
     }
 
-    fn store(&mut self, term: Term) -> bool {
-        self.keep_term(term).is_ok()
+    fn store(&mut self, claim: &StoredClaim) -> bool {
+        self.store_claim(claim).is_ok()
     }
 }
 
@@ -182,24 +184,29 @@ impl<F: NorFlash> BootCounter for Boots<F> {
     }
 }
 
-fn record(count: u64, term: Term) -> [u8; RECORD_BYTES] {
+fn record(count: u64, claim: &StoredClaim) -> [u8; RECORD_BYTES] {
     let mut record = [0; RECORD_BYTES];
     let (summed, sum) = record.split_at_mut(SUMMED);
     let (magic, rest) = summed.split_at_mut(MAGIC.len());
     magic.copy_from_slice(&MAGIC);
     let (number, rest) = rest.split_at_mut(COUNT.len());
     number.copy_from_slice(&count.to_le_bytes());
-    let (number, _) = rest.split_at_mut(TERM.len());
-    number.copy_from_slice(&term.0.to_le_bytes());
+    let StoredClaim { tagged: TaggedClaim { claim: Claim { term, claimant }, tag }, key } = claim;
+    let fields: [&[u8]; 4] = [&term.to_le_bytes(), &claimant.to_le_bytes(), tag, key];
+    rest.iter_mut().zip(fields.into_iter().flatten()).for_each(|(to, from)| *to = *from);
     sum.copy_from_slice(&SUM.checksum(summed).to_le_bytes());
     record
 }
 
-/// The count of a sound record, and the term in it.
-fn count(record: &[u8; RECORD_BYTES]) -> Option<(u64, Term)> {
+/// The count of a sound record, and the claim in it.
+fn count(record: &[u8; RECORD_BYTES]) -> Option<(u64, StoredClaim)> {
     let count = u64::from_le_bytes(*record.get(COUNT)?.first_chunk()?);
-    let term = Term(u32::from_le_bytes(*record.get(TERM)?.first_chunk()?));
-    (*record == self::record(count, term)).then_some((count, term))
+    let (term, rest) = record.get(CLAIM)?.split_first_chunk()?;
+    let (claimant, rest) = rest.split_first_chunk()?;
+    let (tag, rest) = rest.split_first_chunk()?;
+    let claim = Claim { term: u64::from_le_bytes(*term), claimant: u64::from_le_bytes(*claimant) };
+    let claim = StoredClaim { tagged: TaggedClaim { claim, tag: *tag }, key: *rest.first_chunk()? };
+    (*record == self::record(count, &claim)).then_some((count, claim))
 }
 
 #[cfg(test)]
@@ -239,12 +246,12 @@ mod tests {
             Ok(())
         }
 
-        fn keep(&mut self, term: Term) -> Result<(), BootError<PowerCut>> {
-            Boots::new(self, [0, PAGE as u32], PAGE as u32).keep_term(term)
+        fn keep(&mut self, claim: &StoredClaim) -> Result<(), BootError<PowerCut>> {
+            Boots::new(self, [0, PAGE as u32], PAGE as u32).store_claim(claim)
         }
 
-        fn term(&mut self) -> Term {
-            Boots::new(self, [0, PAGE as u32], PAGE as u32).term().unwrap()
+        fn claim(&mut self) -> StoredClaim {
+            Boots::new(self, [0, PAGE as u32], PAGE as u32).claim().unwrap()
         }
 
         fn boot(&mut self) -> Result<u64, BootError<PowerCut>> {
@@ -341,40 +348,45 @@ mod tests {
         assert!(cuts > 100 && second_cuts > 1_000, "{cuts} {second_cuts}");
     }
 
+    fn claim(term: u64) -> StoredClaim {
+        let claim = Claim { term, claimant: !term };
+        StoredClaim { tagged: TaggedClaim { claim, tag: [term as u8; 16] }, key: [9; 6] }
+    }
+
     #[test]
-    fn a_term_is_kept_through_starts_and_pages() {
+    fn a_claim_is_stored_through_starts_and_pages() {
         let mut chip = Chip::new();
-        assert_eq!(chip.term(), Term::NONE);
+        assert_eq!(chip.claim(), StoredClaim::default());
         let mut count = 0;
-        for term in [Term(1), Term(2), Term(u32::MAX), Term(1)] {
-            chip.keep(term).unwrap();
+        for stored in [claim(1), claim(2), claim(u64::MAX), claim(1)] {
+            chip.keep(&stored).unwrap();
             let bytes = chip.bytes.clone();
-            chip.keep(term).unwrap();
+            chip.keep(&stored).unwrap();
             assert_eq!(chip.bytes, bytes, "nothing is written for the same one");
             for _ in 0..11 {
                 let next = chip.boot().unwrap();
-                assert!(next > count && chip.term() == term);
+                assert!(next > count && chip.claim() == stored);
                 count = next;
             }
         }
     }
 
-    /// Power is cut in each word that is written or erased for a term: the one before it is kept, or the new one.
+    /// Power is cut in each word that is written or erased for a claim: the one before it is stored, or the new one.
     #[test]
-    fn wherever_power_is_cut_there_is_a_term() {
-        let (old, new) = (Term(4), Term(5));
+    fn wherever_power_is_cut_there_is_a_claim() {
+        let (old, new) = (claim(4), claim(5));
         for lives in 0..12 {
             for power in 0.. {
                 let mut chip = Chip::new();
-                chip.keep(old).unwrap();
+                chip.keep(&old).unwrap();
                 (0..lives).for_each(|_| assert!(chip.boot().is_ok()));
                 chip.power = power;
-                let kept = chip.keep(new).is_ok();
+                let kept = chip.keep(&new).is_ok();
                 chip.power = usize::MAX;
-                let found = chip.term();
-                assert!(found == new || (found == old && !kept), "{lives}, {power}: {found}");
+                let found = chip.claim();
+                assert!(found == new || (found == old && !kept), "{lives}, {power}: {found:?}");
                 chip.boot().unwrap();
-                assert_eq!(chip.term(), found);
+                assert_eq!(chip.claim(), found);
                 if kept {
                     break;
                 }
@@ -411,7 +423,7 @@ mod tests {
         fn nothing_in_flash_panics(bytes in prop::collection::vec(any::<u8>(), 2 * PAGE), sound in 0_usize..8, high: u64) {
             let mut chip = Chip::new();
             chip.bytes = bytes;
-            chip.bytes[sound * RECORD_BYTES..][..RECORD_BYTES].copy_from_slice(&record(high, Term(7)));
+            chip.bytes[sound * RECORD_BYTES..][..RECORD_BYTES].copy_from_slice(&record(high, &claim(7)));
             match chip.boot() {
                 Ok(count) => {
                     prop_assert!(count > high);

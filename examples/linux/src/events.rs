@@ -14,9 +14,9 @@ pub fn show_events(events: Receiver<UnitEvent>) {
 fn show(event: &UnitEvent) {
     match event {
         UnitEvent::Joined { peer } => say!("joined {peer}"),
-        UnitEvent::Fenced { term } => {
+        UnitEvent::Fenced { claim } => {
             // The unit has stopped. A supervisor is not to start it again.
-            say!("another manager of this name and id has taken over with term {term}");
+            say!("another manager of this name and id commands with the claim {claim}");
             std::process::exit(i32::from(StartError::FENCED_EXIT));
         }
         UnitEvent::Left { peer, reason } => say!("left {peer}: {reason}"),

@@ -25,7 +25,7 @@ use crate::map::Cell;
 pub enum BookError {
     /// This manager is to do nothing any more.
     #[error("a manager with the newer term {0} writes into the book")]
-    Fenced(u32),
+    Fenced(u64),
     /// The file.
     #[error("the managers' book: {0}")]
     File(#[from] std::io::Error),
@@ -46,14 +46,14 @@ pub struct Written {
 #[derive(Debug)]
 pub struct Book {
     file: File,
-    term: u32,
+    term: u64,
     /// Bytes that have been read or written here.
     known: u64,
 }
 
 impl Book {
     /// Opens it for a manager with this term, and says so in it. What stands there already is returned.
-    pub fn open(path: &Path, term: u32) -> Result<(Self, Written), BookError> {
+    pub fn open(path: &Path, term: u64) -> Result<(Self, Written), BookError> {
         let file = File::options().read(true).append(true).create(true).open(path)?;
         let mut book = Self { file, term, known: 0 };
         let mut written = Written::default();

@@ -146,7 +146,13 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         UnitEvent::Joined { peer } => ("joined", Some(peer), "is connected".to_owned()),
         UnitEvent::Left { peer, reason } => ("left", Some(peer), reason.to_string()),
         UnitEvent::NotJoined { address, peer, reason } => ("not_joined", peer.as_ref(), format!("{address}: {reason}")),
-        UnitEvent::Fenced { term } => ("fenced", None, format!("another manager has taken over with term {term}")),
+        UnitEvent::Fenced { claim } => ("fenced", None, format!("another manager commands with the claim {claim}")),
+        UnitEvent::Raised { claim } => ("raised", None, format!("this manager has raised its claim to {claim}")),
+        UnitEvent::ClaimNotKept { peer, claim } => (
+            "claim not stored",
+            Some(peer),
+            format!("the claim {claim} is obeyed until the next start: it could not be stored"),
+        ),
         UnitEvent::ListChanged { peer } => ("list_changed", Some(peer), "published or withdrew functions".to_owned()),
         UnitEvent::NetworkChanged { up } => {
             ("interfaces_changed", None, format!("interfaces that are up: {}", up.join(" ")))

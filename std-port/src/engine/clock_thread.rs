@@ -35,7 +35,11 @@ impl<T: Send + 'static> Engine<T> {
                 }
             }
             // Also before its deadline, where another thread wants it looked at.
+            let waited = state.session.awaits_claim();
             self.poll_session(&link, &mut state);
+            if waited && state.session.has_next_call() {
+                self.hand_over(&link);
+            }
             self.settle(&link, state);
         }
     }
@@ -46,11 +50,13 @@ impl<T: Send + 'static> Engine<T> {
         self.wake_clock();
     }
 
-    pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) {
+    /// Whether none is left.
+    pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) -> bool {
         for _ in 0..BATCH {
-            let Some((count, from)) = self.sockets.datagrams.receive(socket, buffer) else { return };
+            let Some((count, from)) = self.sockets.datagrams.receive(socket, buffer) else { return true };
             self.datagram(from, buffer.get_mut(..count).unwrap_or_default());
         }
+        false
     }
 
     pub(super) fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
@@ -68,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(address) = duplicate {
             self.duplicate_heard(address);
         }
-        self.look_at_terms();
+        self.look_at_claims();
     }
 
     /// Without the hub, so that an emergency does not wait for a search.

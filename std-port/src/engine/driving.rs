@@ -5,12 +5,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use cara_core::config::Mode;
+use cara_core::distribution::claim::Claim;
+use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
-use cara_core::term::Term;
 use cara_core::time::Instant;
 
 use super::Engine;
+use super::claims::TakeOver;
 use super::worker::Worker;
 use crate::clock::Clock;
 use crate::error::StartError;
@@ -86,16 +88,15 @@ impl<T: Send + 'static> Engine<T> {
             return Ok(());
         }
         let running = self.running_elsewhere().map_err(system_refused)?;
-        let takes_over = self.terms.takes_over;
-        if let Some((at, _)) = running.filter(|_| !takes_over) {
-            let (identity, fleet) = self.identity();
-            return Err(StartError::AlreadyRunning { identity, fleet, at });
+        if let Some((at, report)) = &running {
+            self.may_start_beside(*at, report.as_ref())?;
         }
+        let takes_over = self.claims.take_over != TakeOver::No;
         if let Some(path) = (self.driver.asks_for_itself && !takes_over).then(holds).flatten() {
             let (identity, fleet) = self.identity();
             return Err(StartError::SocketHeld { identity, fleet, path });
         }
-        self.claim(running.map_or(Term::NONE, |(_, term)| term))?;
+        self.claim(running.and_then(|(_, report)| report).map_or(Claim::NONE, |report: ClaimReport| report.claim()))?;
         self.thread_pool().start()?;
         let unit_number = self.thread_pool().register(self.clone())?;
         let _ = self.driver.unit_number.set(unit_number);
@@ -179,15 +180,16 @@ impl<T: Send + 'static> Driven for Engine<T> {
     fn keep_time(&self) -> Instant {
         let others = self.poll_node().min(self.go_on_listening());
         let look = self.watch_links(others);
+        self.look_at_claims();
         self.poll_links().min(others).min(look).min(self.sound_alarms())
     }
 
     fn look_around(&self) -> Instant {
-        self.watch_interfaces().min(self.watch_keys()).min(self.watch_terms())
+        self.watch_interfaces().min(self.watch_keys())
     }
 
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {
-        self.datagrams_ready(socket, buffer);
+        let _ = self.datagrams_ready(socket, buffer);
     }
 
     fn accept(&self) {

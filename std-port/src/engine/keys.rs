@@ -38,10 +38,6 @@ impl Keyring for View {
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
         Keyring::pair(&*self.0, peer)
     }
-
-    fn is_own(&self, identity: &Identity) -> bool {
-        self.0.is_own(identity)
-    }
 }
 
 impl Keys {

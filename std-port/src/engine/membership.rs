@@ -207,7 +207,6 @@ impl<T: Send + 'static> Engine<T> {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
         }
         let _ = link.peer.set(peer);
-        self.look_at_terms();
         // Who publishes from here on finds the peer, and waits for this link's lock to tell it. What was published before,
         // and after the session looked, or found no room in it, is told now.
         let grew = self.make_publication_room(state);
@@ -274,7 +273,6 @@ impl<T: Send + 'static> Engine<T> {
         self.tell_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
         self.hub().hub.node.left(self.now(), link.id, reason);
-        self.look_at_terms();
         self.links.remove(link);
         // The hub may have something to do earlier than before.
         self.wake_clock();
@@ -379,8 +377,9 @@ impl<T: Send + 'static> Engine<T> {
         if self.hub().hub.node.searches_at() <= self.now() {
             // What others have asked and answered may lie unread for as long as this thread was busy with other units.
             let mut buffer = [0; DATAGRAM];
-            for socket in [Socket::Shared, Socket::Own] {
-                self.datagrams_ready(socket, &mut buffer);
+            let emptied = [Socket::Shared, Socket::Own].map(|socket| self.datagrams_ready(socket, &mut buffer));
+            if emptied != [true; 2] {
+                self.hub().hub.node.left_unread();
             }
         }
         loop {

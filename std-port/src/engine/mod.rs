@@ -25,6 +25,7 @@ mod afterwards;
 mod alarms;
 mod awaiting;
 mod calling;
+pub(crate) mod claims;
 mod clock_thread;
 pub(crate) mod details;
 mod driving;
@@ -55,7 +56,6 @@ pub(crate) mod streams;
 mod tables;
 #[cfg(feature = "async")]
 mod tasks;
-mod terms;
 #[cfg(test)]
 mod tests;
 mod watch;
@@ -136,7 +136,7 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) pool: MessagePool,
     pub(crate) key_watch: KeyWatch,
     guard: access::Guard,
-    terms: terms::Terms,
+    claims: claims::Claims,
     accounts: accounts::Accounts,
     #[cfg(feature = "control")]
     audit: Option<Arc<Audit>>,
@@ -162,7 +162,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) maximum_links: usize,
     pub(crate) asks_for_itself: bool,
     pub(crate) state_folder: Option<PathBuf>,
-    pub(crate) takes_over: bool,
+    pub(crate) take_over: claims::TakeOver,
     #[cfg(feature = "control")]
     pub(crate) audit: Option<Arc<Audit>>,
 }
@@ -182,7 +182,7 @@ impl<T: Send + 'static> Engine<T> {
             key_watch: KeyWatch::new(parts.keys, driver.born()),
             driver,
             guard: access::Guard::default(),
-            terms: terms::Terms::new(parts.state_folder, parts.takes_over),
+            claims: claims::Claims::new(parts.state_folder, parts.take_over),
             accounts: accounts::Accounts::default(),
             #[cfg(feature = "control")]
             audit: parts.audit,

@@ -4,9 +4,9 @@ use std::net::SocketAddr;
 
 use cara_core::distribution::authenticator::Authenticator;
 use cara_core::distribution::datagram::SEARCH_BYTES;
+use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::Role;
 use cara_core::distribution::presence::{Heard, PRESENCE_PAUSE, PRESENCE_WAIT, Presence};
-use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use super::Engine;
@@ -18,8 +18,8 @@ use crate::sys::epoll::{Epoll, Events, Interest};
 const BATCH: usize = 64;
 
 impl<T: Send + 'static> Engine<T> {
-    /// Where a live manager of this unit's identity answers, and its term; `None` after a wait in which none did.
-    pub(super) fn running_elsewhere(&self) -> std::io::Result<Option<(SocketAddr, Term)>> {
+    /// Where a live manager of this unit's identity answers, and its claim; `None` after a wait in which none did.
+    pub(super) fn running_elsewhere(&self) -> std::io::Result<Option<(SocketAddr, Option<ClaimReport>)>> {
         let presence = {
             let node = &self.hub().hub.node;
             if node.identity().role() != Role::MUnit || !self.driver.asks_for_itself {
@@ -34,7 +34,11 @@ impl<T: Send + 'static> Engine<T> {
         self.wait_for_itself(presence, &set)
     }
 
-    fn wait_for_itself(&self, mut presence: Presence, set: &Epoll) -> std::io::Result<Option<(SocketAddr, Term)>> {
+    fn wait_for_itself(
+        &self,
+        mut presence: Presence,
+        set: &Epoll,
+    ) -> std::io::Result<Option<(SocketAddr, Option<ClaimReport>)>> {
         let (codes, mut events) = (self.keys().codes(), Events::new(2));
         let mut next = self.now();
         let end = next + PRESENCE_WAIT;
@@ -57,7 +61,11 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn hear_of_itself(&self, presence: &Presence, codes: &impl Authenticator) -> Option<(SocketAddr, Term)> {
+    fn hear_of_itself(
+        &self,
+        presence: &Presence,
+        codes: &impl Authenticator,
+    ) -> Option<(SocketAddr, Option<ClaimReport>)> {
         for socket in [Socket::Shared, Socket::Own] {
             let mut buffer = [0; SEARCH_BYTES + 1];
             for _ in 0..BATCH {
@@ -66,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
                 match presence.hear(from, buffer.get(..length).unwrap_or_default(), codes, &mut out) {
                     Heard::Nothing => {}
                     Heard::Answer(answer) => drop(self.sockets.datagrams.send_to(from, answer)),
-                    Heard::Running { at, term } => return Some((at, term)),
+                    Heard::Running { at, claim } => return Some((at, claim)),
                 }
             }
         }

@@ -21,6 +21,7 @@
 //! Keys are wiped from memory when they are dropped, are moved as little as can be, and are never in a `Debug`, an error
 //! or the log. What the kernel writes to swap or to a core dump is not prevented.
 
+mod claims;
 mod error;
 mod file;
 mod fleet;
@@ -30,10 +31,10 @@ mod named;
 pub mod place;
 mod ring;
 mod store;
-mod term;
 mod text;
 
 pub use cara_secure::keys::{DeviceSecret, DiscoveryKey, KEY_BYTES, PairKey, RootKey};
+pub(crate) use claims::{KeptClaims, KeptObeyed, read_claims, write_claims};
 pub use error::{FleetError, KeyError, Owner};
 #[cfg(feature = "access")]
 pub(crate) use file::Mark;
@@ -44,7 +45,6 @@ pub use members::{Member, Members, Revoked};
 pub use named::{full_name, parse_node};
 pub use ring::KeyRing;
 pub use store::{Change, Store, Written};
-pub(crate) use term::{read_term, write_term};
 
 /// Fills an array with random bytes of the kernel's.
 pub fn draw<const BYTES: usize>() -> Result<zeroize::Zeroizing<[u8; BYTES]>, KeyError> {

@@ -210,10 +210,6 @@ impl Keyring for KeyRing {
         let mut keys = self.pairs(peer).map(|(_, key)| key.clone());
         keys.next().map(|key| (key, keys.next()))
     }
-
-    fn is_own(&self, identity: &Identity) -> bool {
-        self.identity == *identity
-    }
 }
 
 /// The generation that a line begins; the line of the one behind it, if there is one.

@@ -130,7 +130,7 @@ impl<'t> Line<'t> {
     }
 
     /// The next value, and the line behind it.
-    fn value(self) -> (&'t str, Self) {
+    pub(super) fn value(self) -> (&'t str, Self) {
         let (value, rest) = self.rest.split_once(' ').unwrap_or((self.rest, ""));
         (value, Self { rest, ..self })
     }

@@ -5,10 +5,10 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use cara_core::config::{Mode, VERSIONS, Versions};
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::datagram::{Datagram, Header};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
-use cara_core::term::Term;
 
 use super::NAME;
 use crate::sys::interfaces::Interface;
@@ -57,8 +57,8 @@ pub struct Heard {
     pub tcp_port: Option<u16>,
     /// How many more nodes it takes, as it said last.
     pub room: Option<u16>,
-    /// The term of an m_unit, as it said last.
-    pub term: Option<Term>,
+    /// The claim of an m_unit, as it said last. Nothing proves it to a survey.
+    pub claim: Option<Claim>,
     /// Searches of it.
     pub searches: u32,
     /// Answers of it.
@@ -113,7 +113,7 @@ impl Heard {
             wanted: None,
             tcp_port: None,
             room: None,
-            term: None,
+            claim: None,
             searches: 0,
             answers: 0,
             others: 0,
@@ -138,7 +138,7 @@ impl Heard {
                 self.answers = self.answers.saturating_add(1);
                 self.tcp_port = Some(answer.tcp_port).filter(|port| *port > 0);
                 self.room = Some(answer.room);
-                self.term = Some(answer.term).filter(|term| *term != Term::NONE);
+                self.claim = answer.claim.map(|report| report.claim());
             }
             Some(Datagram::Session { .. }) | None => self.others = self.others.saturating_add(1),
         }

@@ -9,6 +9,7 @@ mod actuators;
 #[cfg(feature = "async")]
 mod asynchronous;
 mod callbacks;
+mod claims;
 mod constraints;
 mod details;
 mod growing;
@@ -27,6 +28,6 @@ mod processes;
 mod stopping;
 mod stuck;
 mod support;
-mod terms;
+
 mod threads;
 mod typed;

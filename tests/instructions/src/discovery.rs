@@ -18,7 +18,6 @@ use cara_core::services::requests::Pending;
 use cara_core::services::session::{Event, Publication, Session, SessionConfig, SessionStorage};
 use cara_core::services::{CallHead, Context};
 use cara_core::storage::{Buffer, Lent, Pool};
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 
 use crate::pair::{Bench, Nothing};
@@ -210,7 +209,8 @@ impl Discovery {
         let announce = Announce {
             identity,
             epoch: Epoch(1),
-            term: Term::NONE,
+            claim: None,
+            obeyed: None,
             sequence: 1,
             nonce: 0,
             tcp_port: 0,

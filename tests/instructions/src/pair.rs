@@ -22,7 +22,6 @@ use cara_core::services::requests::{CallId, Pending};
 use cara_core::services::session::{Call, Event, Publication, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{CallHead, Context, Port};
 use cara_core::storage::{Buffer, Lent, Pool};
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 
 use crate::{Meter, Of, Operation, Uncounted};
@@ -387,7 +386,8 @@ fn hello(constraints: &Constraints, caller: bool) -> Hello {
         identity: identity(caller),
         wanted: (!caller).then(depot),
         epoch: Epoch(1),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: if caller { 0x1234_5678 } else { 0x8765_4321 },
         limits: constraints.into(),
         link: 0,

@@ -4,7 +4,7 @@ use cara_core::config::{Constraints, Priority};
 use cara_core::error::Error;
 use cara_core::random::Random;
 use cara_core::storage::{Buffers, Lent, Pool};
-use cara_core::term::Term;
+use cara_core::distribution::claim::Claim;
 use cara_core::time::{Duration, Instant};
 
 use crate::linkage::{keep, unknown, unknown_slice};
@@ -29,9 +29,9 @@ entry!(random, {
     keep((random.bits(), random.below(*unknown()), random.jitter(*unknown())));
 });
 
-entry!(terms, {
-    let (one, other) = (*unknown::<Term>(), *unknown::<Term>());
-    keep((one.is_newer_than(other), one.newer(other), one.next()));
+entry!(claims, {
+    let (one, other) = (*unknown::<Claim>(), *unknown::<Claim>());
+    keep((one > other, one.raised(*unknown())));
 });
 
 entry!(pools, {

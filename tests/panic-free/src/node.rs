@@ -60,8 +60,13 @@ entry!(node_polled, {
 entry!(node_hears, {
     node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes);
     keep(node().take_duplicate());
-    node().set_term(*unknown());
-    keep((node().term(), node().take_newer_term(), node().another_proven_at()));
+    node().set_claim(*unknown());
+    node().take_over(*unknown());
+    node().keep_obeyed(*unknown(), unknown(), *unknown());
+    node().claim_kept(unknown(), *unknown(), *unknown());
+    node().left_unread();
+    node().store_claims();
+    keep((node().claim(), node().take_claim_event(), node().obeyed(unknown()), node().forget_claim(unknown())));
 });
 
 entry!(node_dials, {

@@ -8,7 +8,6 @@ use cara_core::error::Refusal;
 use cara_core::host::frame::{self, ChunkWriter, Chunking, Frame};
 use cara_core::host::secure::Plain;
 use cara_core::random::Random;
-use cara_core::term::Term;
 
 /// Streams and datagrams of garbage.
 const GARBAGE: usize = 24;
@@ -113,7 +112,8 @@ fn hello(manager: &Identity, fleet: u32) -> Vec<u8> {
         identity: Identity::s_unit("stranger", 66).expect("a short name"),
         wanted: Manager::new(manager.name(), manager.id()).ok(),
         epoch: Epoch(6),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: 6,
         limits: Limits { message_size: 1024, chunk_size: 1024, calls: 8, minimum_interval: 0 },
         link: 0,

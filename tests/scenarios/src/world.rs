@@ -18,7 +18,6 @@ use cara_core::services::event::UnitEvent;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{BoxedParameters, Path, Sample};
 
@@ -102,8 +101,8 @@ pub enum Seen {
     LeaseExpired(String),
     /// A lease that the unit held ended at the peer.
     LeaseEnded(String, LeaseEnd),
-    /// A manager of a newer term commands, and this one has stepped down.
-    Fenced(Term),
+    /// A manager with a claim of this term commands, and this one has stepped down.
+    Fenced(u64),
 }
 
 impl Seen {
@@ -121,7 +120,7 @@ impl Seen {
             UnitEvent::RequestFailed { call, error, .. } => Self::Failed(call, error),
             UnitEvent::LeaseExpired { function, .. } => Self::LeaseExpired(function.to_string()),
             UnitEvent::LeaseEnded { function, why, .. } => Self::LeaseEnded(function.to_string(), why),
-            UnitEvent::Fenced { term } => Self::Fenced(term),
+            UnitEvent::Fenced { claim } => Self::Fenced(claim.term),
             UnitEvent::FunctionsSkipped { .. } => return None,
             // A scenario that did not see it would pass for the wrong reason.
             other => panic!("no scenario knows {other:?}"),

@@ -8,7 +8,6 @@ use cara_core::distribution::authenticator::CODE_BYTES;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::host::secure::Plain;
-use cara_core::term::Term;
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::keys::{DiscoveryKey, PairKey};
 use cara_std::Interfaces;
@@ -80,7 +79,8 @@ fn announce(who: &Identity, nonce: u64, tcp_port: u16) -> Announce {
     Announce {
         identity: who.clone(),
         epoch,
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         sequence: u32::MAX,
         nonce,
         tcp_port,

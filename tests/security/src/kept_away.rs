@@ -7,7 +7,6 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Role};
-use cara_core::term::Term;
 use cara_secure::keyring::Codes;
 use cara_std::keys::KeyRing;
 use cara_std::sys::datagram::{Datagrams, Socket};
@@ -124,9 +123,19 @@ impl Attack {
         let tcp_port = listener.local_addr()?.port();
         let announce = |_| {
             let epoch = Epoch(fastrand::u64(..));
-            let (term, sequence, room, expected) = (Term::NONE, u32::MAX, 100, u16::MAX);
-            let announce =
-                Announce { identity: depot(), epoch, term, sequence, nonce: 0, tcp_port, room, expected, skipped: 0 };
+            let (sequence, room, expected) = (u32::MAX, 100, u16::MAX);
+            let announce = Announce {
+                identity: depot(),
+                epoch,
+                claim: None,
+                obeyed: None,
+                sequence,
+                nonce: 0,
+                tcp_port,
+                room,
+                expected,
+                skipped: 0,
+            };
             let mut out = [0; SEARCH_BYTES];
             announce.encode(fleet, &codes, None, &mut out).map(<[u8]>::to_vec).context("it fits")
         };

@@ -14,7 +14,6 @@ use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::message::{Message, RequestHeader, SessionBody};
 use cara_core::host::frame::{self, Frame};
 use cara_core::host::secure::{Seal, Secure};
-use cara_core::term::Term;
 use cara_secure::keys::PairKey;
 use cara_secure::link::{Cipher, Credentials};
 
@@ -425,7 +424,8 @@ pub fn hello(claim: &Claim, mode: Mode, udp_port: u16) -> Vec<u8> {
         identity: claim.identity.clone(),
         wanted: claim.wanted.clone(),
         epoch: Epoch(u64::from_le_bytes(random())),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: u64::from_le_bytes(random()),
         limits: Limits { message_size: 1_024, chunk_size: 1_024, calls: 8, minimum_interval: 0 },
         link: 0,

@@ -101,5 +101,5 @@ pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
 pub use world::{
     Actuator, BoxedParameters, Call, Heart, Hold, LeaseWatch, LogEvent, MyFunctionList, NewUnit, Outcome, Peer, Ring,
-    Sample, Service, UnitEvent, UnitHandle, Watched, World, boxed_parameters, for_each_seed, seeds,
+    Sample, Service, Storing, UnitEvent, UnitHandle, Watched, World, boxed_parameters, for_each_seed, seeds,
 };

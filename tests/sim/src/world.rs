@@ -46,6 +46,7 @@ pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
 pub use requests::{Hold, Watched};
 pub use service::{BoxedParameters, Call, LeaseWatch, Outcome, Service, boxed_parameters};
+pub use state::Storing;
 pub use streams::Sample;
 
 use audited::Seals;

@@ -4,7 +4,7 @@ use cara_core::config::{Mode, Priority, Versions};
 use cara_core::distribution::block;
 use cara_core::distribution::datagram::{Announce, Datagram, DatagramError, WhoHas};
 use cara_core::distribution::function::{Attributes, Signature, VariableSpec};
-use cara_core::distribution::hello::{Hello, HelloError, Manager};
+use cara_core::distribution::hello::{ClaimReport, Hello, HelloError, Manager};
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::distribution::items::{Item, Items, Malformed};
 use cara_core::distribution::message::{
@@ -46,7 +46,8 @@ pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
             "identity": identity(&hello.identity),
             "wanted": manager(hello.wanted.as_ref()),
             "epoch": hello.epoch.0,
-            "term": hello.term.0,
+            "claim": claim(hello.claim.as_ref()),
+            "obeyed": claim(hello.obeyed.as_ref()),
             "nonce": hello.nonce,
             "message_size": hello.limits.message_size,
             "chunk_size": hello.limits.chunk_size,
@@ -168,6 +169,7 @@ fn control(control: &Control<'_>) -> Value {
         Control::Limits { message_size, minimum_interval, calls } => json!({ "limits": {
             "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
         }}),
+        Control::Claimed { report } => json!({ "claimed": claim(Some(&report)) }),
         Control::LeaseEnded { call, why } => json!({ "lease_ended": { "call": call, "why": why.word() } }),
         Control::Subscribe { slot, generation, interval } => json!({ "subscribe": {
             "slot": slot, "generation": generation, "interval": interval,
@@ -319,11 +321,18 @@ fn who_has(search: &WhoHas) -> Value {
     })
 }
 
+fn claim(report: Option<&ClaimReport>) -> Value {
+    let Some(ClaimReport { tagged, since }) = report else { return Value::Null };
+    let tag = tagged.tag.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+    json!({ "term": tagged.claim.term, "claimant": tagged.claim.claimant, "tag": tag, "since": since })
+}
+
 fn announce(answer: &Announce) -> Value {
     json!({
         "identity": identity(&answer.identity),
         "epoch": answer.epoch.0,
-        "term": answer.term.0,
+        "claim": claim(answer.claim.as_ref()),
+        "obeyed": claim(answer.obeyed.as_ref()),
         "sequence": answer.sequence,
         "nonce": answer.nonce,
         "tcp_port": answer.tcp_port,

@@ -1,12 +1,12 @@
 //! Vectors of the hello and of datagrams.
 
 use cara_core::config::{Mode, VERSIONS, Versions};
+use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::distribution::datagram::{Announce, WhoHas, session_header, short_hash};
-use cara_core::distribution::hello::{Hello, Limits, Manager};
+use cara_core::distribution::hello::{ClaimReport, Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::message::SessionBody;
 use cara_core::host::secure::Plain;
-use cara_core::term::Term;
 use serde_json::{Value, json};
 
 use crate::vector::{Context, Kind, Vector};
@@ -32,7 +32,8 @@ pub(crate) fn agv_hello() -> Hello {
         identity: identity("agv-07", 7, Role::SUnit),
         wanted: Some(manager("manager", 1)),
         epoch: Epoch(0x0102_0304_0506_0708),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: 0x1122_3344_5566_7788,
         limits: Limits { message_size: 1024, chunk_size: 1024, calls: 8, minimum_interval: 0 },
         link: 0,
@@ -51,7 +52,8 @@ pub(crate) fn manager_hello() -> Hello {
         identity: identity("manager", 1, Role::MUnit),
         wanted: None,
         epoch: Epoch(9),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: 0xA1A2_A3A4_A5A6_A7A8,
         limits: Limits { message_size: 32_768, chunk_size: 4096, calls: 64, minimum_interval: 0 },
         link: 300,
@@ -89,6 +91,16 @@ pub(crate) fn hello_of(first: u8, last: u8) -> Vec<u8> {
     encoded_hello(&Hello { versions: Versions { first, last }, ..agv_hello() })
 }
 
+/// A claim with its tag.
+pub(crate) fn report(since: u32) -> ClaimReport {
+    let claim = Claim { term: 300, claimant: 0x0102_0304_0506_0708 };
+    ClaimReport { tagged: TaggedClaim { claim, tag: [0xA7; 16] }, since }
+}
+
+pub(crate) fn reported(since: u32) -> Value {
+    json!({ "term": 300, "claimant": 0x0102_0304_0506_0708_u64, "tag": "a7".repeat(16), "since": since })
+}
+
 fn hellos() -> Vec<Vector> {
     let mut small = agv_hello();
     small.limits.chunk_size = 319;
@@ -97,7 +109,7 @@ fn hellos() -> Vec<Vector> {
         "identity": { "name": "agv-07", "id": 7, "role": "s_unit" },
         "wanted": { "name": "manager", "id": 1 },
         "epoch": 0x0102_0304_0506_0708_u64,
-        "term": 0,
+        "claim": null, "obeyed": null,
         "nonce": 0x1122_3344_5566_7788_u64,
         "message_size": 1024, "chunk_size": 1024, "calls": 8, "minimum_interval": 0,
         "link": 0, "udp_port": 21_970, "stamp": 1_000_000, "keep_alive": 1000,
@@ -108,7 +120,7 @@ fn hellos() -> Vec<Vector> {
         "identity": { "name": "manager", "id": 1, "role": "m_unit" },
         "wanted": null,
         "epoch": 9,
-        "term": 0,
+        "claim": null, "obeyed": null,
         "nonce": 0xA1A2_A3A4_A5A6_A7A8_u64,
         "message_size": 32_768, "chunk_size": 4096, "calls": 64, "minimum_interval": 0,
         "link": 300, "udp_port": 40_001, "stamp": 5_000_000, "keep_alive": 1000,
@@ -123,7 +135,10 @@ fn hellos() -> Vec<Vector> {
     later["capabilities"] = json!(0x8000_0000_0000_0001_u64);
     let later_hello =
         Hello { versions: Versions { first: 2, last: 9 }, capabilities: 0x8000_0000_0000_0001, ..agv_hello() };
-    let obeyed = Hello { term: Term(300), ..agv_hello() };
+    let obeyed = Hello { obeyed: Some(report(1_500)), ..agv_hello() };
+    let claiming = Hello { claim: Some(report(ClaimReport::NEVER)), ..manager_hello() };
+    let mut of_claim = manager.clone();
+    of_claim["claim"] = reported(u32::MAX);
     let own = encoded_hello(&agv_hello());
     let more_calls = [&own[..], &item(4, &[0x80, 8, 0x80, 8, 9, 0, 0xEE, 0xEE, 0xEE])].concat();
     let other = |versions: Value| json!({ "other_versions": versions });
@@ -132,10 +147,11 @@ fn hellos() -> Vec<Vector> {
         hello(("hello_s_unit", "an s_unit that belongs to a manager"), &encoded_hello(&agv_hello()), &agv),
         hello(("hello_m_unit", "an m_unit"), &encoded_hello(&manager_hello()), &manager),
         hello(
-            ("hello_of_term", "an s_unit that has obeyed term 300"),
+            ("hello_obeyed", "an s_unit that has obeyed the claim 300, whose manager it has heard 1.5 s ago"),
             &encoded_hello(&obeyed),
-            &but("term", json!(300)),
+            &but("obeyed", reported(1_500)),
         ),
+        hello(("hello_claim", "an m_unit of the claim 300"), &encoded_hello(&claiming), &of_claim),
         hello(
             ("hello_of_more_versions", "versions 2 to 9 and two capabilities: version 2 is in common"),
             &encoded_hello(&later_hello),
@@ -191,7 +207,8 @@ fn datagrams() -> Vec<Vector> {
     let answer = Announce {
         identity: identity("manager", 1, Role::MUnit),
         epoch: Epoch(9),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         sequence: 2,
         nonce: 0x0102_0304_0506_0708,
         tcp_port: 40_000,
@@ -202,8 +219,8 @@ fn datagrams() -> Vec<Vector> {
     let mut out = [0; 512];
     let search = search.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
     let wish = wish.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
-    let of_term = Announce { term: Term(300), ..answer.clone() };
-    let of_term = of_term.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
+    let of_claim = Announce { claim: Some(report(1_500)), ..answer.clone() };
+    let of_claim = of_claim.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let answer = answer.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let header = session_header(Mode::Plain, VERSIONS.last, Fleet(7), 300, 0xA1A2_A3A4_A5A6_A7A8);
     let session = [&header[..], &SessionBody::keep_alive(1_000_000)].concat();
@@ -224,9 +241,9 @@ fn datagrams() -> Vec<Vector> {
             "tcp_port": 0, "expected": 1, "known": [], "skipped": skipped,
         }})
     };
-    let announced = |term| {
+    let announced = |claim: Value| {
         json!({ "announce": {
-            "identity": manager, "epoch": 9, "term": term, "sequence": 2, "nonce": 0x0102_0304_0506_0708_u64,
+            "identity": manager, "epoch": 9, "claim": claim, "obeyed": null, "sequence": 2, "nonce": 0x0102_0304_0506_0708_u64,
             "tcp_port": 40_000, "room": 64, "expected": 1, "skipped": 0,
         }})
     };
@@ -269,8 +286,8 @@ fn datagrams() -> Vec<Vector> {
             &json!({ "other_versions": [3, 5] }),
         )
         .lossy(),
-        datagram(("announce", "the manager answers"), 7, &answer, &announced(0)),
-        datagram(("announce_of_term", "the manager of term 300 answers"), 7, &of_term, &announced(300)),
+        datagram(("announce", "the manager answers"), 7, &answer, &announced(Value::Null)),
+        datagram(("announce_claim", "the manager of claim 300 answers"), 7, &of_claim, &announced(reported(1_500))),
         datagram(
             ("session_datagram", "a keep-alive to link 300 of the manager"),
             7,

@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 
 use crate::decoded::hex;
 use crate::introductions::item;
+use crate::introductions::{report, reported};
 use crate::values::{GO_TO, arguments, motion};
 use crate::vector::{Context, Kind, Vector, definition};
 
@@ -244,6 +245,12 @@ fn controls() -> Vec<Vector> {
             "the sender's limits changed",
             Control::Limits { message_size: 65_536, minimum_interval: 10_000, calls: 4 },
             json!({ "limits": { "message_size": 65_536, "minimum_interval": 10_000, "calls": 4 } }),
+        ),
+        (
+            "claimed",
+            "the manager has raised its claim",
+            Control::Claimed { report: report(u32::MAX) },
+            json!({ "claimed": reported(u32::MAX) }),
         ),
         (
             "lease_ended",

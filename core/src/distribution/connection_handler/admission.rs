@@ -1,6 +1,7 @@
 //! Which links are taken: one per node, of the right fleet, role and manager, as many as the constraint allows; and how a
 //! node that restarted is told from another one with the same identity.
 
+use super::claims::claim_of;
 use super::known::{Known, Newcomer, NodeState};
 use super::timetable::Task;
 use super::{Command, Directive, Node, NodeCounter};
@@ -26,15 +27,16 @@ pub(crate) enum Admission {
 impl<P: Port> Node<P> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
     pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: P::Endpoint, hello: &Hello) -> Admission {
-        if let Err(refusal) = self.check(hello).and_then(|()| self.check_term(hello)) {
+        if let Err(refusal) = self.check(hello).and_then(|()| self.check_claim(hello)) {
             if refusal == Refusal::Fenced {
-                self.fenced_at_vehicle(hello.term);
+                self.hear_obeyed(now, from, &hello.identity, hello.obeyed.as_ref());
             }
             return self.refuse(now, from, &hello.identity, refusal);
         }
         // The identity decides before the number of nodes does: a node that restarts takes its own place, also in a full table.
-        let Hello { epoch, term, limits, .. } = *hello;
-        let newcomer = Newcomer { link, epoch, term, limits, address: from, decided: false };
+        let Hello { epoch, claim, limits, .. } = *hello;
+        let is_higher = claim_of(claim.as_ref()) > self.obeyed(&hello.identity);
+        let newcomer = Newcomer { link, epoch, claim, is_higher, limits, address: from, decided: false };
         let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
         match old {
             Some((_, old)) if old == link => Admission::Accept,
@@ -75,7 +77,7 @@ impl<P: Port> Node<P> {
     }
 
     fn join(&mut self, now: Instant, identity: &Identity, newcomer: Newcomer<P::Endpoint>) -> Admission {
-        let Newcomer { link, epoch, term, limits, address, .. } = newcomer;
+        let Newcomer { link, epoch, claim, limits, address, .. } = newcomer;
         let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
             return self.refuse(now, address, identity, Refusal::Full);
         };
@@ -90,6 +92,8 @@ impl<P: Port> Node<P> {
             known.newest = Some((epoch, 0));
         }
         (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
+        known.under = None;
+        let offered = known.offered.take().filter(|(offered, _)| *offered > claim_of(claim.as_ref()));
         // A dial that is planned or under way has its aim; a second link of the same node would only be refused.
         self.table.cancel(place);
         self.table.set_state(place, NodeState::Joined(link));
@@ -98,7 +102,14 @@ impl<P: Port> Node<P> {
         self.counters.add(NodeCounter::Restarted, u64::from(restarted));
         self.counters.count(NodeCounter::Joined);
         self.hints.forget(identity);
-        self.obey(term);
+        if let Some((_, from)) = offered {
+            // Another manager of the same identity has answered with a higher claim, and was slower.
+            self.hints.plan(now, from, identity, now);
+        }
+        if identity.role() == Role::MUnit {
+            self.obey(now, identity, claim.as_ref());
+        }
+        self.was_obeyed();
         debug!("link {} joins", link.0);
         Admission::Accept
     }
@@ -113,8 +124,6 @@ impl<P: Port> Node<P> {
     ) -> Admission {
         // Both ends compare the same two identities, so they keep the same one of two links without asking each other.
         let smaller = self.config.identity < *identity;
-        // A manager with a newer term commands, whether the older one is alive or not.
-        let takes_over = self.config.identity.role() == Role::SUnit && newcomer.term.is_newer_than(self.term());
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
         let same_life = known.epoch == newcomer.epoch;
         let dialed = known.dialing == Some(newcomer.link);
@@ -127,7 +136,7 @@ impl<P: Port> Node<P> {
         if crossing && dialed != smaller {
             return self.refuse(now, newcomer.address, identity, Refusal::AlreadyConnected);
         }
-        newcomer.decided = crossing || takes_over;
+        newcomer.decided = crossing;
         known.newcomer = Some(newcomer);
         self.table.schedule(place, now, Task::Challenge);
         self.table.set_link(newcomer.link, Some(place));
@@ -138,10 +147,11 @@ impl<P: Port> Node<P> {
     /// The link that a newcomer would replace is to show whether it is alive.
     pub(super) fn challenge(&mut self, now: Instant, place: usize) -> Option<Command<P::Endpoint>> {
         let known = self.table.node(place)?;
-        let (old, decided) = (known.link()?, known.newcomer.as_ref()?.decided);
-        let until = if decided { now } else { now + CHALLENGE_TIMEOUT };
+        let (old, newcomer) = (known.link()?, known.newcomer.as_ref()?);
+        let until = if newcomer.decided { now } else { now + CHALLENGE_TIMEOUT };
+        let directive = if newcomer.is_higher { Directive::Yield } else { Directive::Challenge };
         self.table.schedule(place, until, Task::Supersede);
-        Some(Command::Tell(old, Directive::Challenge))
+        Some(Command::Tell(old, directive))
     }
 
     /// The challenged link has answered: the newcomer is not taken.
@@ -158,7 +168,11 @@ impl<P: Port> Node<P> {
         let newcomer = known.newcomer.take()?;
         known.dialing.take_if(|dialing| *dialing == newcomer.link);
         let (same_life, identity) = (known.epoch == newcomer.epoch, known.identity.clone());
-        let refusal = if same_life { Refusal::AlreadyConnected } else { Refusal::DuplicateIdentity };
+        let refusal = match (same_life, newcomer.is_higher) {
+            (true, _) => Refusal::AlreadyConnected,
+            (false, true) => Refusal::Driving,
+            (false, false) => Refusal::DuplicateIdentity,
+        };
         self.table.set_link(newcomer.link, None);
         self.refuse(now, newcomer.address, &identity, refusal);
         Some(Command::Tell(newcomer.link, Directive::Refuse(refusal)))
@@ -200,7 +214,7 @@ impl<P: Port> Node<P> {
             Refusal::AlreadyConnected => NodeCounter::RefusedConnected,
             Refusal::Mode => NodeCounter::RefusedMode,
             Refusal::NoKey => NodeCounter::RefusedKey,
-            Refusal::Fenced => NodeCounter::RefusedFenced,
+            Refusal::Fenced | Refusal::Driving => NodeCounter::RefusedFenced,
         };
         self.counters.count(counter);
         self.note_of(now, address, identity, refusal);

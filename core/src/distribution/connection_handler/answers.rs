@@ -1,11 +1,13 @@
 //! Answers to searches, and dials to the nodes that were found.
 
+use super::claims::claim_of;
 use super::known::NodeState;
 use super::search::back_off;
 use super::timetable::Task;
 use super::{Command, Node, NodeCounter, Target};
 use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH, Mode};
 use crate::distribution::authenticator::Authenticator;
+use crate::distribution::claim::Claim;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
@@ -73,11 +75,13 @@ pub(super) struct Found {
     epoch: Epoch,
     sequence: u32,
     tcp_port: u16,
+    claim: Claim,
 }
 
 impl Found {
     pub(super) const fn of(announce: &Announce) -> Self {
-        Self { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port }
+        let Announce { epoch, sequence, tcp_port, .. } = *announce;
+        Self { epoch, sequence, tcp_port, claim: claim_of(announce.claim.as_ref()) }
     }
 }
 
@@ -136,14 +140,14 @@ impl<P: Port> Node<P> {
         while let Some(index) = self.answers.single.iter().position(|answer| answer.at <= now) {
             let Answer { to, who, nonce, .. } = self.answers.single.swap_remove(index);
             let send = |datagram: &[u8]| mailman.send_to(to, datagram);
-            if !self.send_announce(authenticator, nonce, Some(&who), NodeCounter::AnnounceSent, send) {
+            if !self.send_announce(now, authenticator, nonce, Some(&who), NodeCounter::AnnounceSent, send) {
                 self.counters.count(NodeCounter::AnnounceWithheld);
                 self.note_of(now, to, &who, Refusal::NoKey);
             }
         }
         if self.answers.broadcast.take_if(|at| *at <= now).is_some() {
             self.answers.last_broadcast = Some(now);
-            self.send_announce(authenticator, 0, None, NodeCounter::AnnounceBroadcast, |datagram| {
+            self.send_announce(now, authenticator, 0, None, NodeCounter::AnnounceBroadcast, |datagram| {
                 mailman.broadcast(datagram)
             });
         }
@@ -152,6 +156,7 @@ impl<P: Port> Node<P> {
     /// `false` where there is no key to sign the answer with.
     fn send_announce(
         &mut self,
+        now: Instant,
         authenticator: &dyn Authenticator,
         nonce: u64,
         to: Option<&Identity>,
@@ -161,7 +166,8 @@ impl<P: Port> Node<P> {
         let announce = Announce {
             identity: self.config.identity.clone(),
             epoch: self.config.epoch,
-            term: self.term(),
+            claim: self.own_report(now),
+            obeyed: to.and_then(|manager| self.obeyed_report(now, manager)),
             sequence: self.sequence.wrapping_add(1),
             nonce,
             tcp_port: self.config.tcp_port,
@@ -202,11 +208,12 @@ impl<P: Port> Node<P> {
     /// A node that this unit dials has answered it: it is dialled at once, unless it is connected. While a dial to another
     /// address of it is silent, this one is tried beside it.
     pub(super) fn found(&mut self, now: Instant, identity: &Identity, from: P::Endpoint, found: Found) {
-        let Found { epoch, sequence, tcp_port } = found;
+        let Found { epoch, sequence, tcp_port, claim } = found;
         if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
             return;
         }
         let address = from.at_port(tcp_port);
+        let is_higher = claim > self.obeyed(identity);
         let Some((place, forgotten)) = self.table.hear_of(identity, address, epoch) else {
             self.counters.count(NodeCounter::TableFull);
             return;
@@ -221,7 +228,13 @@ impl<P: Port> Node<P> {
         known.newest = Some((epoch, sequence));
         // Kept also while the node is connected: it is where it is dialled when this link ends.
         let moved = known.listens.replace(address) != Some(address);
+        if known.offered.is_none_or(|(offered, _)| claim > offered) {
+            known.offered = Some((claim, from));
+        }
         if known.is_joined() {
+            if known.epoch != epoch && is_higher && known.task.is_none() {
+                self.table.schedule(place, now, Task::Yield);
+            }
             return;
         }
         // A node that has restarted is not made to wait for what its earlier boot has failed at.

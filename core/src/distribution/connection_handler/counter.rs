@@ -73,8 +73,14 @@ crate::counters::counters! {
         RefusedMode,
         /// Links refused because there is no key for the pair.
         RefusedKey,
-        /// Links refused because the manager's term is older than one that the vehicle has obeyed.
+        /// Links refused because the vehicle has obeyed a higher claim, or drives for another manager.
         RefusedFenced,
+        /// Nodes that said that they obey another manager of this unit's identity.
+        Fenced,
+        /// Questions for this unit's own identity, because another manager of it was obeyed.
+        OwnIdentityAsked,
+        /// Claims that are obeyed until this unit's next start, because they were not stored, or not in time.
+        ClaimsNotKept,
         /// Links that were challenged to prove liveness, because another one had the same identity.
         Challenged,
         /// Nodes that came back with a new epoch.

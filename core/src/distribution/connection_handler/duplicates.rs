@@ -39,7 +39,7 @@ impl<P: Port> Node<P> {
     }
 
     /// Ignores this unit's own datagrams, and records another's in its name. A manager answers the `question` of the
-    /// other one, which would not detect it otherwise, and asks it in turn, for its term.
+    /// other one, which would not detect it otherwise, and asks it in turn, for its claim.
     pub(super) fn is_own(
         &mut self,
         now: Instant,
@@ -57,8 +57,8 @@ impl<P: Port> Node<P> {
             self.duplicates.hear(now, from, epoch);
             if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
                 self.answer_later(now, from, identity, who_has.nonce);
-                // Not what asks this unit alone, or the two would ask each other without end.
-                if who_has.wanted.is_none() {
+                // With a growing pause, so that two do not ask each other without end.
+                if who_has.tcp_port != 0 {
                     self.hints.plan(now, from, identity, now);
                 }
             }

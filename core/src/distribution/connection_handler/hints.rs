@@ -6,12 +6,12 @@
 //! delays it once, by a second at most.
 
 use super::known::NodeState;
-use super::search::{back_off, mostly_late};
+use super::search::{back_off, fresh, mostly_late};
 use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH};
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::hello::Manager;
-use crate::distribution::identity::Identity;
+use crate::distribution::identity::{Epoch, Identity};
 use crate::host::endpoint::{Endpoint, mix};
 use crate::host::mailman::Mailman;
 use crate::host::port::Port;
@@ -136,8 +136,13 @@ impl Hosts {
 
 impl<P: Port> Node<P> {
     /// A broadcast hints at a node that this unit dials: it is asked after `delay`, unless it is connected.
-    pub(super) fn hinted(&mut self, now: Instant, from: P::Endpoint, who: &Identity, delay: Duration) {
-        let away = self.node(who).is_none_or(|known| known.state == NodeState::Away && known.not_before <= now);
+    /// A vehicle that is connected to another boot of its manager asks this one, which may have a higher claim.
+    pub(super) fn hinted(&mut self, now: Instant, from: P::Endpoint, who: &Identity, epoch: Epoch, delay: Duration) {
+        let away = self.node(who).is_none_or(|known| match known.state {
+            NodeState::Away => known.not_before <= now,
+            NodeState::Joined(_) => known.epoch != epoch,
+            NodeState::Dialing => false,
+        });
         if !away || matches!(self.config.target, Target::Fixed(..)) {
             return;
         }
@@ -153,6 +158,10 @@ impl<P: Port> Node<P> {
         authenticator: &dyn Authenticator,
     ) {
         while let Some((to, who)) = self.hints.take(now) {
+            if self.node(&who).is_some_and(|known| known.is_joined()) {
+                // What answered an earlier question proves nothing now.
+                self.search.nonce = fresh(&mut self.random);
+            }
             self.ask(to, &who, mailman, authenticator);
             if self.search.next != Instant::FAR_FUTURE && who != self.config.identity {
                 let soon = now + UNANSWERED + mostly_late(&mut self.random, UNANSWERED);

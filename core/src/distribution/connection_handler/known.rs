@@ -2,10 +2,10 @@
 
 use super::table::NONE;
 use super::timetable::Task;
-use crate::distribution::hello::Limits;
+use crate::distribution::claim::Claim;
+use crate::distribution::hello::{ClaimReport, Limits};
 use crate::distribution::identity::{Epoch, Identity};
 use crate::host::mailman::LinkId;
-use crate::term::Term;
 use crate::time::Instant;
 
 /// What is known of a node. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
@@ -23,6 +23,10 @@ pub struct Known<E> {
     pub(super) listens: Option<E>,
     /// The newest answer of it.
     pub(super) newest: Option<(Epoch, u32)>,
+    /// It has obeyed this higher claim of another manager of this unit's identity.
+    pub(super) under: Option<Claim>,
+    /// The highest claim with which it has answered while it was away, and from where.
+    pub(super) offered: Option<(Claim, E)>,
     pub(super) state: NodeState,
     /// Its link was opened from here.
     pub(super) dialed: bool,
@@ -49,7 +53,9 @@ pub struct Known<E> {
 pub(super) struct Newcomer<E> {
     pub(super) link: LinkId,
     pub(super) epoch: Epoch,
-    pub(super) term: Term,
+    pub(super) claim: Option<ClaimReport>,
+    /// It has a higher claim than the one that is connected.
+    pub(super) is_higher: bool,
     pub(super) limits: Limits,
     pub(super) address: E,
     /// It takes the place whether the older one answers or not.
@@ -76,6 +82,11 @@ impl<E> Known<E> {
     /// Whether the node is connected, or about to be.
     pub const fn state(&self) -> NodeState {
         self.state
+    }
+
+    /// It is under another manager of this unit's identity, with this claim: it refuses this one.
+    pub const fn under(&self) -> Option<Claim> {
+        self.under
     }
 
     /// The node's link, while it is connected.
@@ -106,6 +117,8 @@ impl<E> Known<E> {
             limits: None,
             listens: None,
             newest: None,
+            under: None,
+            offered: None,
             state: NodeState::Away,
             dialed: false,
             dialing: None,

@@ -2,6 +2,7 @@
 
 use super::known::NodeState;
 use super::search::{LOST_LISTENING, back_off};
+use super::timetable::Task;
 use super::{Node, Target};
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
@@ -66,6 +67,7 @@ impl<P: Port> Node<P> {
             }
         } else if known.link() == Some(link) {
             debug!("link {} left: {}", link.0, reason);
+            self.manager_left(now, &identity);
             self.part(now, place, reason);
         }
     }
@@ -85,7 +87,14 @@ impl<P: Port> Node<P> {
         if let Some(newcomer) = self.table.node_mut(place).and_then(|known| known.newcomer.take()) {
             return self.take_place(now, place, newcomer);
         }
+        let is_followed = reason == CloseReason::PeerRestarted
+            && self.table.node(place).is_some_and(|known| known.listens.is_some() && self.dials(&known.identity));
+        if is_followed {
+            // Another boot of it has been found, and is where this one is dialled.
+            self.table.schedule(place, now, Task::Dial);
+        }
         match self.config.target {
+            _ if is_followed => {}
             // One that was stopped in an orderly way says so itself when it is back.
             Target::Everybody if matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere) => {}
             Target::Everybody | Target::Fixed(..) => self.retry(now, place),
@@ -97,7 +106,7 @@ impl<P: Port> Node<P> {
     /// The dialled peer has refused for a reason that does not pass by itself.
     fn lose_hope(&mut self, now: Instant, place: usize, reason: CloseReason) {
         let CloseReason::Refused(refusal) = reason else { return };
-        if matches!(refusal, Refusal::Full | Refusal::AlreadyConnected | Refusal::Fenced) {
+        if matches!(refusal, Refusal::Full | Refusal::AlreadyConnected | Refusal::Fenced | Refusal::Driving) {
             return;
         }
         if let Target::Manager(_) = self.config.target {

@@ -15,6 +15,7 @@
 
 mod admission;
 mod answers;
+mod claims;
 mod counter;
 mod duplicates;
 mod hints;
@@ -22,15 +23,14 @@ mod known;
 mod links;
 mod search;
 mod table;
-mod terms;
 mod timetable;
 mod views;
 
 pub(crate) use admission::Admission;
+pub use claims::ClaimEvent;
 pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;
-pub use terms::NewerTerm;
 
 use crate::config::{Constraints, LATER, VERSIONS};
 use crate::counters::Counters;
@@ -45,11 +45,11 @@ use crate::host::port::{Port, Slice};
 use crate::random::Random;
 use crate::time::Instant;
 use answers::Answers;
+use claims::Claims;
 use duplicates::Duplicates;
 use hints::{Hints, Hosts};
 use search::{Budget, Search};
 use table::Table;
-use terms::Terms;
 use timetable::Task;
 
 /// The nodes that a unit connects to. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
@@ -122,6 +122,9 @@ pub enum Directive {
     /// The peer shows whether it is alive: another link has its identity.
     #[non_exhaustive]
     Challenge,
+    /// The same, because a manager with a higher claim wants to command: when nothing moves, or after a while, the link ends.
+    #[non_exhaustive]
+    Yield,
     /// It has waited, and is accepted.
     #[non_exhaustive]
     Admit,
@@ -178,7 +181,7 @@ pub struct Node<P: Port> {
     hosts: Hosts,
     answers: Answers<P::Endpoint>,
     duplicates: Duplicates<P::Endpoint>,
-    terms: Terms,
+    claims: Claims,
     /// Of the last search or answer.
     sequence: u32,
     /// What happened.
@@ -205,7 +208,7 @@ impl<P: Port> Node<P> {
             hosts: Hosts::new((config.seed >> 32) as u32 ^ config.seed as u32),
             answers: Answers::new(),
             duplicates: Duplicates::new(),
-            terms: Terms::new(),
+            claims: Claims::new(now),
             sequence: 0,
             counters: Counters::new(),
             config,
@@ -286,7 +289,8 @@ impl<P: Port> Node<P> {
             identity: self.config.identity.clone(),
             wanted: self.manager().cloned(),
             epoch: self.config.epoch,
-            term: self.terms.own,
+            claim: self.own_report(now),
+            obeyed: self.peer_of(link).and_then(|peer| self.obeyed_report(now, peer)),
             nonce: self.random.bits(),
             limits: constraints.into(),
             link: link.0,
@@ -295,6 +299,12 @@ impl<P: Port> Node<P> {
             keep_alive: u32::try_from(constraints.keep_alive.as_millis()).unwrap_or(u32::MAX),
             skipped: 0,
         }
+    }
+
+    /// Whom a link that is being opened is meant for, if that is known.
+    fn peer_of(&self, link: LinkId) -> Option<&Identity> {
+        let place = self.table.of_link(link);
+        self.target.as_ref().or_else(|| Some(&self.table.node(place?)?.identity))
     }
 
     fn manager(&self) -> Option<&Manager> {
@@ -311,7 +321,8 @@ impl<P: Port> Node<P> {
 
     /// When [`poll`](Self::poll) has something to do next.
     pub fn next_deadline(&self) -> Instant {
-        self.search.next().min(self.answers.next()).min(self.hints.next()).min(self.table.next_due())
+        let others = self.answers.next().min(self.hints.next()).min(self.table.next_due());
+        self.search.next().min(self.claims.next()).min(others)
     }
 
     /// Does what is due. Returns one command at a time; call it until it returns `None`.
@@ -334,11 +345,15 @@ impl<P: Port> Node<P> {
                     self.table.node(place).and_then(Known::link).map(|new| Command::Tell(new, Directive::Admit))
                 }
                 Task::Refuse => self.refuse_newcomer(now, place),
+                Task::Yield => {
+                    self.table.node(place).and_then(Known::link).map(|old| Command::Tell(old, Directive::Yield))
+                }
             };
             if command.is_some() {
                 return command;
             }
         }
+        self.poll_claims(now, mailman, authenticator);
         self.poll_answers(now, mailman, authenticator);
         self.poll_hints(now, mailman, authenticator);
         self.poll_search(now, mailman, authenticator);
@@ -355,7 +370,7 @@ impl<P: Port> Node<P> {
             }
             Ok(Datagram::Announce(announce)) => {
                 self.counters.add(NodeCounter::DatagramItemsSkipped, announce.skipped.into());
-                self.heard_announce(now, from, &announce);
+                self.heard_announce(now, from, &announce, authenticator);
             }
             Ok(Datagram::Session { .. }) => self.counters.count(NodeCounter::DatagramUnknownLink),
             Err(error) => self.unreadable(now, from, error),

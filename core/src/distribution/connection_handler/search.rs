@@ -84,7 +84,7 @@ fn first_delay(role: Role, listening: Duration, random: &mut Random) -> Duration
 }
 
 /// Nonces are never 0, which stands for a broadcast.
-fn fresh(random: &mut Random) -> u64 {
+pub(super) fn fresh(random: &mut Random) -> u64 {
     random.bits() | 1
 }
 
@@ -145,7 +145,7 @@ impl<P: Port> Node<P> {
     /// When the next search goes out. Another unit's search may defer it, so a port reads waiting datagrams first:
     /// otherwise each of many units that one busy thread drives would search.
     pub fn searches_at(&self) -> Instant {
-        self.search.next()
+        self.search.next().min(self.claims.next())
     }
 
     fn dial_target(&mut self, now: Instant) {
@@ -353,17 +353,34 @@ impl<P: Port> Node<P> {
             }
             return;
         }
-        self.hinted(now, from, &who_has.identity, delay);
+        if self.obeyed_report(now, &who_has.identity).is_some() && !self.is_connected(&who_has.identity, who_has.epoch)
+        {
+            // What this unit has obeyed, a manager of that identity is to know.
+            self.answer_later(now, from, &who_has.identity, who_has.nonce);
+        }
+        self.hinted(now, from, &who_has.identity, who_has.epoch, delay);
     }
 
-    pub(super) fn heard_announce(&mut self, now: Instant, from: P::Endpoint, announce: &Announce) {
+    pub(super) fn heard_announce(
+        &mut self,
+        now: Instant,
+        from: P::Endpoint,
+        announce: &Announce,
+        authenticator: &dyn Authenticator,
+    ) {
         if self.is_own(now, from, &announce.identity, announce.epoch, None) {
             if announce.epoch != self.config.epoch {
-                self.another_answered(now, announce);
+                self.another_answered(now, announce, authenticator);
             }
             return;
         }
         self.counters.count(NodeCounter::AnnounceHeard);
+        if announce.nonce != 0 && announce.nonce == self.search.nonce {
+            self.hear_obeyed(now, from, &announce.identity, announce.obeyed.as_ref());
+        }
+        if announce.identity.role() == Role::SUnit && announce.obeyed.is_some() {
+            return;
+        }
         if announce.identity.role() != Role::MUnit || !self.is_wanted(&announce.identity) {
             self.counters.count(NodeCounter::WrongManager);
             if self.chosen.is_none() {
@@ -384,7 +401,7 @@ impl<P: Port> Node<P> {
             self.found(now, &announce.identity, from, Found::of(announce));
         } else if announce.room > 0 {
             let delay = self.spread(announce.expected);
-            self.hinted(now, from, &announce.identity, delay);
+            self.hinted(now, from, &announce.identity, announce.epoch, delay);
         } else {
             // The broadcast of a full manager is no hint; but a unit that it answers directly may be the one that its
             // capacity is reserved for.

@@ -14,6 +14,8 @@ pub(super) enum Task {
     GiveUp,
     /// Ask its link for a sign of life: a newcomer has its identity.
     Challenge,
+    /// Let its link end when nothing moves: a manager with a higher claim wants to command.
+    Yield,
     /// End the link that has not answered: the newcomer takes its place.
     Supersede,
     /// Tell the newcomer that it has taken the place.

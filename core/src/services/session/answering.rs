@@ -30,7 +30,7 @@ impl<P: Port> Session<P> {
     /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`, and
     /// [`poll`](Self::poll) before it: what was stopped has its safe hook first.
     pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Call> {
-        while self.phase == Phase::Live {
+        while self.phase == Phase::Live && !self.obedience.waits {
             if let Ok(call) = self.begin_next(cx, arguments)? {
                 return Some(call);
             }
@@ -71,7 +71,13 @@ impl<P: Port> Session<P> {
 
     /// Whether [`next_call`](Self::next_call) would look at a call.
     pub fn has_next_call(&self) -> bool {
-        self.phase == Phase::Live && self.calls.can_begin()
+        self.phase == Phase::Live && !self.obedience.waits && self.calls.can_begin()
+    }
+
+    /// Whether a moving call waits until the claim that it is made under is stored: a port that does not poll the session in turn
+    /// with its calls looks at those when this has changed.
+    pub const fn awaits_claim(&self) -> bool {
+        self.obedience.waits
     }
 
     /// Whether [`next_emergency`](Self::next_emergency) would look at a call.

@@ -35,7 +35,7 @@ impl<P: Port> Session<P> {
 
     /// The peer is alive, for which the hub may have asked.
     pub(super) fn show_life(&mut self, cx: &mut Context<'_, P>) {
-        if core::mem::take(&mut self.challenged) {
+        if core::mem::take(&mut self.challenged) && !self.has_given_way(cx) {
             let (now, link) = (cx.now, self.link.id());
             cx.hub.enter(&mut |hub| hub.node.challenge_answered(now, link));
         }
@@ -45,6 +45,7 @@ impl<P: Port> Session<P> {
     pub fn direct(&mut self, cx: &mut Context<'_, P>, directive: Directive) -> Option<Event> {
         match directive {
             Directive::Challenge => self.challenge(cx),
+            Directive::Yield => self.give_way(cx),
             Directive::Admit => return self.admitted(cx),
             Directive::Refuse(refusal) => self.refuse(cx, refusal),
             Directive::Close(reason) => self.close(cx, reason),

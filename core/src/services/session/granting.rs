@@ -30,6 +30,9 @@ impl<P: Port> Session<P> {
         if end <= cx.now {
             return Err(Error::Expired);
         }
+        if self.obedience.gives_way() || !self.may_move(cx) {
+            return Err(Error::Busy);
+        }
         let service = service_of(cx, head.slot, head.generation);
         let is_same = |known: &Granted| {
             known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))

@@ -436,6 +436,10 @@ impl<P: Port> Session<P> {
                     super::GrantedStream { interval: crate::time::Duration::from_millis(interval.into()), bytes };
                 self.subscription_answered(Slot(slot), Generation(generation), granted, refusal)
             }
+            Control::Claimed { report } => {
+                self.claim_arrived(cx, &report);
+                None
+            }
             Control::LeaseEnded { call, why } => {
                 self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })
             }
@@ -464,7 +468,9 @@ impl<P: Port> Session<P> {
         let length = self.link.view(block, lent).len();
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
             // The handler of a function that stops waits where a safe hook is to run first: `poll` comes before `next_call`.
-            let waits = function.attributes.stop && self.awaits_hook(cx, header.slot, header.generation);
+            // A moving call waits until the claim that it is made under is stored.
+            let waits = function.attributes.stop && self.awaits_hook(cx, header.slot, header.generation)
+                || function.attributes.lease.is_some() && !self.may_move(cx);
             let arguments = arguments.filter(|_| !waits);
             let bytes = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {

@@ -23,6 +23,7 @@ mod granting;
 mod holding;
 mod inbound;
 mod lending;
+mod obeying;
 mod outbound;
 mod permitting;
 mod pinging;
@@ -226,6 +227,7 @@ pub struct Session<P: Port> {
     renewal: renewing::Renewal,
     requests: Requests<P::Storage>,
     calls: Calls<P::Storage>,
+    obedience: obeying::Obedience,
     publishing: publishing::Publishing<P::Storage>,
     theirs: TheirFunctionList<P::Storage>,
     granted: heapless::Vec<Granted, LEASES>,
@@ -277,6 +279,7 @@ impl<P: Port> Session<P> {
             renewal: renewing::Renewal::new(),
             requests: Requests::new(storage.pending),
             calls: Calls::new(storage.running),
+            obedience: obeying::Obedience::new(),
             publishing: publishing::Publishing::new(storage.publications),
             theirs: TheirFunctionList::new(storage.their_functions, storage.their_signatures),
             granted: heapless::Vec::new(),
@@ -512,6 +515,10 @@ impl<P: Port> Session<P> {
 
     fn send_hello(&mut self, cx: &mut Context<'_, P>) {
         self.local.stamp = cx.now.as_micros();
+        if let Some(remote) = &self.remote {
+            let (now, obeyed) = (cx.now, &mut self.local.obeyed);
+            cx.hub.enter(&mut |hub| *obeyed = hub.node.obeyed_report(now, &remote.hello.identity));
+        }
         let mut bytes = [0; HELLO_BYTES];
         let mode = self.mode();
         let length = self.local.encode(mode, &mut bytes).unwrap_or(0);

@@ -225,6 +225,7 @@ impl<P: Port> Session<P> {
         if self.publishing.limits_due && self.send_limits(cx) {
             self.publishing.limits_due = false;
         }
+        self.send_claim(cx);
         if let Some(serial) = self.publishing.acknowledgement_due {
             let skipped = u16::try_from(self.theirs.skipped()).unwrap_or(u16::MAX);
             if self.send_control(cx, &Control::ListAck { serial, skipped }) {
@@ -263,7 +264,7 @@ impl<P: Port> Session<P> {
     /// Whether something waits for room.
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
-        let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty();
+        let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty() && !self.obedience.has_news();
         #[cfg(feature = "streams")]
         let told = told && !self.streaming.has_news();
         publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !told

@@ -106,6 +106,7 @@ impl<P: Port> Session<P> {
                 let timers = &self.timers;
                 let own =
                     timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal).min(timers.release);
+                let own = own.min(self.obedience.next);
                 let own = own.min(self.renewal.deadline(self.dialed));
                 #[cfg(feature = "streams")]
                 let own = own.min(self.streaming.deadline(self.link.queued()));
@@ -170,6 +171,7 @@ impl<P: Port> Session<P> {
             self.send_keep_alive(cx);
         }
         self.poll_renewal(cx);
+        self.poll_obedience(cx);
         self.look_for_peer(cx);
         #[cfg(feature = "streams")]
         if cx.now >= self.streaming.deadline(self.link.queued()) {

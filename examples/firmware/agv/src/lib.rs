@@ -10,6 +10,8 @@
 #[cfg(test)]
 extern crate std;
 
+#[cfg(feature = "secure")]
+mod claims;
 pub mod echo;
 pub mod least;
 pub mod led;
@@ -19,8 +21,6 @@ pub mod provision;
 mod streams;
 #[cfg(feature = "tasks")]
 pub mod tasks;
-#[cfg(feature = "secure")]
-mod terms;
 #[cfg(feature = "warehouse")]
 pub mod warehouse;
 
@@ -131,8 +131,8 @@ fn unit_config(settings: &Settings, security: Security) -> Result<Config, Vehicl
     let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, security)?;
     let config = config.fleet(settings.fleet.0);
     #[cfg(feature = "secure")]
-    let config = match terms::kept() {
-        Some(kept) => config.term(kept, terms::keep),
+    let config = match claims::stored() {
+        Some(stored) => config.obeyed_claim(stored, claims::store),
         None => config,
     };
     Ok(match settings.manager_address {

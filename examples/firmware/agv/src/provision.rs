@@ -6,14 +6,14 @@ use cara_embassy::Security;
 use cara_secure::random::{BootCounter, Random};
 use cara_settings::Settings;
 #[cfg(feature = "secure")]
-use cara_settings::boots::TermStore;
+use cara_settings::boots::ClaimStore;
 #[cfg(feature = "secure")]
 use cara_settings::keys::{Keys, KeysError};
 use cara_settings::page::{self, PageError};
 
-use crate::info;
 #[cfg(feature = "secure")]
-use crate::terms;
+use crate::claims;
+use crate::info;
 
 /// What a vehicle was provisioned with.
 pub struct Provision {
@@ -79,13 +79,13 @@ impl Provision {
 impl Proof {
     /// Begins a life of the board: moves the count of its starts, before the network starts, and draws from it and from what
     /// noise the hardware has. `None` when the count cannot be kept, which the log tells: the board could repeat itself.
-    /// With keys, the vehicle keeps the term that it obeys beside the count.
-    pub fn begin<C: BootCounter + TermStore>(self, boots: &'static mut C, noise: [u32; 2]) -> Option<Security> {
+    /// With keys, the vehicle stores the claim that it obeys beside the count.
+    pub fn begin<C: BootCounter + ClaimStore>(self, boots: &'static mut C, noise: [u32; 2]) -> Option<Security> {
         match self {
             Self::Insecure => Some(Security::insecure(seed(noise))),
             Self::Keys(keys) => match Random::start(keys.secret().clone(), boots, &noise) {
                 Ok(random) => {
-                    terms::lend(boots);
+                    claims::lend(boots);
                     Some(Security::keys(lend(keys), random))
                 }
                 Err(_) => {
@@ -179,7 +179,7 @@ mod tests {
     #[cfg(feature = "secure")]
     #[test]
     fn a_board_that_cannot_count_its_starts_joins_nobody() {
-        use cara_core::term::Term;
+        use cara_core::distribution::claim::StoredClaim;
         use cara_secure::keys::{DeviceSecret, DiscoveryKey};
         use std::boxed::Box;
 
@@ -193,12 +193,12 @@ mod tests {
             }
         }
 
-        impl TermStore for Worn {
-            fn stored(&mut self) -> Option<Term> {
+        impl ClaimStore for Worn {
+            fn stored(&mut self) -> Option<StoredClaim> {
                 None
             }
 
-            fn store(&mut self, _: Term) -> bool {
+            fn store(&mut self, _: &StoredClaim) -> bool {
                 false
             }
         }

@@ -1,11 +1,11 @@
-//! The count of the board's lives and the term that it obeys, in a file of the host: QEMU's board has no flash that can be written, and none that
+//! The count of the board's lives and the claim that it obeys, in a file of the host: QEMU's board has no flash that can be written, and none that
 //! outlives it. The file stands for two small pages of such flash; what is written to them is what a real board writes.
 
 use core::ffi::CStr;
 
-use cara_core::term::Term;
+use cara_core::distribution::claim::StoredClaim;
 use cara_secure::random::BootCounter;
-use cara_settings::boots::{BootError, Boots, TermStore};
+use cara_settings::boots::{BootError, Boots, ClaimStore};
 use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash};
 use semihosting::fs;
 use semihosting::io::{Read, Seek, SeekFrom, Write};
@@ -13,9 +13,9 @@ use semihosting::io::{Read, Seek, SeekFrom, Write};
 use crate::arguments::Path;
 
 /// Of each of the two pages: small, so that tests come to their ends.
-const PAGE: u32 = 512;
+const PAGE: u32 = 1_024;
 
-/// The count and the term in a file, which stays open for this life of the board.
+/// The count and the claim in a file, which stays open for this life of the board.
 pub(crate) struct File(Boots<Pages>);
 
 impl File {
@@ -45,13 +45,13 @@ impl BootCounter for File {
     }
 }
 
-impl TermStore for File {
-    fn stored(&mut self) -> Option<Term> {
+impl ClaimStore for File {
+    fn stored(&mut self) -> Option<StoredClaim> {
         self.0.stored()
     }
 
-    fn store(&mut self, term: Term) -> bool {
-        self.0.store(term)
+    fn store(&mut self, claim: &StoredClaim) -> bool {
+        self.0.store(claim)
     }
 }
 

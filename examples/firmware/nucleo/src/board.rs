@@ -37,7 +37,7 @@ const BOUNCES: Duration = Duration::from_millis(50);
 pub struct Board {
     /// The pages of flash that hold its settings.
     pub pages: [&'static [u8]; 2],
-    /// Counts its lives, and keeps the term that it obeys.
+    /// Counts its lives, and stores the claim that it obeys.
     pub lives: &'static mut Lives,
     /// A number that differs from boot to boot, from the chip's random number generator.
     pub seed: u64,

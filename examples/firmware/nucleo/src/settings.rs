@@ -1,4 +1,4 @@
-//! What flash keeps: the settings with the keys, and the count of the board's lives with the term that it obeys.
+//! What flash keeps: the settings with the keys, and the count of the board's lives with the claim that it obeys.
 #![allow(unsafe_code)]
 
 use cara_settings::board;

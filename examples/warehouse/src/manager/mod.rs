@@ -129,7 +129,7 @@ impl Manager {
         system.publish_my_function_list()?;
         let events = system.events();
         system.start()?;
-        let (book, mut written) = Book::open(&options.book, system.term().0)?;
+        let (book, mut written) = Book::open(&options.book, system.claim().term)?;
         let heart = system.heart(HEART);
         let (sender, outcomes) = channel();
         let mut vehicles = Vec::new();
@@ -143,7 +143,7 @@ impl Manager {
         }
         let (lines, commands) = channel();
         std::thread::spawn(move || hear(&lines));
-        println!("up with term {}", system.term().0);
+        println!("up with term {}", system.claim().term);
         let (traffic, jobs) = (Traffic::new(map), Jobs::new(orders, written));
         let (halted, commanding, last_reset) = (false, false, began);
         Ok(Self {
@@ -224,7 +224,7 @@ impl Manager {
     fn hear_events(&mut self) -> Result<()> {
         while let Ok(event) = self.events.try_recv() {
             match event {
-                UnitEvent::Fenced { term } => return Err(BookError::Fenced(term.0).into()),
+                UnitEvent::Fenced { claim } => return Err(BookError::Fenced(claim.term).into()),
                 UnitEvent::Inhibited { peer, latch, .. } => {
                     let Some(vehicle) = self.vehicles.iter_mut().find(|vehicle| *vehicle.peer.identity() == peer)
                     else {

@@ -60,7 +60,7 @@ pub(crate) fn duplicate_managers(seen: &Evidence) -> Vec<Finding> {
     seen.managers().into_iter().filter_map(|name| duplicate_manager(seen, &name)).collect()
 }
 
-/// Two live managers of one identity: terms decide which commands, where they differ.
+/// Two live managers of one identity: the higher claim commands.
 pub(crate) fn duplicate_manager(seen: &Evidence, name: &str) -> Option<Finding> {
     let lives = seen.lives(name);
     let same = duplicate(name, &lives).map(|finding| Finding { advice: DUPLICATE_MANAGERS.to_owned(), ..finding })?;
@@ -69,17 +69,17 @@ pub(crate) fn duplicate_manager(seen: &Evidence, name: &str) -> Option<Finding> 
 
 fn fenced(seen: &Evidence, name: &str, lives: &[Life]) -> Option<Finding> {
     let (first, second) = overlapping(lives)?;
-    let [one, other] = [first, second].map(|life| seen.term(life));
+    let [one, other] = [first, second].map(|life| seen.claim(life));
     let (one, other) = (one?, other?);
-    let (new, newer, old, older) = if one.is_newer_than(other) {
+    let (new, newer, old, older) = if one > other {
         (first, one, second, other)
-    } else if other.is_newer_than(one) {
+    } else if other > one {
         (second, other, first, one)
     } else {
         return None;
     };
     let found = format!(
-        "two live managers are {name}: vehicles obey the one at {} (term {newer}), and refuse the one at {} (term {older}) once \
+        "two live managers are {name}: vehicles obey the one at {} (claim {newer}), and refuse the one at {} (claim {older}) once \
          they have met it",
         new.at, old.at
     );
@@ -87,10 +87,10 @@ fn fenced(seen: &Evidence, name: &str, lives: &[Life]) -> Option<Finding> {
 }
 
 /// Taking over moves vehicles from a manager that may be the one that is meant: the advice does not begin there.
-const FENCED_ADVICE: &str = "find out which manager of this name and id is to command. If it is the one with the newer term, stop \
-                             the other one and leave it stopped. If not, stop the one with the newer term first, and see that its \
+const FENCED_ADVICE: &str = "find out which manager of this name and id is to command. If it is the one with the higher claim, stop \
+                             the other one and leave it stopped. If not, stop the one with the higher claim first, and see that its \
                              process has ended, also where it hangs or is cut off; then start the other one again: it claims a \
-                             newer term by itself";
+                             higher one by itself";
 
 const DUPLICATE_MANAGERS: &str =
     "stop one of the two, or give each a name and id of its own: as it is, each has some of the nodes";
@@ -205,7 +205,7 @@ pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
 mod tests {
     use std::time::Duration;
 
-    use cara_std::{Epoch, Term};
+    use cara_std::{Claim, Epoch};
 
     use super::super::evidence::samples::{answering, evidence, life};
     use super::*;
@@ -224,10 +224,10 @@ mod tests {
     }
 
     #[test]
-    fn of_two_live_managers_the_newer_term_commands() {
-        let said = |epoch, term: u32| Heard {
+    fn of_two_live_managers_the_higher_claim_commands() {
+        let said = |epoch, term: u64| Heard {
             epoch: Some(Epoch(epoch)),
-            term: Some(Term(term)),
+            claim: Some(Claim { term, claimant: 0 }),
             last: Duration::from_secs(3),
             ..answering("boss", 1)
         };
@@ -237,15 +237,15 @@ mod tests {
             assert_eq!(found.len(), 1);
             found.remove(0)
         };
-        for finding in [found(4, u32::MAX), found(u32::MAX, 4)] {
-            let told = "(term 4), and refuse the one at 10.0.0.9:5000 (term 4294967295)";
+        for finding in [found(5, 4), found(4, 5)] {
+            let told = "(claim 5.0000), and refuse the one at 10.0.0.9:5000 (claim 4.0000)";
             assert!(finding.id == Id::Fenced && finding.found.contains(told), "{finding:?}");
             assert_eq!(finding.about.as_deref(), Some("boss/1"));
         }
         let equal = found(4, 4);
         assert_eq!((equal.id, equal.advice.as_str()), (Id::Duplicate, DUPLICATE_MANAGERS));
         let mut untold = Evidence { heard: vec![said(1, 4), said(2, 5)], ..evidence() };
-        untold.heard[0].term = None;
+        untold.heard[0].claim = None;
         assert_eq!(duplicate_managers(&untold)[0].id, Id::Duplicate);
     }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use cara_std::control::RunningUnit;
 use cara_std::survey::{Foreign, Heard, Ports, Reach, Standing};
-use cara_std::{Fleet, Identity, Interfaces, Manager, Mode, Role, Term};
+use cara_std::{Claim, Fleet, Identity, Interfaces, Manager, Mode, Role};
 
 use super::dial::Dial;
 use super::running::Running;
@@ -165,11 +165,11 @@ impl Evidence {
         self.m_units().into_iter().find(|(_, identity)| wanted.is(identity)).map(|(heard, _)| heard)
     }
 
-    /// The term of one life of a manager of our fleet, as it said last.
-    pub(crate) fn term(&self, life: &Life) -> Option<Term> {
+    /// The claim of one life of a manager of our fleet, as it said last.
+    pub(crate) fn claim(&self, life: &Life) -> Option<Claim> {
         let of_it = |heard: &&Heard| heard.epoch.is_some_and(|epoch| epoch.0 == life.epoch);
         let said = self.m_units_heard().filter(|(_, identity)| identity.to_string() == life.node);
-        said.map(|(heard, _)| heard).filter(of_it).max_by_key(|heard| heard.last)?.term
+        said.map(|(heard, _)| heard).filter(of_it).max_by_key(|heard| heard.last)?.claim
     }
 
     /// The lives of a node of our fleet, heard or connected, the earliest first.

@@ -31,7 +31,7 @@ pub(crate) fn object(looked: &Looked) -> Value {
                 "looks_for": heard.wanted.as_ref().map(super::causes::text_of),
                 "tcp_port": heard.tcp_port,
                 "room": heard.room,
-                "term": heard.term.map(|term| term.0),
+                "claim": heard.claim.map(|claim| claim.to_string()),
                 "searches": heard.searches,
                 "answers": heard.answers,
                 "first_ms": heard.first.as_millis() as u64,

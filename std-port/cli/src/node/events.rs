@@ -4,18 +4,18 @@ use std::collections::HashMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use cara_std::{CloseReason, Term, UnitEvent};
+use cara_std::{Claim, CloseReason, UnitEvent};
 
 /// Links that did not come about for one reason are one line in this time: a port scan has hundreds a second.
 const PERIOD: Duration = Duration::from_secs(1);
 
 /// Tells what happens to the node, in a thread that ends with the unit; `fenced` once another manager has taken over.
-pub(super) fn log(events: Receiver<UnitEvent>, fenced: impl Fn(Term) + Send + 'static) -> anyhow::Result<()> {
+pub(super) fn log(events: Receiver<UnitEvent>, fenced: impl Fn(Claim) + Send + 'static) -> anyhow::Result<()> {
     std::thread::Builder::new().name("cara-log".into()).spawn(move || log_all(&events, &fenced))?;
     Ok(())
 }
 
-fn log_all(events: &Receiver<UnitEvent>, fenced: &dyn Fn(Term)) {
+fn log_all(events: &Receiver<UnitEvent>, fenced: &dyn Fn(Claim)) {
     let mut sparing = Sparing::default();
     loop {
         let event = match sparing.0.is_empty() {
@@ -24,7 +24,7 @@ fn log_all(events: &Receiver<UnitEvent>, fenced: &dyn Fn(Term)) {
         };
         match event {
             Ok(UnitEvent::NotJoined { reason, .. }) if !sparing.admits(reason, Instant::now()) => {}
-            Ok(UnitEvent::Fenced { term }) => fenced(term),
+            Ok(UnitEvent::Fenced { claim }) => fenced(claim),
             Ok(event) => log_event(event),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return sparing.0.into_iter().for_each(left_out),

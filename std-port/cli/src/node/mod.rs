@@ -66,7 +66,10 @@ pub(crate) struct Arguments {
     /// Start although a live m_unit has this one's name and ID: it steps down, and its vehicles come to this one.
     #[arg(long)]
     take_over: bool,
-    /// The folder in which the node keeps its term; CARA_STATE or STATE_DIRECTORY unless told.
+    /// The same also where another one has taken over within the last minute.
+    #[arg(long)]
+    force_take_over: bool,
+    /// The folder in which the node stores its claims; CARA_STATE or STATE_DIRECTORY unless told.
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
     /// Serve http://ADDR/metrics for Prometheus, as 127.0.0.1:9464.
@@ -143,7 +146,8 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         discovery_port: global.discovery_port,
         m_units: arguments.m_units.clone(),
         tcp_port: arguments.tcp_port,
-        takes_over: arguments.take_over,
+        takes_over: arguments.take_over || arguments.force_take_over,
+        forces: arguments.force_take_over,
         state: arguments.state.clone(),
         metrics: arguments.metrics,
         metrics_anywhere: arguments.metrics_anywhere,

@@ -65,7 +65,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     programs.finish();
     match fenced.get() {
         None => Ok(()),
-        Some(term) => Err(Ended::fenced(*term)),
+        Some(claim) => Err(Ended::fenced(*claim)),
     }
 }
 

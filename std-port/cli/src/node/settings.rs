@@ -44,6 +44,7 @@ pub(super) struct Settings {
     pub(super) audit: Option<PathBuf>,
     /// It starts although a live one has its identity.
     pub(super) takes_over: bool,
+    pub(super) forces: bool,
     /// Where it keeps its term.
     pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<Placed<SocketAddr>>,
@@ -74,6 +75,7 @@ pub(super) struct Overrides {
     pub(super) m_units: Vec<NameAndId>,
     pub(super) tcp_port: Option<u16>,
     pub(super) takes_over: bool,
+    pub(super) forces: bool,
     pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<SocketAddr>,
     pub(super) metrics_anywhere: bool,
@@ -133,6 +135,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         manager: manager(file, role, mistakes),
         m_units: m_units(file, role, over, mistakes),
         takes_over: over.takes_over,
+        forces: over.forces,
         state: over.state.clone(),
         fleet: over.fleet.or(file.fleet).unwrap_or(0),
         interfaces: over

@@ -47,17 +47,17 @@ fn a_manager_takes_over_and_the_other_one_ends_with_its_own_code() {
     };
     let first = start(&[]);
     let vehicle = agv(stage.vehicle("agv-1", 11));
-    until("the vehicle has joined", || vehicle.is_connected() && vehicle.term().0 == 1);
+    until("the vehicle has joined", || vehicle.is_connected() && vehicle.claim().term == 1);
     let second = start(&["--take-over"]);
     assert_eq!(first.end(), 6);
-    until("the vehicle has changed over", || vehicle.is_connected() && vehicle.term().0 == 2);
+    until("the vehicle has changed over", || vehicle.is_connected() && vehicle.claim().term == 2);
     stage.ends(0, &["scan", "--json"]);
     second.freeze();
     let third = start(&["--take-over"]);
-    until("the vehicle has changed over again", || vehicle.is_connected() && vehicle.term().0 == 3);
+    until("the vehicle has changed over again", || vehicle.is_connected() && vehicle.claim().term == 3);
     second.thaw();
     assert_eq!(second.end(), 6);
-    assert!(vehicle.is_connected() && vehicle.term().0 == 3);
+    assert!(vehicle.is_connected() && vehicle.claim().term == 3);
     third.interrupt();
     assert_eq!(third.end(), 0);
     vehicle.stop();
@@ -186,4 +186,46 @@ fn idle_connections_take_no_descriptor_from_the_operator_and_from_vehicles() {
             std::panic::resume_unwind(panic);
         }
     });
+}
+
+/// Two hosts: a state folder and a control folder each, and so the same term. One hangs, the other one starts, with a take-over or
+/// without; then the first goes on. Every restart of the vehicles ends with all of them at one manager.
+#[test]
+fn two_managers_with_equal_terms_do_not_split_the_fleet() {
+    for flag in [Some("--take-over"), None] {
+        let stage = Stage::empty();
+        let names = ["agv-1", "agv-2", "agv-3"];
+        names.iter().zip(11..).for_each(|(name, id)| stage.know(name, id));
+        let [here, there, state_here, state_there] = std::array::from_fn(|_| private_folder());
+        let start = |control: &tempfile::TempDir, state: &tempfile::TempDir, flag: Option<&str>| {
+            let mut command = stage.command(&NODE.into_iter().chain(flag).collect::<Vec<_>>());
+            command.env("CARA_STATE", state.path()).env("CARA_CONTROL_DIR", control.path());
+            let mut node = Running::start(command);
+            node.expect(" is up: ");
+            node
+        };
+        let has = |control: &tempfile::TempDir| {
+            let mut scan = stage.command(&["scan", "--json"]);
+            let scan = scan.env("CARA_CONTROL_DIR", control.path()).output().unwrap();
+            let scan: Value = serde_json::from_slice(&scan.stdout).unwrap_or_default();
+            let nodes = scan["nodes"].as_array().cloned().unwrap_or_default();
+            nodes.iter().filter(|node| node["connected"] == true && node["role"] != "m_unit").count()
+        };
+        let vehicles = || names.iter().zip(11..).map(|(name, id)| agv(stage.vehicle(name, id))).collect::<Vec<_>>();
+        let first = start(&here, &state_here, None);
+        let mut agvs = vehicles();
+        until("all have joined the first", || has(&here) == 3);
+        first.freeze();
+        let second = start(&there, &state_there, flag);
+        until("all have joined the second", || has(&there) == 3);
+        first.thaw();
+        assert_eq!(first.end(), 6, "the lower claim steps down");
+        for _ in 0..3 {
+            agvs.drain(..).for_each(|agv| agv.stop());
+            agvs = vehicles();
+            until("all have joined the second again", || has(&there) == 3);
+        }
+        assert_eq!(has(&here), 0);
+        drop(second);
+    }
 }

@@ -4,7 +4,7 @@ use std::fmt;
 use std::io::Write;
 use std::process::ExitCode;
 
-use cara_std::{StartError, Term, is_hidden};
+use cara_std::{Claim, StartError, is_hidden};
 use serde_json::json;
 
 use crate::global::Global;
@@ -79,10 +79,10 @@ impl Ended {
         Self { exit, text: error.to_string(), name: error.code() }.into()
     }
 
-    /// A manager with a newer term has taken over from a node.
-    pub fn fenced(term: Term) -> anyhow::Error {
+    /// A live manager with a higher claim commands in place of a node.
+    pub fn fenced(claim: Claim) -> anyhow::Error {
         let text = format!(
-            "another m_unit of this name and ID has taken over with term {term}: find out which of the two is to \
+            "another m_unit of this name and ID commands with the claim {claim}: find out which of the two is to \
              command, and stop the other one before this one starts again"
         );
         Self { exit: Exit::Fenced, text, name: "Fenced".into() }.into()

@@ -21,21 +21,21 @@ pub(super) fn kept(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &who)?;
     // The term is kept before this call runs.
     position(&manager.meet(&who)?)?;
-    let obeyed = manager.system.term();
+    let obeyed = manager.system.claim();
     drop(manager);
     board.cut_power()?;
 
     let manager = start(&old)?;
-    let refused = manager.system.term();
+    let refused = manager.system.claim();
     ensure!(obeyed.is_newer_than(refused), "{obeyed} is not newer than {refused}");
     let _board = bench.board(&cable, &who)?;
     let ends = |event: &UnitEvent| matches!(event, UnitEvent::Joined { .. } | UnitEvent::Fenced { .. });
     let event = manager.event("answer of the board", ends)?;
-    ensure!(matches!(event, UnitEvent::Fenced { term } if term == obeyed), "the old manager sees {event:?}");
+    ensure!(matches!(event, UnitEvent::Fenced { claim } if claim == obeyed), "the old manager sees {event:?}");
     drop(manager);
 
     let manager = start(&old)?;
-    let newest = manager.system.term();
+    let newest = manager.system.claim();
     ensure!(newest.is_newer_than(obeyed), "{newest} is not newer than {obeyed}");
     position(&manager.meet(&who)?)?;
     Ok(format!("term {obeyed} obeyed, {refused} refused after the restart, {newest} obeyed"))

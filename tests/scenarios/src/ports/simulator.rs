@@ -143,7 +143,7 @@ impl World for SimWorld {
             SpecRole::Manager => self.world.m_unit(&name, id),
             SpecRole::Agv(manager, manager_id) => self.world.s_unit(&name, id).joins(&manager, manager_id),
         };
-        let new = if spec.takes_over { new.kept_term(1) } else { new };
+        let new = if spec.takes_over { new.kept_term(1).takes_over() } else { new };
         let new = if spec.same_seed { new.boot_seed(4) } else { new };
         let new = spec.m_units.iter().fold(new, |new, m_units| new.m_units(m_units));
         let new = new.fleet(fleet).constraints(constraints).functions(their_functions).message_buffers(message_buffers);

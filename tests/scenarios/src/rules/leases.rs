@@ -4,7 +4,6 @@ use cara_core::error::Error;
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
-use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use super::{met, pair};
@@ -196,7 +195,7 @@ fn a_manager_that_takes_over_has_the_vehicle_alone(world: &mut dyn World) {
     let (service, first, agv) = driving(world);
     let second = world.add(Spec::manager("manager", 1).takes_over());
     met(world, &second, "agv", "drive");
-    world.wait("the first is told", || first.count(|event| *event == Seen::Fenced(Term(2))) == 1, secs(40));
+    world.wait("the first is told", || first.count(|event| *event == Seen::Fenced(2)) == 1, secs(40));
     assert!(!agv.lease_is_live("drive"), "what the first wanted has ended");
     assert_eq!(service.log().stops().len(), 1);
     assert!(first.request("agv", "drive", &number("n", 1)).is_err());

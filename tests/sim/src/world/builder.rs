@@ -4,16 +4,16 @@ use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
 use cara_core::config::{Constraints, Mode};
+use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity};
-use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use super::Shared;
 use super::handle::UnitHandle;
 use super::keys::Given;
-use super::state::{Program, Settings, UnitState};
+use super::state::{Program, Settings, Stored, Storing, UnitState};
 
 /// A unit that has not started; made by [`World::m_unit`](super::World::m_unit) and
 /// [`World::s_unit`](super::World::s_unit).
@@ -50,7 +50,9 @@ impl NewUnit {
             boot_seed: None,
             given: Given::new(mode, seals),
             program: None,
-            term: Term::NONE,
+            claims: Stored::default(),
+            storing: Storing::Works,
+            takes_over: false,
         };
         Self { shared: Rc::downgrade(shared), settings, segment: 0, ahead: Duration::ZERO }
     }
@@ -135,9 +137,28 @@ impl NewUnit {
         self
     }
 
-    /// The term that it has kept; none unless set. An m_unit claims the next one in each of its lives.
-    pub fn kept_term(mut self, term: u32) -> Self {
-        self.settings.term = Term(term);
+    /// The term of the claim that an m_unit has stored; none unless set. It claims above it in each of its lives.
+    pub fn kept_term(mut self, term: u64) -> Self {
+        self.settings.claims.own = Claim { term, claimant: 1 << 63 };
+        self
+    }
+
+    /// A claim of its manager that a vehicle has obeyed and stored, with its tag.
+    pub fn has_obeyed(mut self, name: &str, id: u32, tagged: TaggedClaim) -> Self {
+        let manager = Identity::m_unit(name, id).expect("a name has 1 to 32 bytes");
+        self.settings.claims.obeyed.insert(manager, tagged);
+        self
+    }
+
+    /// What becomes of what it stores; it works unless set.
+    pub fn storing(mut self, storing: Storing) -> Self {
+        self.settings.storing = storing;
+        self
+    }
+
+    /// It raises its claim until that was the highest once.
+    pub fn takes_over(mut self) -> Self {
+        self.settings.takes_over = true;
         self
     }
 

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::rc::Rc;
 
 use cara_core::distribution::authenticator::Authenticator as _;
-use cara_core::distribution::connection_handler::{Command, NewerTerm, NodeCounter};
+use cara_core::distribution::connection_handler::{ClaimEvent, Command, NodeCounter};
 use cara_core::distribution::datagram;
 use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::Slot;
@@ -18,7 +18,7 @@ use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
 use super::replies::Promise;
 use super::service::{BoxedParameters, Call, Handler, LeaseWatch, Serving};
-use super::state::NODE_TIMER;
+use super::state::{NODE_TIMER, Storing};
 use super::streams::Sample;
 use super::tasks::Owner;
 use super::{Inner, LogEvent, Shared, UnitEvent};
@@ -139,29 +139,49 @@ impl Inner {
             self.log(shared, host, UnitEvent::NotJoined { address, peer, reason });
         }
         self.work_node(shared, host);
-        self.look_at_terms(shared, host);
     }
 
-    /// An s_unit keeps a newer term; an m_unit that hears of one steps down.
-    fn look_at_terms(&mut self, shared: &Rc<Shared>, host: HostId) {
+    /// Does what the node wants done about claims; whether anything was.
+    fn look_at_claims(&mut self, shared: &Rc<Shared>, host: HostId) -> bool {
         let unit = &mut self.units[host.index()];
-        let Some(machine) = &mut unit.machine else { return };
-        let term = match machine.links.hub.node.take_newer_term() {
-            None => return,
-            Some(NewerTerm::Obeyed(term)) => {
-                unit.term = term;
-                return;
-            }
-            Some(NewerTerm::AtVehicle(term) | NewerTerm::OfManager(term)) => term,
-        };
-        // Kept, so that its next start claims the one behind it.
-        unit.term = term;
+        let storing = unit.settings.storing;
+        let Some(machine) = &mut unit.machine else { return false };
         let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
-        for index in links {
-            machine.links.with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::StoppedHere));
+        match machine.links.hub.node.take_claim_event() {
+            None => return false,
+            Some(ClaimEvent::Keep(manager, tagged)) if storing != Storing::Hangs => {
+                if storing == Storing::Works {
+                    unit.claims.obeyed.insert(manager.clone(), tagged);
+                }
+                machine.links.hub.node.claim_kept(&manager, tagged.claim, storing == Storing::Works);
+            }
+            Some(ClaimEvent::Raise(above)) if storing == Storing::Works => {
+                unit.claims.own = above.raised(self.network.random().bits());
+                let tagged = unit.claims.own.tagged(&unit.settings.identity, &machine.links.keys.codes);
+                machine.links.hub.node.set_claim(tagged.unwrap_or_default());
+                for index in links {
+                    machine.links.with(&mut self.network, index, |session, cx| session.announce_claim(cx));
+                }
+                machine.links.hub.node.broadcast(self.network.clock(host));
+                let claim = unit.claims.own;
+                self.log(shared, host, UnitEvent::Raised { claim });
+            }
+            Some(ClaimEvent::Keep(..) | ClaimEvent::Raise(_)) => {}
+            Some(ClaimEvent::Unkept(peer, claim)) => self.log(shared, host, UnitEvent::ClaimNotKept { peer, claim }),
+            Some(ClaimEvent::StepDown(by)) => {
+                // Stored, so that its next start claims above it.
+                unit.claims.own = unit.claims.own.max(by.claim);
+                for index in links {
+                    machine
+                        .links
+                        .with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::StoppedHere));
+                }
+                self.log(shared, host, UnitEvent::Fenced { claim: by.claim });
+                self.network.stop(host);
+            }
+            Some(_) => {}
         }
-        self.log(shared, host, UnitEvent::Fenced { term });
-        self.network.stop(host);
+        true
     }
 
     /// The host's interface went or came, or has another address.
@@ -181,8 +201,12 @@ impl Inner {
             let Some(machine) = &mut self.units[host.index()].machine else { return };
             match machine.poll_node(&mut self.network, host) {
                 Some(command) => self.act(shared, host, command),
-                None => return machine.arm_node(&mut self.network, host),
+                None => break,
             }
+        }
+        while self.look_at_claims(shared, host) {}
+        if let Some(machine) = &mut self.units[host.index()].machine {
+            machine.arm_node(&mut self.network, host);
         }
     }
 
@@ -207,7 +231,6 @@ impl Inner {
     fn happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Vec<Happened>) {
         for happened in happened {
             self.one_happened(shared, host, index, happened);
-            self.look_at_terms(shared, host);
         }
         self.look_at_stops(shared, host);
         // What happened may have left the hub something to do.

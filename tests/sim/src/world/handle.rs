@@ -5,13 +5,14 @@ use std::future::Future;
 use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
+use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
+use cara_core::host::mailman::LinkId;
 use cara_core::services::Ticket;
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 
 use super::functions::MyFunctionList;
@@ -259,14 +260,36 @@ impl UnitHandle {
         promise.await;
     }
 
-    /// What it keeps of terms: that of an m_unit, or the newest that an s_unit has obeyed.
-    pub fn term(&self) -> Term {
-        self.with(|inner| inner.units[self.host.index()].term)
+    /// The claim of an m_unit, or the highest that an s_unit has obeyed; while it is down, the one that an m_unit has stored.
+    pub fn claim(&self) -> Claim {
+        self.with(|inner| {
+            let unit = &inner.units[self.host.index()];
+            unit.machine.as_ref().map_or(unit.claims.own, |machine| machine.links.hub.node.claim())
+        })
     }
 
-    /// Replaces what it keeps of terms, for its next life: as where it is lost, or wrong.
-    pub fn keep_term(&self, term: Term) {
-        self.with(|inner| inner.units[self.host.index()].term = term);
+    /// The claim of an m_unit with its tag, as it announces it.
+    pub fn tagged_claim(&self) -> TaggedClaim {
+        let claim = self.with(|inner| {
+            let machine = inner.units[self.host.index()].machine.as_mut()?;
+            machine.links.hub.node.hello(Instant::START, LinkId(u16::MAX)).claim
+        });
+        claim.map_or(TaggedClaim::NONE, |report| report.tagged)
+    }
+
+    /// Its term.
+    pub fn term(&self) -> u64 {
+        self.claim().term
+    }
+
+    /// The claim of its manager that it has stored.
+    pub fn stored_claim(&self) -> Option<TaggedClaim> {
+        self.with(|inner| inner.units[self.host.index()].claims.obeyed.values().next().copied())
+    }
+
+    /// Replaces what an m_unit has stored, for its next life: as where it is lost, or wrong.
+    pub fn keep_term(&self, term: u64) {
+        self.with(|inner| inner.units[self.host.index()].claims.own = Claim { term, claimant: 0 });
     }
 
     /// Stops it in an orderly way: peers are told.

@@ -1,10 +1,12 @@
 //! One simulated unit: what it is in every life, and the core's machines of this one.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::rc::Rc;
 
 use cara_core::config::{Constraints, Mode};
 use cara_core::counters::Counters;
+use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::distribution::connection_handler::{Command, NodeConfig, Target};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -14,7 +16,6 @@ use cara_core::host::secure::Seal;
 use cara_core::random::Random;
 use cara_core::services::session::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::slots_for;
-use cara_core::term::Term;
 use cara_core::time::Instant;
 
 use super::handle::UnitHandle;
@@ -56,8 +57,29 @@ pub(super) struct Settings {
     pub(super) boot_seed: Option<u64>,
     pub(super) given: Given,
     pub(super) program: Option<Program>,
-    /// What it has kept of terms before its first life.
-    pub(super) term: Term,
+    /// What it has stored before its first life.
+    pub(super) claims: Stored,
+    /// Whether it can store anything.
+    pub(super) storing: Storing,
+    pub(super) takes_over: bool,
+}
+
+/// What a unit stores of claims.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Stored {
+    pub(super) own: Claim,
+    pub(super) obeyed: BTreeMap<Identity, TaggedClaim>,
+}
+
+/// What becomes of what a unit stores.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Storing {
+    /// It is stored at once.
+    Works,
+    /// It fails at once.
+    Fails,
+    /// It hangs.
+    Hangs,
 }
 
 /// A unit with its log, and with its machine while it lives.
@@ -65,8 +87,8 @@ pub(super) struct UnitState {
     pub(super) host: HostId,
     pub(super) settings: Settings,
     pub(super) life: u32,
-    /// What it keeps of terms: that of an m_unit, or the newest that an s_unit has obeyed.
-    pub(super) term: Term,
+    /// What it stores of claims.
+    pub(super) claims: Stored,
     pub(super) machine: Option<Machine>,
     pub(super) log: Vec<(Instant, LogEvent)>,
     pub(super) hooks: Vec<EventHook>,
@@ -97,7 +119,7 @@ impl UnitState {
         Self {
             host,
             life: 0,
-            term: settings.term,
+            claims: settings.claims.clone(),
             settings,
             machine: None,
             log: Vec::new(),
@@ -111,7 +133,6 @@ impl UnitState {
         let listens = settings.identity.role() == Role::MUnit;
         if listens {
             network.listen(self.host, TCP_PORT);
-            self.term = self.term.next();
         }
         let (epoch, seed) = (network.random().bits(), network.random().bits());
         let config = NodeConfig {
@@ -135,7 +156,20 @@ impl UnitState {
         if let Some(m_units) = &settings.m_units {
             hub.node.choose(m_units.clone());
         }
-        hub.node.set_term(self.term);
+        let now = network.clock(self.host);
+        if listens {
+            // Drawn anew for each life, without a draw of the network's.
+            self.claims.own = self.claims.own.raised(epoch.rotate_left(23) ^ seed);
+            let tagged = self.claims.own.tagged(&settings.identity, &keys.codes);
+            hub.node.set_claim(tagged.unwrap_or_default());
+            if settings.takes_over {
+                hub.node.take_over(now);
+            }
+        }
+        if settings.given.mode == Mode::Secured {
+            self.claims.obeyed.iter().for_each(|(manager, tagged)| hub.node.keep_obeyed(now, manager, *tagged));
+            hub.node.store_claims();
+        }
         self.machine = Some(Machine {
             links: Links::new(self.host, settings.links, functions, buffers, hub, keys, arguments),
             constraints: settings.constraints,

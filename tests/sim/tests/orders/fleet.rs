@@ -257,7 +257,7 @@ fn race(world: &World, mut caller: Caller, vehicles: &[UnitHandle]) {
 fn seen(unit: &UnitHandle, actuators: &[Actuator; 2]) -> Seen {
     let latched = [DRIVE, FORK].map(|actuator| actuators[actuator].latch().is_some());
     let live = [DRIVE, FORK].map(|actuator| actuators[actuator].is_live(unit));
-    Seen { now: unit.now(), term: unit.term(), live, latched }
+    Seen { now: unit.now(), term: unit.claim(), live, latched }
 }
 
 /// One life of a vehicle.
@@ -387,7 +387,7 @@ async fn moving(watch: Shared, n: usize, actuator: usize, actuators: [Actuator; 
 
 /// One life of a manager, or of the traffic control.
 fn caller(unit: &UnitHandle, watch: &Shared, current: &Cell<usize>, vehicles: &Rc<[Identity]>, seed: u64) {
-    let process = watch.borrow_mut().process(unit.identity().id(), unit.term(), unit.now());
+    let process = watch.borrow_mut().process(unit.identity().id(), unit.claim(), unit.now());
     current.set(process);
     let mut random = Random::new(seed ^ unit.now().as_micros());
     let mut caller = Caller {

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use cara_core::distribution::claim::Claim;
 use cara_core::services::lease::LeaseEnd;
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_sim::LeaseWatch;
 
@@ -64,7 +64,7 @@ struct Call {
 /// One life of a caller.
 struct Process {
     id: u32,
-    term: Term,
+    term: Claim,
     /// When it ran last.
     pulse: Instant,
 }
@@ -85,7 +85,7 @@ struct Moved {
 struct Vehicle {
     /// Obeys terms.
     is_s_unit: bool,
-    executed: Term,
+    executed: Claim,
     moved: [Moved; 2],
 }
 
@@ -93,7 +93,7 @@ struct Vehicle {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Seen {
     pub(crate) now: Instant,
-    pub(crate) term: Term,
+    pub(crate) term: Claim,
     /// Whether its actuators may move, for whichever order.
     pub(crate) live: [bool; 2],
     /// Whether they say that they are stopped.
@@ -151,7 +151,7 @@ pub(crate) struct Watch {
 
 impl Watch {
     pub(crate) fn add_vehicle(&mut self, is_s_unit: bool) {
-        self.vehicles.push(Vehicle { is_s_unit, executed: Term::NONE, moved: Default::default() });
+        self.vehicles.push(Vehicle { is_s_unit, executed: Claim::NONE, moved: Default::default() });
     }
 
     pub(crate) fn reach(&mut self, what: &'static str) {
@@ -160,7 +160,7 @@ impl Watch {
 
     // --- what callers do
 
-    pub(crate) fn process(&mut self, id: u32, term: Term, now: Instant) -> usize {
+    pub(crate) fn process(&mut self, id: u32, term: Claim, now: Instant) -> usize {
         self.processes.push(Process { id, term, pulse: now });
         self.processes.len() - 1
     }
@@ -235,8 +235,8 @@ impl Watch {
         self.vehicles[vehicle].moved.iter().any(|moved| moved.latched.is_some_and(|(_, lifted)| !lifted))
     }
 
-    pub(crate) fn newest_term(&self) -> Term {
-        self.processes.iter().fold(Term::NONE, |newest, process| newest.newer(process.term))
+    pub(crate) fn newest_term(&self) -> u64 {
+        self.processes.iter().map(|process| process.term.term).max().unwrap_or(0)
     }
 
     /// The last time at which the caller of a call can have wanted it.
@@ -286,8 +286,8 @@ impl Watch {
             return;
         }
         let before = std::mem::replace(&mut vehicle.executed, term);
-        assert!(!before.is_newer_than(term), "call {n} of term {term} runs after one of {before}");
-        if before != Term::NONE && term.is_newer_than(before) {
+        assert!(before <= term, "call {n} of term {term} runs after one of {before}");
+        if before != Claim::NONE && term > before {
             self.reach("newer term obeyed");
         }
     }

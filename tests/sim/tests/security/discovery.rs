@@ -6,12 +6,11 @@ use cara_core::config::Constraints;
 use cara_core::distribution::authenticator::{Authenticator, CODE_BYTES};
 use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeCounter, NodeStorage, Target};
 use cara_core::distribution::datagram::{ANSWER_BYTES, Announce, SEARCH_BYTES};
-use cara_core::distribution::hello::Manager;
+use cara_core::distribution::hello::{ClaimReport, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::presence::{Heard, Presence};
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::{LinkId, Mailman};
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::keys::{DiscoveryKey, PairKey, RootKey};
@@ -23,8 +22,9 @@ use super::ends::Attacked;
 pub(super) const FLEET: Fleet = Fleet(7);
 
 /// An answer in the manager's name, that it is elsewhere.
-pub(super) fn made_up(epoch: Epoch, term: Term, nonce: u64) -> Announce {
-    Announce { identity: depot(), epoch, term, sequence: 9, nonce, tcp_port: 666, room: 1, expected: 1, skipped: 0 }
+pub(super) fn made_up(epoch: Epoch, claim: Option<ClaimReport>, nonce: u64) -> Announce {
+    let (identity, obeyed) = (depot(), None);
+    Announce { identity, epoch, claim, obeyed, sequence: 9, nonce, tcp_port: 666, room: 1, expected: 1, skipped: 0 }
 }
 
 pub(super) struct Ring {
@@ -211,7 +211,8 @@ fn spoofed_announces_lead_nowhere() {
             let announce = Announce {
                 identity: name.clone(),
                 epoch: Epoch(u64::from(id)),
-                term: Term::NONE,
+                claim: None,
+                obeyed: None,
                 sequence: u32::MAX,
                 nonce,
                 tcp_port: 666,
@@ -264,7 +265,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
     running.run(at(2_001));
     let answer = running.outbox.sent.last().expect("it answers").1.clone();
     let told = asking.hear(host(1), &answer, &own, &mut out);
-    assert_eq!(told, Heard::Running { at: SocketAddr::from(([10, 0, 0, 1], 7_000)), term: Term::NONE });
+    assert_eq!(told, Heard::Running { at: SocketAddr::from(([10, 0, 0, 1], 7_000)), claim: None });
     assert!(answer.len() <= question.len());
     // The next start has another nonce, and that answer is an old one.
     let next = Presence::new(depot(), FLEET, Epoch(600), 78);
@@ -277,7 +278,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
     let thief = codes(1, &agv(18));
     for epoch in [1, 599, 600, 601, u64::MAX] {
         for nonce in [0, 1, 78 | 1] {
-            let announce = made_up(Epoch(epoch), Term::NONE, nonce);
+            let announce = made_up(Epoch(epoch), None, nonce);
             let mut bytes = [0; SEARCH_BYTES];
             for to in [None, Some(depot()), Some(agv(18))] {
                 let Some(bytes) = announce.encode(FLEET, &thief, to.as_ref(), &mut bytes) else { continue };

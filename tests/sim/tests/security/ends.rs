@@ -19,7 +19,6 @@ use cara_core::services::lease::{ActuatorState, Lease, Service};
 use cara_core::services::session::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::{Context, Keys, Port};
 use cara_core::storage::Pool;
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keys::{PairKey, RootKey};
 use cara_secure::link::{Cipher, Credentials};
@@ -146,7 +145,8 @@ fn hello(agv: bool, run: u8) -> Hello {
         identity: if agv { vehicle } else { manager },
         wanted: agv.then(|| Manager::new("depot", 1).expect("a name")),
         epoch: Epoch(1),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: 0x1_0000 + u64::from(run) * 2 + u64::from(agv),
         limits,
         link: u16::from(agv),

@@ -9,7 +9,6 @@ use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::Epoch;
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::LinkId;
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 
 use super::discovery::{FLEET, Outbox, Unit, agv, at, codes, depot, host};
@@ -56,7 +55,8 @@ fn recordings(attack: Attack) -> Vec<Vec<u8>> {
                 let announce = Announce {
                     identity: depot(),
                     epoch: Epoch(10_000 - life),
-                    term: Term::NONE,
+                    claim: None,
+                    obeyed: None,
                     sequence: u32::MAX,
                     nonce: 0,
                     tcp_port: 666,

@@ -10,6 +10,7 @@
 //! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
 
+mod claims;
 mod discovery;
 mod ends;
 mod fleet;
@@ -17,7 +18,6 @@ mod frames;
 mod kept_away;
 mod orders;
 mod renewals;
-mod terms;
 mod vectors;
 
 /// Attempts of one kind, and how many of them came to something.

@@ -2,11 +2,11 @@
 
 mod actuators;
 mod calls;
+mod claims;
 mod faults;
 mod leases;
 mod renewals;
 mod runs;
-mod terms;
 mod trips;
 
 use cara_core::distribution::parameters::Parameters;

@@ -98,7 +98,7 @@ impl Port {
             Command::Tell(link, directive) => {
                 assert!(self.open.contains(&link.0), "{link:?} is told {directive:?}");
                 match directive {
-                    Directive::Challenge => {}
+                    Directive::Challenge | Directive::Yield => {}
                     Directive::Admit => {
                         let known = self.node.node_of(link).expect("who is admitted has joined");
                         assert_eq!(known.link(), Some(link));

@@ -143,7 +143,7 @@ impl Port {
     fn told(&mut self, link: u16, directive: Directive) {
         let open = self.open.get_mut(&link).unwrap();
         match directive {
-            Directive::Challenge => assert_eq!(open.1, Open::Joined),
+            Directive::Challenge | Directive::Yield => assert_eq!(open.1, Open::Joined),
             Directive::Admit => {
                 assert_eq!(open.1, Open::Waiting, "only who waits is taken");
                 open.1 = Open::Joined;

@@ -9,6 +9,7 @@
 
 mod admission;
 mod chaos;
+mod claims;
 mod discovery;
 mod fleet;
 mod hostile;
@@ -18,7 +19,6 @@ mod network;
 mod ordering;
 mod restart;
 mod table;
-mod terms;
 
 use core::net::SocketAddr;
 use std::boxed::Box;
@@ -29,7 +29,6 @@ use crate::config::Mode;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas};
 use crate::host::port::InMemory;
 use crate::host::secure::Plain;
-use crate::term::Term;
 use crate::time::Duration;
 
 pub(super) const FLEET: Fleet = Fleet(7);
@@ -155,7 +154,8 @@ pub(super) fn announce_of(config: &NodeConfig<SocketAddr>, sequence: u32, nonce:
     Announce {
         identity: config.identity.clone(),
         epoch: config.epoch,
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         sequence,
         nonce,
         tcp_port: config.tcp_port,

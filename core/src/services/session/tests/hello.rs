@@ -4,11 +4,11 @@ use super::super::Event;
 use super::pair::Pair;
 use super::setup::{self, Setup};
 use crate::config::{HELLO_TIMEOUT, VERSIONS, Versions};
+use crate::distribution::claim::{Claim, TaggedClaim};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
-use crate::term::Term;
-use crate::time::Duration;
+use crate::time::{Duration, Instant};
 
 #[test]
 fn both_ends_learn_who_the_other_is() {
@@ -35,13 +35,15 @@ fn a_refusal_tells_the_reason_to_both() {
 }
 
 #[test]
-fn a_term_that_is_over_is_told_to_both() {
-    let (over, newer) = (Term(5), Term(6));
+fn a_claim_that_is_fenced_is_told_to_both() {
+    let tagged = |term| TaggedClaim { claim: Claim { term, claimant: 1 }, ..TaggedClaim::NONE };
+    let (over, newer) = (tagged(5), tagged(6));
     for manager_refuses in [true, false] {
-        let mut pair = Pair::of_terms(&Setup::default(), over, newer);
+        let mut pair = Pair::of_claims(&Setup::default(), over, newer);
         // One that does not look what the vehicle has obeyed is refused by it.
-        pair.manager.hub.hub.node.set_term(if manager_refuses { over } else { newer });
-        pair.agv.hub.hub.node.set_term(newer);
+        pair.manager.hub.hub.node.set_claim(if manager_refuses { over } else { newer });
+        let manager = pair.manager.hub.hub.node.identity().clone();
+        pair.agv.hub.hub.node.keep_obeyed(Instant::START, &manager, newer);
         pair.settle();
         let closed = Event::Closed(CloseReason::Refused(Refusal::Fenced));
         assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);

@@ -3,10 +3,11 @@
 use super::net::Net;
 use super::setup::Setup;
 use super::side::{Side, context};
+use crate::distribution::claim::TaggedClaim;
+use crate::distribution::hello::ClaimReport;
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::services::Context;
-use crate::term::Term;
 use crate::time::{Duration, Instant};
 
 /// A manager and an AGV on one network. Every buffer must have come back when it is dropped.
@@ -19,14 +20,19 @@ pub(super) struct Pair {
 impl Pair {
     /// Two ends whose connection is open, and nothing sent yet.
     pub(super) fn connected(setup: &Setup) -> Self {
-        Self::of_terms(setup, Term::NONE, Term::NONE)
+        Self::open(setup, None, None)
     }
 
-    /// The same where the hellos say these terms.
-    pub(super) fn of_terms(setup: &Setup, manager: Term, agv: Term) -> Self {
+    /// The same where the hellos say what the manager claims and the AGV has obeyed.
+    pub(super) fn of_claims(setup: &Setup, manager: TaggedClaim, agv: TaggedClaim) -> Self {
+        let report = |tagged| Some(ClaimReport { tagged, since: ClaimReport::NEVER });
+        Self::open(setup, report(manager), report(agv))
+    }
+
+    fn open(setup: &Setup, manager: Option<ClaimReport>, agv: Option<ClaimReport>) -> Self {
         let mut pair =
             Self { manager: Side::new(setup, false, 1), agv: Side::new(setup, true, 2), elapsed: Duration::ZERO };
-        (pair.manager.session.local.term, pair.agv.session.local.term) = (manager, agv);
+        (pair.manager.session.local.claim, pair.agv.session.local.obeyed) = (manager, agv);
         pair.manager.session.connected(context!(pair.manager));
         pair.agv.session.connected(context!(pair.agv));
         pair

@@ -20,7 +20,6 @@ use crate::services::lease::{Lease, Service};
 use crate::services::publications::Publications;
 use crate::services::slots_for;
 use crate::storage::{Boxed, Pool};
-use crate::term::Term;
 use crate::time::{Duration, Instant};
 
 /// What may differ between pairs.
@@ -111,7 +110,8 @@ pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> He
         identity: if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit("manager", 1) }.unwrap(),
         wanted: agv.then(|| Manager::new("manager", 1).unwrap()),
         epoch: Epoch(1),
-        term: Term::NONE,
+        claim: None,
+        obeyed: None,
         nonce: if agv { 0xA61 } else { 0x3A6A6E2 },
         limits: constraints.into(),
         link: u16::from(agv),

@@ -36,7 +36,7 @@ const ABSENT: Duration = Duration::from_secs(2);
 pub struct Board {
     /// The pages of flash that hold its settings.
     pub pages: [&'static [u8]; 2],
-    /// Counts its lives, and keeps the term that it obeys.
+    /// Counts its lives, and stores the claim that it obeys.
     pub lives: &'static mut Lives,
     /// A number that differs from boot to boot, from the jitter of the ring oscillator.
     pub seed: u64,

@@ -77,7 +77,7 @@ fn heard(identity: Identity, wanted: Option<Manager>) -> Heard {
         wanted,
         tcp_port: None,
         room: None,
-        term: None,
+        claim: None,
         searches: 1,
         answers: 0,
         others: 0,

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use cara_core::config::{Constraints, Mode};
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
@@ -15,7 +16,6 @@ use cara_core::services::heart::{self, Renew};
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
-use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_embassy::{Config, Handle, LeaseWatch, Peer};
 use cara_embassy_host::{Bench, Board, now, security};
@@ -126,7 +126,7 @@ impl BoardNode {
             SpecRole::Manager => Config::m_unit(&name, id, security)?,
             SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, security)?,
         };
-        let config = if self.spec.takes_over { config.term(Term(2), drop) } else { config };
+        let config = if self.spec.takes_over { config.claim(Claim { term: 2, claimant: 1 }, |_| true) } else { config };
         let epoch = self.bench.random(u64::MAX);
         Ok(config.fleet(fleet).constraints(constraints).epoch(epoch))
     }

@@ -1,0 +1,115 @@
+//! Claims: which of two managers of one identity commands.
+
+use core::fmt;
+
+use super::authenticator::{Authenticator, CODE_BYTES};
+use super::identity::Identity;
+use crate::config::Mode;
+
+/// What a manager commands with: the higher claim commands. The claimant is drawn for each claim, so no two are equal.
+///
+/// ```
+/// use cara_core::distribution::claim::Claim;
+///
+/// let kept = Claim { term: 5, claimant: 9 };
+/// assert!(kept.raised(1) > kept && kept > Claim { term: 5, claimant: 8 } && kept > Claim::NONE);
+/// assert!(Claim { term: u64::MAX, claimant: 9 }.raised(0) > Claim { term: u64::MAX, claimant: 9 }, "nothing wraps");
+/// ```
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Claim {
+    /// Counts the claims.
+    pub term: u64,
+    /// Drawn for this claim.
+    pub claimant: u64,
+}
+
+impl Claim {
+    /// Below all others.
+    pub const NONE: Self = Self { term: 0, claimant: 0 };
+
+    /// A claim above this one, with this claimant. At the end of all terms the claimant rises.
+    pub const fn raised(self, claimant: u64) -> Self {
+        match self.term.checked_add(1) {
+            Some(term) => Self { term, claimant },
+            None => Self { term: u64::MAX, claimant: self.claimant.saturating_add(1) },
+        }
+    }
+
+    /// What its tag covers. No datagram begins so.
+    fn bytes(self) -> [u8; 21] {
+        let [t0, t1, t2, t3, t4, t5, t6, t7] = self.term.to_le_bytes();
+        let [c0, c1, c2, c3, c4, c5, c6, c7] = self.claimant.to_le_bytes();
+        let [k0, k1, k2, k3, k4] = *b"claim";
+        [k0, k1, k2, k3, k4, t0, t1, t2, t3, t4, t5, t6, t7, c0, c1, c2, c3, c4, c5, c6, c7]
+    }
+
+    /// The claim with its tag, made with the key that the manager has with itself. `None` without that key.
+    pub fn tagged(self, manager: &Identity, authenticator: &dyn Authenticator) -> Option<TaggedClaim> {
+        let tag = match authenticator.mode() {
+            Mode::Plain => [0; CODE_BYTES],
+            Mode::Secured => authenticator.sign_for(manager, &self.bytes())?,
+        };
+        Some(TaggedClaim { claim: self, tag })
+    }
+}
+
+impl fmt::Display for Claim {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{:04x}", self.term, self.claimant >> 48)
+    }
+}
+
+/// A claim and what shows that a manager of its identity made it. Only managers of that identity can make or check it; a
+/// vehicle keeps it and shows it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TaggedClaim {
+    /// The claim.
+    pub claim: Claim,
+    /// Its tag; zeros in plain mode.
+    pub tag: [u8; CODE_BYTES],
+}
+
+impl TaggedClaim {
+    /// None, without a tag.
+    pub const NONE: Self = Self { claim: Claim::NONE, tag: [0; CODE_BYTES] };
+
+    /// Whether a manager of this identity made it. In plain mode anybody did.
+    pub fn is_genuine(&self, manager: &Identity, authenticator: &dyn Authenticator) -> bool {
+        match authenticator.mode() {
+            Mode::Plain => true,
+            Mode::Secured => authenticator.is_of(manager, &self.claim.bytes(), &self.tag),
+        }
+    }
+}
+
+/// Bytes of the fingerprint of a pair key.
+pub const KEY_FINGERPRINT_BYTES: usize = 6;
+
+/// A claim that a vehicle has obeyed, as it is stored: it counts while the pair key is there under which it was obeyed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StoredClaim {
+    /// The claim.
+    pub tagged: TaggedClaim,
+    /// The fingerprint of that key.
+    pub key: [u8; KEY_FINGERPRINT_BYTES],
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_raised_claim_is_higher_wherever_the_counter_stands(
+            term in prop_oneof![any::<u64>(), 0..3_u64, u64::MAX - 3..],
+            one in 0..u64::MAX,
+            other: u64,
+        ) {
+            let claim = Claim { term, claimant: one };
+            prop_assert!(claim.raised(other) > claim);
+        }
+    }
+}

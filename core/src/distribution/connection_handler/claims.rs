@@ -1,0 +1,454 @@
+//! Claims: which of two managers of one identity commands. Only what has been proven counts: a hello behind its handshake, the
+//! answer to a question of this unit, and of a fence only one whose tag is genuine. Nothing that one peer says ends more than its
+//! own link. The states are in `docs/notes/claims.md`.
+
+use super::{Node, NodeCounter};
+use crate::config::OBEYED_MANAGERS;
+use crate::distribution::authenticator::Authenticator;
+use crate::distribution::claim::{Claim, TaggedClaim};
+use crate::distribution::datagram::Announce;
+use crate::distribution::hello::{ClaimReport, Hello, Manager};
+use crate::distribution::identity::{Epoch, Identity, Role};
+use crate::error::Refusal;
+use crate::host::mailman::Mailman;
+use crate::host::port::Port;
+use crate::time::{Duration, Instant};
+
+/// From one question for this unit's own identity to the next.
+const PERIOD: Duration = Duration::from_secs(1);
+/// How often the node looks meanwhile, so that it notices a pause of its own.
+const LOOK: Duration = Duration::from_millis(250);
+/// Questions in a row that nobody answers before a claim is raised.
+const QUESTIONS: u8 = 3;
+/// So long the manager of a higher claim was not heard before a claim is raised above it.
+const UNHEARD: Duration = Duration::from_secs(3);
+/// Between the first raise and the next one; it doubles.
+const FIRST_PAUSE: Duration = Duration::from_secs(30);
+const LONGEST_PAUSE: Duration = Duration::from_secs(3_600);
+/// Between two raises of a manager that takes over.
+const TAKE_OVER_PAUSE: Duration = Duration::from_millis(100);
+/// A moving call waits at most so long until the claim that it is made under is stored.
+const STORING: Duration = Duration::from_secs(2);
+/// Fences that are kept until the node is polled, which follows at once.
+const FENCES: usize = 4;
+
+/// What the port is to do about claims. To be asked for with [`Node::take_claim_event`] after each
+/// [`datagram`](Node::datagram) and [`poll`](Node::poll), and after what a session did.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ClaimEvent {
+    /// A moving call waits until this claim of this manager is stored, with the fingerprint of the pair key. The port answers with
+    /// [`Node::claim_kept`], and then polls its sessions. A board stores while nothing moves.
+    Keep(Identity, TaggedClaim),
+    /// This claim is obeyed until this unit's next start: it could not be stored, or not in time.
+    Unkept(Identity, Claim),
+    /// This m_unit is to claim the one above: the port draws a claimant, stores, calls [`Node::set_claim`], and has each session
+    /// announce it. Where storing fails it does nothing.
+    Raise(Claim),
+    /// A live manager of this m_unit's identity has this higher claim: the port stores it and stops.
+    StepDown(TaggedClaim),
+}
+
+/// Whether a claim that is obeyed is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Keeping {
+    /// No moving call was made under it.
+    Unasked,
+    /// A moving call waits, since then; whether the port has been told.
+    Wanted(Instant, bool),
+    Kept,
+    /// Too late, or it failed; whether the port has been told.
+    Failed(bool),
+}
+
+/// The highest claim of a manager that this unit has obeyed.
+#[derive(Clone, Copy, Debug)]
+struct Obeyed {
+    tagged: TaggedClaim,
+    keeping: Keeping,
+    /// When that manager was last connected, at the latest.
+    heard: Instant,
+}
+
+/// A genuine claim above this manager's.
+#[derive(Clone, Copy, Debug)]
+struct Rival {
+    claim: Claim,
+    /// For how long its manager had not been heard, by whoever heard it last, when a vehicle said so last: that nobody says
+    /// anything any more is no sign that it is gone.
+    silent: Duration,
+    reported: Instant,
+}
+
+/// The questions for this unit's own identity.
+#[derive(Clone, Copy, Debug)]
+struct Questions {
+    /// Of the last one; another each time.
+    nonce: u64,
+    /// When it was asked; none is open before the first.
+    asked: Option<Instant>,
+    unanswered: u8,
+    /// Vehicles were asked as well, a question ago.
+    asked_vehicles: bool,
+    polled: Instant,
+    next: Instant,
+}
+
+/// The claim of an m_unit, those that it has heard, and those that a vehicle obeys.
+#[derive(Debug)]
+pub(super) struct Claims {
+    own: TaggedClaim,
+    took_over: Option<Instant>,
+    /// It raises its claim until it was the highest once.
+    takes_over: bool,
+    fences: heapless::Vec<ClaimReport, FENCES>,
+    rival: Option<Rival>,
+    questions: Questions,
+    next_raise: Instant,
+    pause: Duration,
+    event: Option<ClaimEvent>,
+    /// The port stores what this unit obeys.
+    stores: bool,
+    obeyed: heapless::Vec<(Identity, Obeyed), OBEYED_MANAGERS>,
+}
+
+impl Claims {
+    pub(super) const fn new(now: Instant) -> Self {
+        Self {
+            own: TaggedClaim::NONE,
+            took_over: None,
+            takes_over: false,
+            fences: heapless::Vec::new(),
+            rival: None,
+            questions: Questions {
+                nonce: 0,
+                asked: None,
+                unanswered: 0,
+                asked_vehicles: false,
+                polled: now,
+                next: Instant::FAR_FUTURE,
+            },
+            next_raise: Instant::START,
+            pause: FIRST_PAUSE,
+            event: None,
+            stores: false,
+            obeyed: heapless::Vec::new(),
+        }
+    }
+
+    pub(super) const fn next(&self) -> Instant {
+        self.questions.next
+    }
+
+    fn of(&self, manager: &Identity) -> Option<&Obeyed> {
+        self.obeyed.iter().find(|(identity, _)| identity == manager).map(|(_, obeyed)| obeyed)
+    }
+
+    fn of_mut(&mut self, manager: &Identity) -> Option<&mut Obeyed> {
+        self.obeyed.iter_mut().find(|(identity, _)| identity == manager).map(|(_, obeyed)| obeyed)
+    }
+
+    fn meet_rival(&mut self, now: Instant, claim: Claim, silent: Duration) {
+        let rival = self.rival.get_or_insert(Rival { claim, silent, reported: now });
+        let known = rival.silent + now.since(rival.reported);
+        *rival = Rival { claim: rival.claim.max(claim), silent: known.min(silent), reported: now };
+        self.questions.next = self.questions.next.min(now);
+    }
+}
+
+/// The claim that a report names; the lowest one without a report.
+pub(super) const fn claim_of(report: Option<&ClaimReport>) -> Claim {
+    match report {
+        Some(report) => report.tagged.claim,
+        None => Claim::NONE,
+    }
+}
+
+/// Of the port, about claims.
+impl<P: Port> Node<P> {
+    /// The claim of an m_unit; of an s_unit the highest that it has obeyed.
+    pub fn claim(&self) -> Claim {
+        match &self.target {
+            Some(manager) => self.obeyed(manager),
+            None => self.claims.own.claim,
+        }
+    }
+
+    /// This m_unit's own claim, which the port has stored: what hellos and answers say from here on. Links that there are stay as
+    /// they are; the port has their sessions announce it.
+    pub fn set_claim(&mut self, tagged: TaggedClaim) {
+        self.claims.own = tagged;
+        self.claims.rival = self.claims.rival.filter(|rival| rival.claim > tagged.claim);
+    }
+
+    /// This m_unit starts beside a live one, or to take over from one that hangs: it raises its claim above all genuine ones until
+    /// it was the highest once.
+    pub fn take_over(&mut self, now: Instant) {
+        (self.claims.took_over, self.claims.takes_over) = (Some(now), true);
+    }
+
+    /// The port stores what this unit obeys, and answers [`ClaimEvent::Keep`].
+    pub fn store_claims(&mut self) {
+        self.claims.stores = true;
+    }
+
+    /// A claim of this manager was obeyed and stored in an earlier life.
+    pub fn keep_obeyed(&mut self, now: Instant, manager: &Identity, tagged: TaggedClaim) {
+        let obeyed = Obeyed { tagged, keeping: Keeping::Kept, heard: now };
+        if self.claims.obeyed.push((manager.clone(), obeyed)).is_err() {
+            self.counters.count(NodeCounter::ClaimsNotKept);
+        }
+    }
+
+    /// The highest claim of a manager that this unit has obeyed.
+    pub fn obeyed(&self, manager: &Identity) -> Claim {
+        self.claims.of(manager).map_or(Claim::NONE, |obeyed| obeyed.tagged.claim)
+    }
+
+    /// What was stored in answer to [`ClaimEvent::Keep`], or could not be.
+    pub fn claim_kept(&mut self, manager: &Identity, claim: Claim, kept: bool) {
+        let Some(obeyed) = self.claims.of_mut(manager).filter(|obeyed| obeyed.tagged.claim == claim) else { return };
+        match (kept, obeyed.keeping) {
+            (true, _) => obeyed.keeping = Keeping::Kept,
+            (false, Keeping::Failed(_)) => {}
+            (false, _) => {
+                obeyed.keeping = Keeping::Failed(false);
+                self.counters.count(NodeCounter::ClaimsNotKept);
+            }
+        }
+    }
+
+    /// Obeys any claim of this manager again; whether there was one. Only while no order of it is live.
+    pub fn forget_claim(&mut self, manager: &Identity) -> bool {
+        let before = self.claims.obeyed.len();
+        self.claims.obeyed.retain(|(identity, _)| identity != manager);
+        self.claims.obeyed.len() != before
+    }
+
+    /// What the port is to do about claims; one at a time, until there is none.
+    pub fn take_claim_event(&mut self) -> Option<ClaimEvent> {
+        if let Some(event) = self.claims.event.take() {
+            return Some(event);
+        }
+        self.claims.obeyed.iter_mut().find_map(|(manager, obeyed)| match obeyed.keeping {
+            Keeping::Wanted(since, false) => {
+                obeyed.keeping = Keeping::Wanted(since, true);
+                Some(ClaimEvent::Keep(manager.clone(), obeyed.tagged))
+            }
+            Keeping::Failed(false) => {
+                obeyed.keeping = Keeping::Failed(true);
+                Some(ClaimEvent::Unkept(manager.clone(), obeyed.tagged.claim))
+            }
+            _ => None,
+        })
+    }
+
+    /// The port could not read its sockets empty: a question that seems unanswered may have been answered.
+    pub fn left_unread(&mut self) {
+        self.claims.questions.unanswered = 0;
+    }
+}
+
+impl<P: Port> Node<P> {
+    /// What this m_unit's hellos and answers say of its own claim.
+    pub(crate) fn own_report(&self, now: Instant) -> Option<ClaimReport> {
+        let tagged = self.claims.own;
+        let since = self.claims.took_over.map_or(ClaimReport::NEVER, |at| millis(now.since(at)));
+        (tagged.claim != Claim::NONE).then_some(ClaimReport { tagged, since })
+    }
+
+    /// What this unit tells a manager of the claims of that one's identity.
+    pub(crate) fn obeyed_report(&self, now: Instant, manager: &Identity) -> Option<ClaimReport> {
+        let obeyed = self.claims.of(manager)?;
+        let is_connected = self.node(manager).is_some_and(|known| known.is_joined());
+        let since = if is_connected { 0 } else { millis(now.since(obeyed.heard)) };
+        Some(ClaimReport { tagged: obeyed.tagged, since })
+    }
+
+    /// Whether the manager of a link may command its vehicle, whichever of the two this unit is, or each to the other.
+    pub(super) fn check_claim(&self, hello: &Hello) -> Result<(), Refusal> {
+        let is_fenced_here = claim_of(hello.claim.as_ref()) < self.obeyed(&hello.identity);
+        if is_fenced_here || self.is_fence(hello.obeyed.as_ref()) { Err(Refusal::Fenced) } else { Ok(()) }
+    }
+
+    fn is_fence(&self, obeyed: Option<&ClaimReport>) -> bool {
+        self.config.identity.role() == Role::MUnit && claim_of(obeyed) > self.claims.own.claim
+    }
+
+    /// A node that has proven itself says which claim of this m_unit's identity it has obeyed. A higher one costs that node, and
+    /// nothing else.
+    pub(super) fn hear_obeyed(
+        &mut self,
+        now: Instant,
+        from: P::Endpoint,
+        peer: &Identity,
+        obeyed: Option<&ClaimReport>,
+    ) {
+        let Some(report) = obeyed.filter(|obeyed| self.is_fence(Some(obeyed))) else { return };
+        if let Some((place, forgotten)) = self.table.place_of(peer, from, Epoch(0)) {
+            self.count_forgotten(forgotten);
+            self.table.keep_index(place);
+            if let Some(known) = self.table.node_mut(place) {
+                known.under = Some(report.claim());
+            }
+        }
+        self.counters.count(NodeCounter::Fenced);
+        // Its tag is checked when the node is polled.
+        let _ = self.claims.fences.push(*report);
+        self.claims.questions.next = self.claims.questions.next.min(now);
+    }
+
+    /// A manager that has joined is obeyed from here on; its claim is stored before the first moving call.
+    pub(super) fn obey(&mut self, now: Instant, manager: &Identity, claim: Option<&ClaimReport>) {
+        let Some(tagged) = claim.map(|report| report.tagged) else { return };
+        match self.claims.of_mut(manager) {
+            Some(obeyed) if tagged.claim < obeyed.tagged.claim => {}
+            Some(obeyed) if obeyed.tagged == tagged => obeyed.heard = now,
+            // Also the same claim with another tag: the key was changed.
+            Some(obeyed) => *obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: now },
+            None => {
+                let obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: now };
+                if self.claims.obeyed.push((manager.clone(), obeyed)).is_err() {
+                    self.counters.count(NodeCounter::ClaimsNotKept);
+                }
+            }
+        }
+    }
+
+    /// A connected manager has raised its claim.
+    pub(crate) fn claim_raised(&mut self, now: Instant, manager: &Identity, claim: &ClaimReport) {
+        self.obey(now, manager, Some(claim));
+    }
+
+    /// The link of a manager has ended.
+    pub(super) fn manager_left(&mut self, now: Instant, manager: &Identity) {
+        if let Some(obeyed) = self.claims.of_mut(manager) {
+            obeyed.heard = now;
+        }
+    }
+
+    /// Whether a moving call of this manager may begin: its claim is stored, cannot be, or takes too long.
+    pub(crate) fn may_move(&mut self, now: Instant, manager: &Identity) -> bool {
+        if !self.claims.stores {
+            return true;
+        }
+        let Some(obeyed) = self.claims.of_mut(manager) else { return true };
+        match obeyed.keeping {
+            Keeping::Kept | Keeping::Failed(_) => return true,
+            Keeping::Unasked => obeyed.keeping = Keeping::Wanted(now, false),
+            Keeping::Wanted(since, _) if now < since + STORING => {}
+            Keeping::Wanted(..) => {
+                obeyed.keeping = Keeping::Failed(false);
+                self.counters.count(NodeCounter::ClaimsNotKept);
+                return true;
+            }
+        }
+        // The port is asked to store it.
+        self.claims.questions.next = self.claims.questions.next.min(now);
+        false
+    }
+
+    /// Another unit with this m_unit's identity has answered, to be heard only if it answers a question of this one.
+    pub(super) fn another_answered(&mut self, now: Instant, announce: &Announce, authenticator: &dyn Authenticator) {
+        let claims = &mut self.claims;
+        let is_asked = announce.nonce != 0 && [self.search.nonce, claims.questions.nonce].contains(&announce.nonce);
+        if self.config.identity.role() != Role::MUnit || !is_asked {
+            return;
+        }
+        claims.questions.unanswered = 0;
+        let report = announce.claim.filter(|claim| claim.tagged.is_genuine(&self.config.identity, authenticator));
+        let Some(tagged) = report.map(|report| report.tagged) else { return };
+        if tagged.claim <= claims.own.claim {
+            // The other one is to hear of this one, and steps down.
+            claims.takes_over = false;
+            if tagged.claim < claims.own.claim {
+                self.broadcast(now);
+            }
+        } else if claims.takes_over {
+            claims.meet_rival(now, tagged.claim, Duration::ZERO);
+        } else {
+            claims.event = Some(ClaimEvent::StepDown(tagged));
+            // The port asks for it when it has polled.
+            claims.questions.next = now;
+        }
+    }
+
+    /// A vehicle has taken this manager: its claim was the highest once.
+    pub(super) fn was_obeyed(&mut self) {
+        self.claims.takes_over = false;
+    }
+
+    /// Looks at fences, asks for this unit's own identity while one is genuine, and raises the claim when nobody answers.
+    pub(super) fn poll_claims(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
+        if core::mem::replace(&mut self.claims.questions.polled, now) + PERIOD < now {
+            (self.claims.questions.unanswered, self.claims.questions.asked) = (0, None);
+        }
+        while let Some(fence) = self.claims.fences.pop() {
+            if fence.claim() > self.claims.own.claim && fence.tagged.is_genuine(&self.config.identity, authenticator) {
+                self.claims.meet_rival(now, fence.claim(), Duration::from_millis(fence.since.into()));
+            }
+        }
+        let Some(rival) = self.claims.rival else {
+            self.claims.questions.next = Instant::FAR_FUTURE;
+            return;
+        };
+        if now < self.claims.questions.next {
+            return;
+        }
+        self.claims.questions.next = now + LOOK;
+        if self.claims.takes_over {
+            return self.raise(now, rival, TAKE_OVER_PAUSE);
+        }
+        if self.claims.questions.asked.is_none_or(|asked| now >= asked + PERIOD) {
+            let questions = &mut self.claims.questions;
+            questions.unanswered = questions.unanswered.saturating_add(questions.asked.is_some().into());
+            let is_alone = questions.unanswered >= QUESTIONS && rival.silent >= UNHEARD;
+            let is_allowed = is_alone && now >= self.claims.next_raise;
+            let asked_vehicles = core::mem::replace(&mut questions.asked_vehicles, is_allowed);
+            if is_allowed && asked_vehicles {
+                let pause = self.claims.pause;
+                self.raise(now, rival, pause);
+            } else if is_allowed {
+                // One that is under the other manager says that it hears it.
+                self.broadcast(now);
+            }
+            self.ask_for_itself(now, mailman, authenticator);
+        }
+    }
+
+    fn raise(&mut self, now: Instant, rival: Rival, pause: Duration) {
+        if now < self.claims.next_raise {
+            return;
+        }
+        self.claims.next_raise = now + pause;
+        if pause == self.claims.pause {
+            self.claims.pause = pause.times(2).min(LONGEST_PAUSE);
+        }
+        self.claims.event = Some(ClaimEvent::Raise(rival.claim));
+    }
+
+    fn ask_for_itself(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
+        let nonce = self.random.bits() | 1;
+        let questions = &mut self.claims.questions;
+        (questions.nonce, questions.asked) = (nonce, Some(now));
+        let wanted = Manager::new(self.config.identity.name(), self.config.identity.id()).ok();
+        let search = core::mem::replace(&mut self.search.nonce, nonce);
+        let sent = self.say_who_has(wanted, 0, authenticator, |datagram| mailman.broadcast(datagram));
+        self.search.nonce = search;
+        self.counters.count(if sent { NodeCounter::OwnIdentityAsked } else { NodeCounter::SendFailed });
+    }
+}
+
+fn millis(span: Duration) -> u32 {
+    u32::try_from(span.as_millis()).unwrap_or(u32::MAX)
+}

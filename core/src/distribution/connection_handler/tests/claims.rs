@@ -1,0 +1,367 @@
+//! Claims: which of two managers of one identity commands, and that no peer's word ends more than its own link.
+
+use std::vec;
+
+use super::*;
+use crate::distribution::authenticator::{Authenticator, CODE_BYTES};
+use crate::distribution::claim::{Claim, TaggedClaim};
+use crate::distribution::hello::ClaimReport;
+
+/// The code that only holders of a key make; everybody here has it but for tags, which a test makes by hand.
+const GENUINE: [u8; CODE_BYTES] = [7; CODE_BYTES];
+
+struct Keyed;
+
+impl Authenticator for Keyed {
+    fn mode(&self) -> Mode {
+        Mode::Secured
+    }
+
+    fn sign_for_fleet(&self, _: &[u8]) -> [u8; CODE_BYTES] {
+        GENUINE
+    }
+
+    fn is_of_fleet(&self, _: &[u8], code: &[u8; CODE_BYTES]) -> bool {
+        *code == GENUINE
+    }
+
+    fn sign_for(&self, _: &Identity, _: &[u8]) -> Option<[u8; CODE_BYTES]> {
+        Some(GENUINE)
+    }
+
+    fn is_of(&self, _: &Identity, _: &[u8], code: &[u8; CODE_BYTES]) -> bool {
+        *code == GENUINE
+    }
+}
+
+fn claim(term: u64) -> Claim {
+    Claim { term, claimant: 4 }
+}
+
+fn tagged(claim: Claim) -> TaggedClaim {
+    TaggedClaim { claim, tag: GENUINE }
+}
+
+fn report(claim: Claim, since: u32) -> Option<ClaimReport> {
+    Some(ClaimReport { tagged: tagged(claim), since })
+}
+
+fn forged(claim: Claim) -> Option<ClaimReport> {
+    Some(ClaimReport { tagged: TaggedClaim { claim, tag: [8; CODE_BYTES] }, since: ClaimReport::NEVER })
+}
+
+/// The hello of the manager with this claim.
+fn of_claim(claim: Claim) -> Hello {
+    Hello { claim: report(claim, ClaimReport::NEVER), ..hello_of(&m_unit(MANAGER, MANAGER_ID)) }
+}
+
+/// A vehicle that has obeyed this claim in an earlier life.
+fn vehicle(obeyed: Claim) -> Node<InMemory> {
+    let mut node = node(s_unit("agv", 1));
+    let depot = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    node.keep_obeyed(at(0), &depot, tagged(obeyed));
+    node.store_claims();
+    node
+}
+
+fn managed(term: u64) -> Node<InMemory> {
+    let mut node = depot();
+    node.set_claim(tagged(claim(term)));
+    node
+}
+
+fn admit(node: &mut Node<InMemory>, link: u16, hello: &Hello) -> Admission {
+    admit_at(node, at(1_000), link, hello)
+}
+
+fn admit_at(node: &mut Node<InMemory>, now: Instant, link: u16, hello: &Hello) -> Admission {
+    node.admit(now, LinkId(link), address(1, 7_000), hello)
+}
+
+const FENCED: Admission = Admission::Refuse(Refusal::Fenced);
+
+/// The hello of a vehicle.
+fn agv(id: u32, obeyed: Option<ClaimReport>) -> Hello {
+    Hello { obeyed, ..hello_of(&s_unit("agv", id)) }
+}
+
+/// Polls as a port does until `end`; what the port is to do about claims, and how often the node asked for itself.
+fn watch(node: &mut Node<InMemory>, from: Instant, end: Instant) -> (Vec<ClaimEvent>, usize) {
+    let (mut events, mut outbox, mut now) = (Vec::new(), Outbox::default(), from);
+    while now <= end {
+        while node.poll(now, &mut outbox, &Keyed).is_some() {}
+        events.extend(core::iter::from_fn(|| node.take_claim_event()));
+        now = node.next_deadline().max(now + Duration::from_millis(1)).min(now + Duration::from_millis(100));
+    }
+    let is_own = |bytes: &&Vec<u8>| match Datagram::decode(bytes, FLEET, &Keyed) {
+        Ok(Datagram::WhoHas(who_has)) => who_has.wanted.is_some(),
+        _ => false,
+    };
+    let asked = outbox.broadcasts.iter().filter(is_own).count();
+    (events, asked)
+}
+
+/// Managers with no claim, a lower one, the next lower, the same and a higher one.
+#[test]
+fn a_vehicle_obeys_the_highest_claim_and_refuses_lower_ones() {
+    let obeyed = Claim { term: 5, claimant: 4 };
+    let lower = [Claim::NONE, claim(1), claim(4), Claim { term: 5, claimant: 3 }];
+    for refused in lower {
+        let mut node = vehicle(obeyed);
+        assert_eq!(admit(&mut node, 0, &of_claim(refused)), FENCED, "{refused:?}");
+        assert_eq!((node.claim(), node.counters.value(NodeCounter::RefusedFenced)), (obeyed, 1));
+        let hello = node.hello(at(9_000), LinkId(0));
+        assert_eq!(hello.obeyed, report(obeyed, 9_000), "a manager hears what fences it, and how old it is");
+    }
+    let without = Hello { claim: None, ..of_claim(obeyed) };
+    assert_eq!(admit(&mut vehicle(obeyed), 0, &without), FENCED);
+    for taken in [obeyed, Claim { term: 5, claimant: 5 }, claim(6), claim(u64::MAX)] {
+        let mut node = vehicle(obeyed);
+        assert_eq!(admit(&mut node, 0, &of_claim(taken)), Admission::Accept, "{taken:?}");
+        assert_eq!(node.claim(), taken);
+        node.left(at(3_000), LinkId(0), CloseReason::Silent);
+        assert_eq!(admit_at(&mut node, at(3_001), 0, &of_claim(claim(4))), FENCED);
+    }
+}
+
+/// It is stored before the first moving call under it, and not at joining.
+#[test]
+fn a_claim_is_stored_before_the_first_moving_call() {
+    let manager = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    let joined = || {
+        let mut node = vehicle(claim(5));
+        assert_eq!(admit(&mut node, 0, &of_claim(claim(6))), Admission::Accept);
+        assert_eq!(node.take_claim_event(), None, "it has only joined");
+        assert!(!node.may_move(at(2_000), &manager) && !node.may_move(at(2_010), &manager));
+        let keep = ClaimEvent::Keep(manager.clone(), tagged(claim(6)));
+        assert_eq!((node.take_claim_event(), node.take_claim_event()), (Some(keep), None), "asked once");
+        node
+    };
+    let mut stored = joined();
+    stored.claim_kept(&manager, claim(6), true);
+    assert!(stored.may_move(at(2_020), &manager) && stored.take_claim_event().is_none());
+    let unkept = Some(ClaimEvent::Unkept(manager.clone(), claim(6)));
+    let mut failed = joined();
+    failed.claim_kept(&manager, claim(6), false);
+    assert!(failed.may_move(at(2_020), &manager));
+    assert_eq!((failed.take_claim_event(), failed.take_claim_event()), (unkept.clone(), None));
+    let mut late = joined();
+    assert!(!late.may_move(at(3_999), &manager) && late.may_move(at(4_000), &manager));
+    assert_eq!((late.take_claim_event(), late.counters.value(NodeCounter::ClaimsNotKept)), (unkept, 1));
+    // One that was stored in an earlier life needs no more, and a unit that stores nothing waits for nothing.
+    let mut kept = vehicle(claim(5));
+    assert_eq!(admit(&mut kept, 0, &of_claim(claim(5))), Admission::Accept);
+    assert!(kept.may_move(at(2_000), &manager));
+    let mut forgetful = node(s_unit("agv", 1));
+    assert_eq!(admit(&mut forgetful, 0, &of_claim(claim(5))), Admission::Accept);
+    assert!(forgetful.may_move(at(2_000), &manager));
+}
+
+/// With the key of one vehicle, or by accident: whatever claim it says it has obeyed, the manager loses that vehicle only.
+#[test]
+fn a_fence_costs_a_manager_that_vehicle_and_nothing_else() {
+    for obeyed in [forged(claim(100)), forged(claim(u64::MAX)), report(claim(6), 0), report(claim(5).raised(5), 100)] {
+        let mut node = managed(5);
+        assert_eq!(admit(&mut node, 0, &agv(1, None)), Admission::Accept);
+        assert_eq!(admit(&mut node, 1, &agv(2, obeyed)), FENCED);
+        let fenced = Identity::s_unit("agv", 2).unwrap();
+        let under = node.node(&fenced).and_then(Known::under);
+        assert_eq!(under, obeyed.map(|report| report.claim()));
+        assert_eq!(node.s_units().count(), 2, "it stays on the roster");
+        let (events, _) = watch(&mut node, at(1_001), at(1_900));
+        assert_eq!((events, node.claim(), node.number_of_s_units()), (vec![], claim(5), 1));
+    }
+    for obeyed in [None, report(Claim::NONE, 0), report(claim(4), 0), report(claim(5), 0)] {
+        assert_eq!(admit(&mut managed(5), 1, &agv(2, obeyed)), Admission::Accept);
+    }
+}
+
+#[test]
+fn a_claim_without_a_genuine_tag_is_never_raised_above() {
+    let mut node = managed(5);
+    for link in 0..10 {
+        assert_eq!(admit(&mut node, link, &agv(2, forged(claim(100)))), FENCED);
+    }
+    let (events, asked) = watch(&mut node, at(1_001), at(60_000));
+    assert_eq!((events, asked), (vec![], 0));
+}
+
+#[test]
+fn a_manager_raises_its_claim_when_nobody_has_heard_the_other_one() {
+    // The other one was heard just now, and of that nobody says anything any more.
+    let mut node = managed(5);
+    assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 0))), FENCED);
+    assert_eq!(watch(&mut node, at(1_000), at(20_000)).0, vec![]);
+    // A vehicle says that it was not heard for 3 s: the vehicles are asked once more, for a second.
+    assert_eq!(admit_at(&mut node, at(20_000), 0, &agv(2, report(claim(7), 19_000))), FENCED);
+    let (events, asked) = watch(&mut node, at(20_001), at(23_000));
+    assert_eq!(events, vec![ClaimEvent::Raise(claim(7))]);
+    assert!(asked >= 2);
+    node.set_claim(tagged(claim(7).raised(1)));
+    assert_eq!(admit_at(&mut node, at(23_100), 0, &agv(2, report(claim(7), 0))), Admission::Accept);
+    // Again within 30 s it does not, and from then on after twice as long each time.
+    assert_eq!(admit_at(&mut node, at(23_200), 1, &agv(3, report(claim(9), 60_000))), FENCED);
+    assert_eq!(watch(&mut node, at(23_200), at(50_000)).0, vec![]);
+    assert_eq!(watch(&mut node, at(50_100), at(56_000)).0, vec![ClaimEvent::Raise(claim(9))]);
+    assert_eq!(watch(&mut node, at(56_100), at(110_000)).0, vec![], "storing failed, and a minute is not over");
+}
+
+/// Vehicles that have it tell that it lives, each time that they hear this one's search.
+#[test]
+fn a_manager_that_is_heard_by_a_vehicle_is_not_raised_above() {
+    let mut node = managed(5);
+    for second in 1..60 {
+        assert_eq!(admit_at(&mut node, at(second * 1_000), 0, &agv(2, report(claim(7), 200))), FENCED);
+        assert_eq!(watch(&mut node, at(second * 1_000), at(second * 1_000 + 990)).0, vec![]);
+    }
+}
+
+#[test]
+fn a_pause_of_its_own_or_sockets_that_are_not_empty_start_the_count_again() {
+    let fenced = || {
+        let mut node = managed(5);
+        assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 60_000))), FENCED);
+        assert_eq!(watch(&mut node, at(1_000), at(3_900)).0, vec![], "three questions, and one of vehicles");
+        node
+    };
+    let mut suspended = fenced();
+    assert_eq!(watch(&mut suspended, at(3_603_000), at(3_606_900)).0, vec![], "what came meanwhile is not read yet");
+    assert_eq!(watch(&mut suspended, at(3_606_950), at(3_609_000)).0, vec![ClaimEvent::Raise(claim(7))]);
+    let mut flooded = fenced();
+    for second in 4..60 {
+        flooded.left_unread();
+        assert_eq!(watch(&mut flooded, at(second * 1_000), at(second * 1_000 + 950)).0, vec![]);
+    }
+}
+
+/// The question of a running manager to another one of its identity.
+fn question(node: &mut Node<InMemory>, now: Instant) -> WhoHas {
+    let mut outbox = Outbox::default();
+    while node.poll(now, &mut outbox, &Keyed).is_some() {}
+    let asked = outbox.broadcasts.iter().find_map(|bytes| match Datagram::decode(bytes, FLEET, &Keyed) {
+        Ok(Datagram::WhoHas(who_has)) if who_has.wanted.is_some() => Some(who_has),
+        _ => None,
+    });
+    asked.expect("it asks for itself")
+}
+
+fn answer(nonce: u64, claim: Option<ClaimReport>) -> Announce {
+    let double = NodeConfig { epoch: Epoch(99), ..m_unit(MANAGER, MANAGER_ID) };
+    Announce { claim, ..announce_of(&double, 1, nonce) }
+}
+
+fn hear(node: &mut Node<InMemory>, now: Instant, announce: &Announce) {
+    let depot = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    let mut out = [0; SEARCH_BYTES];
+    let bytes = announce.encode(FLEET, &Keyed, Some(&depot), &mut out).unwrap();
+    node.datagram(now, address(9, 7_000), bytes, &Keyed);
+}
+
+#[test]
+fn of_two_live_managers_the_lower_claim_steps_down() {
+    let mut node = managed(5);
+    assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 60_000))), FENCED);
+    let nonce = question(&mut node, at(1_001)).nonce;
+    for (wrong, why) in [
+        (answer(nonce ^ 2, report(claim(7), 0)), "another question's answer"),
+        (answer(0, report(claim(7), 0)), "a broadcast"),
+        (answer(nonce, forged(claim(7))), "a tag that is not genuine"),
+        (answer(nonce, None), "no claim"),
+        (answer(nonce, report(claim(5), 0)), "its own"),
+        (answer(nonce, report(claim(4), 0)), "a lower one"),
+    ] {
+        hear(&mut node, at(1_002), &wrong);
+        assert_eq!(node.take_claim_event(), None, "{why}");
+    }
+    hear(&mut node, at(1_003), &answer(nonce, report(claim(7), 0)));
+    assert_eq!(node.take_claim_event(), Some(ClaimEvent::StepDown(tagged(claim(7)))));
+}
+
+#[test]
+fn an_answer_starts_the_count_again() {
+    let mut node = managed(5);
+    assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 60_000))), FENCED);
+    let mut outbox = Outbox::default();
+    for now in (1_000..60_000).step_by(100) {
+        while node.poll(at(now), &mut outbox, &Keyed).is_some() {}
+        for bytes in core::mem::take(&mut outbox.broadcasts) {
+            // It lives, and does not say its claim.
+            let Ok(Datagram::WhoHas(who_has)) = Datagram::decode(&bytes, FLEET, &Keyed) else { continue };
+            hear(&mut node, at(now), &answer(who_has.nonce, None));
+        }
+        assert_eq!(node.take_claim_event(), None);
+    }
+}
+
+#[test]
+fn a_manager_that_takes_over_raises_until_it_was_the_highest_once() {
+    let mut node = managed(5);
+    node.take_over(at(900));
+    assert_eq!(node.hello(at(1_000), LinkId(9)).claim, report(claim(5), 100));
+    assert_eq!(admit(&mut node, 0, &agv(2, forged(claim(80)))), FENCED);
+    assert_eq!(watch(&mut node, at(1_000), at(1_100)).0, vec![]);
+    assert_eq!(admit_at(&mut node, at(1_200), 0, &agv(3, report(claim(7), 0))), FENCED);
+    assert_eq!(watch(&mut node, at(1_200), at(1_250)).0, vec![ClaimEvent::Raise(claim(7))]);
+    node.set_claim(tagged(claim(8)));
+    assert_eq!(admit_at(&mut node, at(1_300), 0, &agv(3, report(claim(7), 0))), Admission::Accept);
+    assert_eq!(admit_at(&mut node, at(1_400), 1, &agv(4, report(claim(9), 0))), FENCED);
+    assert_eq!(watch(&mut node, at(1_400), at(3_000)).0, vec![], "as any other manager");
+}
+
+/// An s_unit that is connected asks another boot of its manager, and gives way to a higher claim only.
+#[test]
+fn a_connected_vehicle_gives_way_to_a_higher_claim_that_is_proven() {
+    for (heard, gives_way) in [(None, false), (report(claim(5), 0), false), (report(claim(6), 0), true)] {
+        let mut node = node(s_unit("agv", 1));
+        assert_eq!(admit(&mut node, 0, &of_claim(claim(5))), Admission::Accept);
+        let newer = NodeConfig { epoch: Epoch(99), ..m_unit(MANAGER, MANAGER_ID) };
+        node.hear(at(5_000), address(9, 7_001), &who_has_bytes(&search_of(&newer, 1)));
+        let mut outbox = Outbox::default();
+        assert_eq!(run(&mut node, at(5_200), &mut outbox), []);
+        let asked = outbox.sent.iter().find_map(|(_, bytes)| match read(bytes) {
+            Datagram::WhoHas(who_has) => Some(who_has),
+            _ => None,
+        });
+        let told = outbox.sent.iter().find_map(|(_, bytes)| match read(bytes) {
+            Datagram::Announce(announce) => Some(announce),
+            _ => None,
+        });
+        assert_eq!(told.expect("it says whom it obeys").obeyed, report(claim(5), 0));
+        let asked = asked.expect("it asks");
+        let replayed = Announce { claim: report(claim(6), 0), ..announce_of(&newer, 1, asked.nonce ^ 2) };
+        node.hear(at(5_201), address(9, 7_001), &announce_bytes(&replayed));
+        assert_eq!(due(&mut node, at(5_202)), []);
+        let announce = Announce { claim: heard, ..announce_of(&newer, 1, asked.nonce) };
+        node.hear(at(5_203), address(9, 7_001), &announce_bytes(&announce));
+        let expected = if gives_way { vec![tell(0, Directive::Yield)] } else { vec![] };
+        assert_eq!(due(&mut node, at(5_204)), expected);
+        if gives_way {
+            node.left(at(5_400), LinkId(0), CloseReason::PeerRestarted);
+            let dialled = due(&mut node, at(5_401));
+            assert!(matches!(&dialled[..], [Command::Dial { to, .. }] if *to == address(9, 7_000)), "{dialled:?}");
+        }
+    }
+}
+
+/// A door that a manager dials: the newcomer waits until the present link is silent, or is told that it drives.
+#[test]
+fn a_newcomer_with_a_higher_claim_waits_or_is_told_that_the_vehicle_drives() {
+    let joined = || {
+        let mut door = node(m_unit("door", 9));
+        assert_eq!(admit(&mut door, 0, &of_claim(claim(5))), Admission::Accept);
+        let newer = Hello { epoch: Epoch(7), ..of_claim(claim(6)) };
+        assert_eq!(admit(&mut door, 1, &newer), Admission::Wait);
+        assert_eq!(due(&mut door, at(1_000)), [tell(0, Directive::Yield)]);
+        door
+    };
+    let mut silent = joined();
+    assert_eq!(due(&mut silent, at(1_300)), [tell(0, Directive::Close(CloseReason::PeerRestarted))]);
+    silent.left(at(1_301), LinkId(0), CloseReason::PeerRestarted);
+    assert!(due(&mut silent, at(1_301)).contains(&tell(1, Directive::Admit)));
+    let manager = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    assert_eq!(silent.obeyed(&manager), claim(6));
+    let mut alive = joined();
+    alive.challenge_answered(at(1_100), LinkId(0));
+    assert_eq!(due(&mut alive, at(1_100)), [tell(1, Directive::Refuse(Refusal::Driving))]);
+    assert_eq!(alive.obeyed(&manager), claim(5));
+}

@@ -1,0 +1,128 @@
+//! What the claim of a link's manager means for its calls: moving ones wait until it is stored, and the link ends when a manager
+//! with a higher claim wants to command and nothing moves.
+
+use super::{Phase, Session};
+use crate::config::CHALLENGE_TIMEOUT;
+use crate::distribution::hello::ClaimReport;
+use crate::distribution::message::Control;
+use crate::error::CloseReason;
+use crate::services::lease::{Lease, Stage};
+use crate::services::{Context, Port};
+use crate::time::{Duration, Instant};
+
+/// How often it is looked at what is waited for.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// The peer's claim, as far as its calls have to do with it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Obedience {
+    /// The hub lets moving calls begin: it need not be asked again.
+    may_move: bool,
+    /// A moving call waits until the hub lets it begin.
+    pub(super) waits: bool,
+    /// A manager with a higher claim wants to command: until when the peer has to answer, and its orders go on.
+    gives_way: Option<(Instant, Instant)>,
+    pub(super) next: Instant,
+    /// This unit's own claim was raised, which the peer has not been told.
+    raised: Option<ClaimReport>,
+}
+
+impl Obedience {
+    pub(super) const fn new() -> Self {
+        Self { may_move: false, waits: false, gives_way: None, next: Instant::FAR_FUTURE, raised: None }
+    }
+
+    pub(super) const fn has_news(&self) -> bool {
+        self.raised.is_some()
+    }
+
+    pub(super) const fn gives_way(&self) -> bool {
+        self.gives_way.is_some()
+    }
+}
+
+impl<P: Port> Session<P> {
+    /// This unit's claim is another one: the peer is told.
+    pub fn announce_claim(&mut self, cx: &mut Context<'_, P>) {
+        let (now, mut report) = (cx.now, None);
+        cx.hub.enter(&mut |hub| report = hub.node.own_report(now));
+        self.local.claim = report;
+        self.obedience.raised = report;
+        self.pump(cx);
+    }
+
+    pub(super) fn send_claim(&mut self, cx: &mut Context<'_, P>) {
+        if let Some(report) = self.obedience.raised
+            && self.send_control(cx, &Control::Claimed { report })
+        {
+            self.obedience.raised = None;
+        }
+    }
+
+    /// The peer has raised its claim.
+    pub(super) fn claim_arrived(&mut self, cx: &mut Context<'_, P>, report: &ClaimReport) {
+        let Some(peer) = self.remote.as_ref().map(|remote| &remote.hello.identity) else { return };
+        let now = cx.now;
+        cx.hub.enter(&mut |hub| hub.node.claim_raised(now, peer, report));
+        self.obedience.may_move = false;
+    }
+
+    /// Whether a moving call of the peer may begin. Otherwise it waits, and the port is asked to store the peer's claim.
+    pub(super) fn may_move(&mut self, cx: &mut Context<'_, P>) -> bool {
+        if !self.obedience.may_move
+            && let Some(remote) = &self.remote
+        {
+            let (now, mut may) = (cx.now, true);
+            cx.hub.enter(&mut |hub| may = hub.node.may_move(now, &remote.hello.identity));
+            (self.obedience.may_move, self.obedience.waits) = (may, !may);
+            if !may {
+                self.obedience.next = now + LOOK;
+            }
+        }
+        self.obedience.may_move
+    }
+
+    /// A manager with a higher claim wants to command: the peer shows whether it is alive.
+    pub(super) fn give_way(&mut self, cx: &mut Context<'_, P>) {
+        if self.phase == Phase::Live && self.obedience.gives_way.is_none() {
+            self.obedience.gives_way = Some((cx.now + CHALLENGE_TIMEOUT, cx.now + self.constraints.handover));
+            self.obedience.next = cx.now + LOOK;
+            self.challenge(cx);
+        }
+    }
+
+    /// Ends a link that gives way when nothing of it moves; whether it has.
+    pub(super) fn has_given_way(&mut self, cx: &mut Context<'_, P>) -> bool {
+        let ends = self.obedience.gives_way() && self.is_quiet(cx);
+        if ends {
+            self.close(cx, CloseReason::PeerRestarted);
+        }
+        ends
+    }
+
+    pub(super) fn poll_obedience(&mut self, cx: &mut Context<'_, P>) {
+        if cx.now < self.obedience.next {
+            return;
+        }
+        self.obedience.next = Instant::FAR_FUTURE;
+        if self.obedience.waits {
+            self.may_move(cx);
+        }
+        let Some((silent_at, until)) = self.obedience.gives_way else { return };
+        self.obedience.next = cx.now + LOOK;
+        if self.challenged {
+            if cx.now >= silent_at {
+                self.close(cx, CloseReason::PeerRestarted);
+            }
+        } else if !self.has_given_way(cx) && cx.now >= until {
+            (0..self.granted.len()).for_each(|index| self.cut_lease(cx, index));
+        }
+    }
+
+    /// No order of the peer is live, nothing is stopping, and no hook is due.
+    fn is_quiet(&self, cx: &Context<'_, P>) -> bool {
+        let is_busy = |lease: &Lease| lease.awaits_hook() || lease.stage(cx.now) == Stage::Stopping;
+        let functions = self.publishing.all_slots().filter_map(|slot| cx.functions.function(slot));
+        self.granted.is_empty() && !functions.filter_map(|function| function.handler.lease()).any(is_busy)
+    }
+}

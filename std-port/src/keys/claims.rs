@@ -1,0 +1,95 @@
+//! The file of a unit's claims, in the form of key files: nothing in it is secret, but it is written and checked as they are.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use cara_core::distribution::authenticator::CODE_BYTES;
+use cara_core::distribution::claim::{Claim, TaggedClaim};
+use cara_core::distribution::identity::Identity;
+use cara_secure::keys::FINGERPRINT_BYTES;
+
+use super::text::{FORM, FormError, Line, Lines, push_identity, push_sum};
+use super::{KeyError, file};
+
+/// The first line's word.
+const HEAD: &str = "cara-claims";
+
+/// What a unit keeps.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct KeptClaims {
+    /// Of an m_unit: its own, or the highest one that it has heard where it did not start.
+    pub(crate) own: Claim,
+    /// The highest of each manager that it has obeyed.
+    pub(crate) obeyed: Vec<KeptObeyed>,
+}
+
+/// A claim that a vehicle has obeyed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct KeptObeyed {
+    pub(crate) manager: Identity,
+    pub(crate) tagged: TaggedClaim,
+    /// The fingerprint of the pair key: with other keys it does not count.
+    pub(crate) key: [u8; FINGERPRINT_BYTES],
+}
+
+/// The claims in a file; `None` where there is none.
+pub(crate) fn read_claims(path: &Path) -> Result<Option<KeptClaims>, KeyError> {
+    if !file::is_there(path)? {
+        return Ok(None);
+    }
+    let (text, _) = file::read(path)?;
+    parse(&text).map(Some).map_err(|error| file::form(path, error))
+}
+
+fn parse(text: &str) -> Result<KeptClaims, FormError> {
+    let mut lines = Lines::of(text);
+    lines.head(HEAD, "a file with claims begins with `cara-claims`")?;
+    let (own, _) = claim(lines.expect("own", "here `own` is expected")?)?;
+    let obeyed = lines.map(|line| match line.word {
+        "obeyed" => parse_obeyed(line),
+        _ => Err(line.wrong("here `obeyed` is expected")),
+    });
+    Ok(KeptClaims { own, obeyed: obeyed.collect::<Result<_, _>>()? })
+}
+
+fn claim(line: Line<'_>) -> Result<(Claim, Line<'_>), FormError> {
+    let wrong = line.wrong("here a term and a claimant, numbers of 64 bits, are expected");
+    let (term, rest) = line.value();
+    let (claimant, rest) = rest.value();
+    match (term.parse(), claimant.parse()) {
+        (Ok(term), Ok(claimant)) => Ok((Claim { term, claimant }, rest)),
+        _ => Err(wrong),
+    }
+}
+
+fn parse_obeyed(line: Line<'_>) -> Result<KeptObeyed, FormError> {
+    let (claim, rest) = claim(line)?;
+    let (tag_digits, rest) = rest.value();
+    let (key_digits, rest) = rest.value();
+    let (mut tag, mut key) = ([0; CODE_BYTES], [0; FINGERPRINT_BYTES]);
+    hex::decode_to_slice(tag_digits, &mut tag).map_err(|_| line.wrong("here a tag of 32 digits is expected"))?;
+    hex::decode_to_slice(key_digits, &mut key).map_err(|_| line.wrong("here a fingerprint is expected"))?;
+    Ok(KeptObeyed { manager: rest.identity()?, tagged: TaggedClaim { claim, tag }, key })
+}
+
+fn digits(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Writes it, whole, and with its folder on the disk before this returns.
+pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyError> {
+    let mut text = String::new();
+    // Writing to text does not fail.
+    let _ = writeln!(text, "{HEAD} {FORM}\nown {} {}", kept.own.term, kept.own.claimant);
+    for KeptObeyed { manager, tagged, key } in &kept.obeyed {
+        let Claim { term, claimant } = tagged.claim;
+        let _ = write!(text, "obeyed {term} {claimant} {} {} ", digits(&tagged.tag), digits(key));
+        push_identity(&mut text, manager);
+        text.push('\n');
+    }
+    push_sum(&mut text);
+    if let Some(folder) = path.parent() {
+        file::make_folder(folder)?;
+    }
+    file::write_private(path, text.as_bytes())
+}

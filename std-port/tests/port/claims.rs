@@ -1,0 +1,126 @@
+//! Claims: a manager that takes over, one that steps down, and what is stored across starts.
+
+use std::path::Path;
+use std::sync::mpsc::Receiver;
+
+use cara_std::control::Control;
+use cara_std::{
+    Call, Claim, CommunicationSystem, Definition, Error, Parameters, ParametersView, ServiceError, ServiceOptions,
+    StartError, Unit, UnitEvent,
+};
+
+use crate::support::{PATIENCE, fleet, system, unit, until};
+
+fn manager(fleet: u32, state: &Path, takes_over: bool) -> CommunicationSystem {
+    system(fleet).control(Control::Off).take_over(takes_over).state_folder(state).build().unwrap()
+}
+
+fn vehicle(fleet: u32, state: &Path) -> Unit {
+    let agv = unit("agv", 7, fleet).state_folder(state).build().unwrap();
+    let drive = agv.my_function_list().actuator(|| ()).unwrap();
+    let options = ServiceOptions::new().moves(&drive, std::time::Duration::from_secs(1));
+    let go = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    agv.my_function_list().add_service(&Definition::parse("go()").unwrap(), options, go).unwrap();
+    agv.publish_my_function_list().unwrap();
+    agv.start().unwrap();
+    agv
+}
+
+/// Has the vehicle move, before which it stores the claim.
+fn move_it(manager: &CommunicationSystem) {
+    until("it moves", || {
+        let peer = manager.peer("agv");
+        peer.is_ok_and(|agv| agv.block_request("go", &mut Parameters::new()).is_ok())
+    });
+}
+
+/// The claim of the one that commands, of a manager that has stepped down.
+fn stepped_down(events: &Receiver<UnitEvent>) -> Claim {
+    loop {
+        if let UnitEvent::Fenced { claim } = events.recv_timeout(PATIENCE).unwrap() {
+            return claim;
+        }
+    }
+}
+
+#[test]
+fn a_manager_that_takes_over_gets_the_vehicle_and_the_other_one_steps_down() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let [here, there, board] = ["here", "there", "board"].map(|name| folder.path().join(name));
+    let first = manager(fleet, &here, false);
+    let events = first.events();
+    first.start().unwrap();
+    let agv = vehicle(fleet, &board);
+    until("it has joined the first", || first.number_of_s_units() == 1 && agv.claim() == first.claim());
+
+    let unwanted = manager(fleet, &there, false).start();
+    assert!(matches!(unwanted, Err(StartError::AlreadyRunning { .. })), "{unwanted:?}");
+    let second = manager(fleet, &there, true);
+    second.start().unwrap();
+    assert!(second.claim() > first.claim());
+    assert_eq!(stepped_down(&events), second.claim());
+    assert_eq!(first.start(), Err(Error::NotRunning.into()), "it has stopped");
+    until("it has joined the second", || second.number_of_s_units() == 1 && agv.claim() == second.claim());
+
+    // Another one within a minute is forced, or refused.
+    let hasty = manager(fleet, &here, true).start();
+    assert!(matches!(hasty, Err(StartError::JustTakenOver { .. })), "{hasty:?}");
+
+    // What was heard is stored: where no live one answers, the next start claims above it.
+    let claim = second.claim();
+    second.stop();
+    let third = manager(fleet, &here, false);
+    third.start().unwrap();
+    assert!(third.claim() > claim && third.claim().term == claim.term + 1);
+    until("it has joined the third", || third.number_of_s_units() == 1 && agv.claim() == third.claim());
+}
+
+#[test]
+fn what_a_vehicle_has_obeyed_outlives_it_and_a_lost_claim_locks_no_manager_out() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let board = folder.path().join("board");
+    let [kept, lost] = ["kept", "lost"].map(|name| folder.path().join(name));
+    let mut obeyed = Claim::NONE;
+    for life in 1..4 {
+        let manager = manager(fleet, &kept, false);
+        manager.start().unwrap();
+        let agv = vehicle(fleet, &board);
+        move_it(&manager);
+        obeyed = manager.claim();
+        assert_eq!((obeyed.term, agv.claim()), (life, obeyed));
+    }
+    let agv = vehicle(fleet, &board);
+    assert_eq!(agv.claim(), obeyed, "stored across its lives");
+    // With another folder it begins with the first term, hears of the third, and is alone.
+    let manager = manager(fleet, &lost, false);
+    manager.start().unwrap();
+    assert_eq!(manager.claim().term, 1);
+    until("it has raised its claim", || manager.claim().term == 4);
+    until("it has joined", || manager.number_of_s_units() == 1 && agv.claim() == manager.claim());
+    move_it(&manager);
+}
+
+/// It obeys the claim until its next start, and says so.
+#[test]
+fn a_vehicle_that_cannot_store_moves_all_the_same() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let file = folder.path().join("file");
+    std::fs::write(&file, "").unwrap();
+    let manager = manager(fleet, &folder.path().join("kept"), false);
+    manager.start().unwrap();
+    let agv = vehicle(fleet, &file.join("state"));
+    let events = agv.events();
+    move_it(&manager);
+    let not_kept = |event: UnitEvent| matches!(event, UnitEvent::ClaimNotKept { .. });
+    assert!(std::iter::from_fn(|| events.recv_timeout(PATIENCE).ok()).any(not_kept));
+}
+
+#[test]
+fn a_manager_that_cannot_store_its_claim_does_not_start() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let file = folder.path().join("file");
+    std::fs::write(&file, "").unwrap();
+    let manager = manager(fleet, &file.join("state"), false);
+    let error = manager.start().unwrap_err();
+    assert!(matches!(error, StartError::Claim(_)) && error.to_string().contains("CARA_STATE"), "{error}");
+}
