@@ -102,7 +102,7 @@ impl Book {
 
 impl Written {
     /// Takes a line over; a term is returned. What is no line of a book changes nothing.
-    fn take(&mut self, line: &str) -> Option<u32> {
+    fn take(&mut self, line: &str) -> Option<u64> {
         match line.split(' ').collect::<Vec<_>>()[..] {
             ["term", term] => return term.parse().ok(),
             ["grant", vehicle, at, next] => {

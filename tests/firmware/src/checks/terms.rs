@@ -27,7 +27,7 @@ pub(super) fn kept(bench: &Bench, _: u32) -> Result<String> {
 
     let manager = start(&old)?;
     let refused = manager.system.claim();
-    ensure!(obeyed.is_newer_than(refused), "{obeyed} is not newer than {refused}");
+    ensure!(obeyed > refused, "{obeyed} is not higher than {refused}");
     let _board = bench.board(&cable, &who)?;
     let ends = |event: &UnitEvent| matches!(event, UnitEvent::Joined { .. } | UnitEvent::Fenced { .. });
     let event = manager.event("answer of the board", ends)?;
@@ -36,7 +36,7 @@ pub(super) fn kept(bench: &Bench, _: u32) -> Result<String> {
 
     let manager = start(&old)?;
     let newest = manager.system.claim();
-    ensure!(newest.is_newer_than(obeyed), "{newest} is not newer than {obeyed}");
+    ensure!(newest > obeyed, "{newest} is not higher than {obeyed}");
     position(&manager.meet(&who)?)?;
     Ok(format!("term {obeyed} obeyed, {refused} refused after the restart, {newest} obeyed"))
 }
