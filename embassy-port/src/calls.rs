@@ -139,7 +139,7 @@ impl<T> Machine<T> {
         options: &RequestOptions,
         deadline: Instant,
     ) -> Result<InFlight, Error> {
-        if !self.can_wait(link) {
+        if !self.can_wait(link, function, options.priority) {
             return Err(Error::Full(Limit::Calls));
         }
         let serial = self.link(link).map_or(0, |link| link.serial);

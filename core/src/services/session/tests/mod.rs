@@ -30,6 +30,7 @@ mod pair;
 mod requests;
 mod setup;
 mod side;
+mod stops;
 #[cfg(feature = "streams")]
 mod streams;
 
