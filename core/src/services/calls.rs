@@ -103,13 +103,15 @@ pub struct CallHead {
     pub deadline: Instant,
     /// The earliest time at which the caller can have made the request: its age is counted from here.
     pub sent_at: Instant,
+    /// The caller's number of it: a call that it made later has a higher one.
+    pub number: u32,
 }
 
 /// So many requests that were given up before they arrived are remembered beside the windows.
 const UNWANTED: usize = 8;
 
 /// Bytes of a call's head in a queue.
-const HEAD_BYTES: usize = 32;
+const HEAD_BYTES: usize = 36;
 /// Where its deadline is.
 const DEADLINE: usize = 16;
 
@@ -507,16 +509,17 @@ fn encode_head(head: &CallHead, block: usize) -> [u8; HEAD_BYTES] {
     let [f0, f1, f2, f3] = [head.wants_reply, head.takes_over, head.operator, head.wants_progress].map(u8::from);
     let [d0, d1, d2, d3, d4, d5, d6, d7] = head.deadline.as_micros().to_le_bytes();
     let [m0, m1, m2, m3, m4, m5, m6, m7] = head.sent_at.as_micros().to_le_bytes();
+    let [n0, n1, n2, n3] = head.number.to_le_bytes();
     [
         l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, f0, f1, f2, f3, d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3,
-        m4, m5, m6, m7,
+        m4, m5, m6, m7, n0, n1, n2, n3,
     ]
 }
 
 fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize) {
     let [l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, wants_reply, takes_over, operator, wants_progress, rest @ ..] =
         *bytes;
-    let [d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3, m4, m5, m6, m7] = rest;
+    let [d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3, m4, m5, m6, m7, n0, n1, n2, n3] = rest;
     let head = CallHead {
         id: u32::from_le_bytes([i0, i1, i2, i3]),
         slot: Slot(u16::from_le_bytes([s0, s1])),
@@ -530,6 +533,7 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         resets: false,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
         sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
+        number: u32::from_le_bytes([n0, n1, n2, n3]),
     };
     (head, u32::from_le_bytes([l0, l1, l2, l3]) as usize)
 }

@@ -10,6 +10,16 @@ use crate::time::{Duration, Instant};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CallId(pub u32);
 
+/// The place of a call among those of its link, in the order in which they were made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Made(u32);
+
+impl Made {
+    pub(crate) const fn number(self) -> u32 {
+        self.0
+    }
+}
+
 /// A call that waits for its reply.
 #[derive(Clone, Copy, Debug)]
 pub struct Pending {
@@ -35,6 +45,8 @@ pub struct Requests<S: Storage> {
     /// Emergencies that found all of `pending` taken.
     urgent: [Option<Pending>; EMERGENCY_CALLS],
     next_id: u32,
+    /// How many calls have been made, those among them that wait until they can be sent.
+    made: u32,
     /// No call's deadline is earlier; a call that was closed may leave it too early until the next look.
     earliest: Instant,
     last_request: Option<Instant>,
@@ -48,6 +60,7 @@ impl<S: Storage> Requests<S> {
             in_flight: 0,
             urgent: [None; EMERGENCY_CALLS],
             next_id: 1,
+            made: 0,
             earliest: Instant::FAR_FUTURE,
             last_request: None,
         }
@@ -70,6 +83,22 @@ impl<S: Storage> Requests<S> {
         let id = self.next_id;
         self.next_id = id.checked_add(1)?;
         Some(CallId(id))
+    }
+
+    /// A call is made, which may wait for room before it is sent. They are no more than ids, of which the last one ends the
+    /// link.
+    pub(crate) fn make(&mut self) -> Made {
+        self.made = self.made.saturating_add(1);
+        Made(self.made)
+    }
+
+    /// The place of a call that is sent now: the one that it was given when it was made. One of an earlier link to the peer was
+    /// made before all of this one.
+    pub(crate) fn made(&mut self, earlier: Option<Made>) -> Made {
+        match earlier {
+            Some(made) if made.0 <= self.made => made,
+            _ => self.make(),
+        }
     }
 
     /// The newest id that was given; 0 before the first.

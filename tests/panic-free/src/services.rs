@@ -121,6 +121,7 @@ entry!(session_asked, {
         session.hello(),
     ));
     keep(session.version());
+    keep(self::session().make());
     keep((session.identity(), session.peer(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((
         session.their_function_list(),

@@ -34,6 +34,14 @@ impl<P: Port> Session<P> {
         let is_same = |known: &Granted| {
             known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))
         };
+        // It was overtaken on its way, in another class or on the other way: what was asked for last counts.
+        let moves_it = |slot| {
+            let function = cx.functions.function(slot);
+            slot == head.slot || function.is_some_and(|function| share_a_lease(service, Some(function.handler)))
+        };
+        if self.publishing.ordered_after(head.number).any(moves_it) {
+            return Err(Error::Replaced);
+        }
         let known = self.granted.iter().position(is_same);
         let earlier = known.and_then(|index| self.granted.get(index)).copied();
         // The safe hook of that lease is still to run, from `poll`. Granting now would let a new motion begin before it, and the hook
@@ -67,6 +75,7 @@ impl<P: Port> Session<P> {
         let (slot, generation) = (head.slot, head.generation);
         let granted = Granted { call: head.id, slot, generation, order, length, end };
         self.timers.lease = self.timers.lease.min(end);
+        self.publishing.note_order(slot, head.number);
         match known.and_then(|index| self.granted.get_mut(index)) {
             Some(known) => {
                 let replaced = core::mem::replace(known, granted).call;

@@ -559,6 +559,7 @@ impl<P: Port> Session<P> {
             resets: false,
             deadline,
             sent_at,
+            number: header.number,
         };
         Ok((head, function))
     }

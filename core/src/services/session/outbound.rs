@@ -10,7 +10,7 @@ use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
 use crate::services::heart::Renew;
-use crate::services::requests::CallId;
+use crate::services::requests::{CallId, Made};
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
@@ -43,6 +43,8 @@ pub struct RequestOptions {
     pub take_over: bool,
     /// An operator makes it, and not the unit's program: each of them holds for itself what it moves.
     pub operator: bool,
+    /// Its place among the calls of its link, where it was [made](Session::make) before it is sent; now if none.
+    pub made: Option<Made>,
     /// Tell what the call tells while it runs, if its function declares that.
     #[cfg(feature = "details")]
     pub progress: bool,
@@ -58,6 +60,7 @@ impl RequestOptions {
             renew: Renew::Never,
             take_over: false,
             operator: false,
+            made: None,
             #[cfg(feature = "details")]
             progress: false,
         }
@@ -108,6 +111,12 @@ impl<P: Port> Session<P> {
         result
     }
 
+    /// A call is made that may have to wait for room: in [`RequestOptions::made`] it keeps its place among those that move the
+    /// same thing, and is refused as [`Error::Replaced`] behind a later one.
+    pub fn make(&mut self) -> Made {
+        self.requests.make()
+    }
+
     fn try_request(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -123,6 +132,7 @@ impl<P: Port> Session<P> {
         self.check_held(held, options, slot)?;
         let id = self.take_id(cx, &checked, wants_reply)?;
         checked.header.id = id.0;
+        checked.header.number = self.requests.made(options.made).number();
         let sent = match options.delivery {
             Delivery::BestEffort if self.peer_is_live() => self.send_best_effort(cx, &checked, parameters),
             _ => self.send_reliable(cx, &checked, parameters),
@@ -190,6 +200,7 @@ impl<P: Port> Session<P> {
             remaining,
             stamp,
             since,
+            number: 0,
         };
         Ok(Checked { header, priority, length, lease: function.attributes.lease, is_urgent })
     }

@@ -26,6 +26,7 @@ mod lists;
 mod liveness;
 mod net;
 mod orders;
+mod overtaking;
 mod pair;
 mod requests;
 mod setup;

@@ -212,6 +212,7 @@ fn a_stop_below_the_window_of_its_class_is_done_and_does_not_run() {
         remaining: Duration::from_secs(1),
         stamp: pair.agv.now.as_micros(),
         since: Duration::ZERO,
+        number: 0,
     };
     pair.agv.hear_request(&header, Priority::Emergency, &[]);
     pair.settle();
