@@ -21,6 +21,7 @@ pub struct Config {
     pub(crate) access: Table,
     pub(crate) term: Term,
     pub(crate) keep_term: Option<fn(Term)>,
+    pub(crate) starts_stopped: Option<u16>,
 }
 
 /// The access table, if there is one.
@@ -51,7 +52,15 @@ impl Config {
         let (seed, udp_port) = (security.0.seed(), security.0.mode().port());
         let (fleet, epoch, constraints) = (Fleet(0), Epoch(seed), Constraints::S_UNIT);
         let node = NodeConfig { identity, fleet, epoch, target, tcp_port: 0, udp_port, constraints, seed };
-        Self { node, constraints: None, security, access: Table(None), term: Term::NONE, keep_term: None }
+        Self {
+            node,
+            constraints: None,
+            security,
+            access: Table(None),
+            term: Term::NONE,
+            keep_term: None,
+            starts_stopped: None,
+        }
     }
 
     /// Units of different fleets on one network do not meet; 0 unless set.
@@ -108,6 +117,13 @@ impl Config {
     /// An m_unit says `kept`, which its program has claimed and kept before; `keep` is not called.
     pub fn term(mut self, kept: Term, keep: fn(Term)) -> Self {
         (self.term, self.keep_term) = (kept, Some(keep));
+        self
+    }
+
+    /// All that the unit moves starts stopped, for this reason ([`Error::Inhibited`]), until a service resets it: for a board that has
+    /// kept that it was stopped, or that cannot keep it.
+    pub fn starts_stopped(mut self, reason: u16) -> Self {
+        self.starts_stopped = Some(reason);
         self
     }
 

@@ -13,6 +13,7 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
 use cara_core::services::CallHead;
 use cara_core::services::hub::Hub;
+use cara_core::services::lease::Latch;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::session::{Publication, SessionStorage};
@@ -251,6 +252,13 @@ impl<
         let (port, tcp_port) = (config.node.udp_port, config.node.tcp_port);
         let mut node = Node::new(now(), config.node, storage);
         node.set_term(config.term);
+        let functions = FunctionList::new(
+            self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
+            self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
+        );
+        if let Some(reason) = config.starts_stopped {
+            functions.stopped().inhibit(now(), Latch { by: 0, reason });
+        }
         let pool = self.pool.write([const { None }; BUFFERS]);
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
@@ -267,10 +275,7 @@ impl<
                 proof: config.security.0,
                 access: config.access,
                 keep_term: config.keep_term,
-                functions: FunctionList::new(
-                    self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
-                    self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
-                ),
+                functions,
                 pool: Pool::new(&mut pool[..]),
                 links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
                 mail: EmbassyMailman {

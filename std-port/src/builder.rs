@@ -65,6 +65,7 @@ pub struct Builder<T, R> {
     asks_for_itself: bool,
     state_folder: Option<PathBuf>,
     takes_over: bool,
+    starts_stopped: Option<u16>,
     state: T,
     role: PhantomData<fn() -> R>,
 }
@@ -112,6 +113,7 @@ impl<R> Builder<(), R> {
             asks_for_itself: true,
             state_folder: crate::terms::folder(),
             takes_over: false,
+            starts_stopped: None,
             state: (),
             role: PhantomData,
         }
@@ -228,11 +230,18 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
-    /// The folder in which the unit keeps its [term](crate::Term), made if it is not there; what `CARA_STATE` names unless set, or
+    /// The folder in which the unit keeps its [term](crate::Term) and whether it is stopped, made if it is not there; what `CARA_STATE` names unless set, or
     /// systemd's `STATE_DIRECTORY`. Without one, an m_unit begins with the first term again, and an s_unit forgets with its end
     /// which managers it has to refuse.
     pub fn state_folder(mut self, folder: impl Into<PathBuf>) -> Self {
         self.state_folder = Some(folder.into());
+        self
+    }
+
+    /// All that the unit moves starts stopped, for this reason ([`Error::Inhibited`](crate::Error::Inhibited)), until a service
+    /// resets it: for one without a folder of state. With one it starts stopped where it was stopped when it ended.
+    pub fn starts_stopped(mut self, reason: u16) -> Self {
+        self.starts_stopped = Some(reason);
         self
     }
 
@@ -273,6 +282,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
             takes_over: self.takes_over,
+            starts_stopped: self.starts_stopped,
             state,
             role: PhantomData,
         }
@@ -359,6 +369,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
             takes_over: self.takes_over,
+            starts_stopped: self.starts_stopped,
             #[cfg(feature = "control")]
             audit: self.audit,
         };

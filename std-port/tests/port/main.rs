@@ -18,6 +18,7 @@ mod in_use;
 mod junk;
 #[path = "../keyed/mod.rs"]
 mod keyed;
+mod latches;
 mod leases;
 mod many;
 mod members;

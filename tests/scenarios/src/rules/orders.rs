@@ -1,5 +1,6 @@
 //! A lease belongs to one call: what is not waited for stops, and an older call never moves again.
 
+use cara_core::config::Priority;
 use cara_core::error::Error;
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
@@ -14,6 +15,7 @@ scenarios![
     a_released_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
     a_call_made_earlier_never_replaces_a_later_one: "order of calls", Own, [Freeze], ["overtaken"];
     a_call_that_waits_keeps_its_place: "order of calls", Light, [], ["waited"];
+    a_stop_of_all_outlasts_every_change_of_the_list: "latch", Light, [], ["stopped"];
     a_replaced_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
 ];
 
@@ -62,6 +64,40 @@ fn a_call_that_waits_keeps_its_place(world: &mut dyn World) {
     assert!(agv.lease_is_live("drive") && log.values().last() != Some(&1), "{asked:?}{}", world.story());
     manager.release("agv", "drive").expect("it is connected");
     world.wait("the safe hook runs", || !log.stops().is_empty(), secs(20));
+}
+
+/// A service that is replaced, one that is added, and one that is removed and added again.
+fn a_stop_of_all_outlasts_every_change_of_the_list(world: &mut dyn World) {
+    let leased = |name: &str| Service::numbered(name).lease(secs(60));
+    let (drive, halt) = (leased("drive"), Service::numbered("halt").priority(Priority::Emergency).stops_all());
+    let manager = world.add(Spec::manager("manager", 1));
+    let free = Service::numbered("free").resets_all();
+    let agv = world.add(Spec::agv("agv", 7).service(&drive).service(&halt).service(&free));
+    met(world, &manager, "agv", "free");
+    met(world, &manager, "agv", "drive");
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    assert_eq!(world.ask(&manager, "agv", "halt", &mut number("n", 1)), Ok(()));
+    let stopped = Err(Error::Inhibited { by: 1, reason: 0 });
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 2)), stopped);
+    let (drive, lift, tilt) = (leased("drive"), leased("lift"), leased("tilt"));
+    agv.add_service(&tilt).expect("there is room");
+    agv.remove_service("tilt").expect("it is there");
+    agv.replace_service(&drive).expect("it is there");
+    agv.add_service(&lift).expect("there is room");
+    agv.add_service(&tilt).expect("there is room");
+    agv.publish().expect("it can be published");
+    met(world, &manager, "agv", "lift");
+    met(world, &manager, "agv", "tilt");
+    world.run_for(secs(1));
+    for function in ["drive", "lift", "tilt"] {
+        assert_eq!(world.ask(&manager, "agv", function, &mut number("n", 3)), stopped, "{function}");
+    }
+    world.reached("stopped");
+    assert_eq!(world.ask(&manager, "agv", "free", &mut number("n", 1)), Ok(()));
+    for function in ["drive", "lift", "tilt"] {
+        assert_eq!(world.ask(&manager, "agv", function, &mut number("n", 4)), Ok(()), "{function}");
+    }
+    assert_eq!([&drive, &lift, &tilt].map(|service| service.log().runs()), [1; 3]);
 }
 
 /// Moves once a second while it is wanted. Its lease is longer than any wait here, so that time alone ends nothing.

@@ -19,6 +19,7 @@ mod gathering;
 mod hearts;
 mod hello;
 mod hostile;
+mod latches;
 mod leases;
 mod limits;
 mod lines;
