@@ -451,7 +451,8 @@ fn session_bodies() -> Vec<Vector> {
             &emergency,
             &json!({ "message": { "priority": "emergency", "message": { "request": {
                 "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "wants_progress": false, "takes_over": false, "operator": false,
-                "unknown": 0, "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
+                "unknown": 0, "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "number": 0x0506_0708,
+                "block": "",
             }}}}),
         ),
     ]
