@@ -50,6 +50,9 @@ pub const CHUNK_BYTES: usize = 4096;
 pub const MINIMUM_CHUNK_BYTES: usize = 320;
 /// Longest emergency message, in bytes: fits one chunk and one datagram. Each link reserves room for one.
 pub const EMERGENCY_BYTES: usize = 256;
+/// Calls of emergency services, or of those that stop, that may be in flight to a peer when its table of calls is full; one
+/// more is refused as [`Calls`](crate::error::Limit::Calls). Costs 24 bytes each per link.
+pub const EMERGENCY_CALLS: usize = 8;
 /// Longest message of best-effort delivery, in bytes: one UDP datagram that is not fragmented on Ethernet.
 pub const DATAGRAM_BYTES: usize = 1400;
 /// The buffer that each link owns: partial frames and handshakes up to this length need no buffer of the pool.

@@ -416,6 +416,10 @@ pub enum Error {
         /// Why, as the callee numbers its reasons; 0 for a function that stops.
         reason: u16,
     },
+    /// The callee has begun a later call of this unit that moves the same thing, so it did not run this one: what was asked for
+    /// last counts.
+    #[error("a later call of this unit has what this function moves: if it is still wanted, call it again")]
+    Replaced,
     /// The callee's rules do not let this unit call the function.
     #[error(
         "the peer's access table does not let this unit call the function: change the table, or ask with another unit"
@@ -498,6 +502,7 @@ impl Error {
             | Self::Unsupported
             | Self::Held { .. }
             | Self::Inhibited { .. }
+            | Self::Replaced
             | Self::NotAllowed
             | Self::Service(_)
             | Self::Refused(_) => Cause::Peer,

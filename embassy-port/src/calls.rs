@@ -69,6 +69,10 @@ impl<T> Peer<T> {
         options: &RequestOptions,
         deadline: Instant,
     ) -> Result<Hold<T>, Error> {
+        // It keeps its place among the calls that move the same thing, however long it waits for room.
+        let link = self.link()?;
+        let made = self.unit.act(|machine| machine.with(link, |session, _| session.make()));
+        let options = &RequestOptions { made, ..*options };
         loop {
             let again = match self.try_begin(function, parameters, options, deadline) {
                 Ok(call) => return Ok(Hold { unit: self.unit, call, is_wanted: false }),
@@ -139,7 +143,7 @@ impl<T> Machine<T> {
         options: &RequestOptions,
         deadline: Instant,
     ) -> Result<InFlight, Error> {
-        if !self.can_wait(link) {
+        if !self.can_wait(link, function, options.priority) {
             return Err(Error::Full(Limit::Calls));
         }
         let serial = self.link(link).map_or(0, |link| link.serial);

@@ -23,6 +23,7 @@ pub struct Config {
     pub(crate) store_own: Option<fn(Claim) -> bool>,
     pub(crate) obeyed: StoredClaim,
     pub(crate) store: Option<fn(&StoredClaim) -> bool>,
+    pub(crate) starts_stopped: Option<u16>,
 }
 
 /// The access table, if there is one.
@@ -55,7 +56,7 @@ impl Config {
         let node = NodeConfig { identity, fleet, epoch, target, tcp_port: 0, udp_port, constraints, seed };
         let (claim, obeyed) = (Claim::NONE, StoredClaim::default());
         let access = Table(None);
-        Self { node, constraints: None, security, access, claim, store_own: None, obeyed, store: None }
+        Self { node, constraints: None, security, access, claim, store_own: None, obeyed, store: None, starts_stopped: None }
     }
 
     /// The manager of an s_unit.
@@ -126,6 +127,13 @@ impl Config {
     /// returns whether it is stored. Without this an m_unit begins with the first term in each life.
     pub fn claim(mut self, claim: Claim, store: fn(Claim) -> bool) -> Self {
         (self.claim, self.store_own) = (claim, Some(store));
+        self
+    }
+
+    /// All that the unit moves starts stopped, for this reason ([`Error::Inhibited`]), until a service resets it: for a board that has
+    /// kept that it was stopped, or that cannot keep it.
+    pub fn starts_stopped(mut self, reason: u16) -> Self {
+        self.starts_stopped = Some(reason);
         self
     }
 

@@ -29,6 +29,8 @@ use crate::security::{LinkCipher, Proof};
 use crate::taken::TaskSlot;
 use crate::time::now;
 
+/// Emergencies that tasks may wait for on a link whose calls are all in flight.
+pub(crate) const EMERGENCIES: usize = 2;
 /// Tasks that can wait for the same thing without waking each other.
 const TASKS_WAITING: usize = 4;
 
@@ -61,13 +63,16 @@ pub(crate) struct Link {
     /// When it was opened.
     pub(crate) since: Instant,
     pub(crate) waiters: &'static mut [Option<Waiter>],
+    /// Places of emergencies, where the others are taken.
+    pub(crate) urgent: [Option<Waiter>; EMERGENCIES],
     /// The serial of the list that was last sent to the peer, for tasks that wait until it is read.
     pub(crate) told: Option<u32>,
 }
 
 impl Link {
     pub(crate) fn new(storage: SessionStorage<Lent>, waiters: &'static mut [Option<Waiter>]) -> Self {
-        Self { session: None, storage: Some(storage), serial: 0, since: Instant::START, waiters, told: None }
+        let urgent = [const { None }; EMERGENCIES];
+        Self { session: None, storage: Some(storage), serial: 0, since: Instant::START, waiters, urgent, told: None }
     }
 
     /// The peer, from joining to leaving.

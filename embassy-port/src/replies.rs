@@ -5,6 +5,7 @@
 
 use core::task::Waker;
 
+use cara_core::config::Priority;
 use cara_core::distribution::block;
 #[cfg(feature = "details")]
 use cara_core::distribution::failure::Failure;
@@ -105,15 +106,25 @@ impl ReplyBox {
 }
 
 impl Link {
+    /// The places of calls that tasks wait for.
+    fn places(&mut self) -> impl Iterator<Item = &mut Option<Waiter>> {
+        self.waiters.iter_mut().chain(&mut self.urgent)
+    }
+
+    /// The calls that tasks wait for.
+    fn waiting(&self) -> impl Iterator<Item = &Waiter> {
+        self.waiters.iter().chain(&self.urgent).flatten()
+    }
+
     /// Whether a task waits for a reply on this link.
     pub(crate) fn awaits_reply(&self) -> bool {
-        self.waiters.iter().flatten().any(|waiter| waiter.call.serial == self.serial && waiter.outcome.is_none())
+        self.waiting().any(|waiter| waiter.call.serial == self.serial && waiter.outcome.is_none())
     }
 
     /// Ends all calls of the link that have not ended.
     pub(crate) fn interrupt(&mut self) {
         let serial = self.serial;
-        for waiter in self.waiters.iter_mut().flatten().filter(|waiter| waiter.call.serial == serial) {
+        for waiter in self.places().flatten().filter(|waiter| waiter.call.serial == serial) {
             waiter.end(Err(Error::Interrupted));
         }
     }
@@ -139,7 +150,7 @@ impl Waiter {
 pub(crate) fn told(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: &[u8]) {
     let Event::Progress(id, values) = event else { return };
     let (serial, session) = (link.serial, &link.session);
-    let mut waiting = link.waiters.iter_mut().flatten();
+    let mut waiting = link.waiters.iter_mut().chain(&mut link.urgent).flatten();
     let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == *id) else { return };
     if let Some(Ok(block)) = session.as_ref().map(|session| session.progress_values(values, lent)) {
         reply.tell(waiter.call, block.bytes());
@@ -161,7 +172,7 @@ pub(crate) fn ended(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: 
     #[cfg(feature = "details")]
     let failure = outcome.is_err().then(|| link.session.as_mut()?.failure(lent)).flatten();
     let (serial, session) = (link.serial, &link.session);
-    let mut waiting = link.waiters.iter_mut().flatten();
+    let mut waiting = link.waiters.iter_mut().chain(&mut link.urgent).flatten();
     if let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == *id) {
         let session = session.as_ref().ok_or(Error::ResultLost);
         let results = outcome.and_then(|results| session?.results(&results, lent));
@@ -174,14 +185,20 @@ pub(crate) fn ended(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: 
 }
 
 impl<T> Machine<T> {
-    /// A place for a call that is about to be made; `None` when as many are in flight as may be.
-    pub(crate) fn can_wait(&self, link: u16) -> bool {
-        self.link(link).is_some_and(|link| link.waiters.iter().any(Option::is_none))
+    /// Whether there is a place for a call that is about to be made; an emergency has some where the others are taken.
+    pub(crate) fn can_wait(&self, link: u16, function: &str, class: Option<Priority>) -> bool {
+        let Some(link) = self.link(link) else { return false };
+        let is_urgent = || {
+            let function = link.session.as_ref().and_then(|session| session.their_function_list().named(function));
+            let attributes = function.map(|function| function.attributes);
+            attributes.is_some_and(|attributes| attributes.is_urgent(class.unwrap_or(attributes.priority)))
+        };
+        link.waiters.iter().any(Option::is_none) || link.urgent.iter().any(Option::is_none) && is_urgent()
     }
 
     pub(crate) fn wait(&mut self, call: InFlight) {
         let link = self.link_mut(call.link);
-        if let Some(place) = link.and_then(|link| link.waiters.iter_mut().find(|place| place.is_none())) {
+        if let Some(place) = link.and_then(|link| link.places().find(|place| place.is_none())) {
             *place = Some(Waiter { call, waker: None, outcome: None });
         }
     }
@@ -194,7 +211,7 @@ impl<T> Machine<T> {
         waker: &Waker,
     ) -> Option<Result<(), Error>> {
         let link = self.links.get_mut(usize::from(call.link))?;
-        let place = link.waiters.iter_mut().find(|place| place.as_ref().is_some_and(|waiter| waiter.call == *call));
+        let place = link.places().find(|place| place.as_ref().is_some_and(|waiter| waiter.call == *call));
         let Some(place) = place else { return Some(Err(Error::Interrupted)) };
         let waiter = place.as_mut()?;
         let Some(outcome) = waiter.outcome else {
@@ -219,7 +236,7 @@ impl<T> Machine<T> {
         let Self { links, reply, .. } = self;
         let goes_on = |waiter: &Waiter| waiter.call == *call && waiter.outcome.is_none();
         let link = links.get(usize::from(call.link));
-        let goes_on = link.is_some_and(|link| link.waiters.iter().flatten().any(goes_on));
+        let goes_on = link.is_some_and(|link| link.waiting().any(goes_on));
         let (told, called) = (reply.take_told(call), called(links, call).filter(|_| goes_on));
         told.zip(called).is_some_and(|(bytes, called)| block::read(called.progress(), bytes, values).is_ok())
     }
@@ -227,7 +244,7 @@ impl<T> Machine<T> {
     /// Nothing waits for a call any more, and what it started is not wanted.
     pub(crate) fn give_up(&mut self, call: &InFlight) {
         let Some(link) = self.links.get_mut(usize::from(call.link)) else { return };
-        for place in link.waiters.iter_mut() {
+        for place in link.places() {
             place.take_if(|waiter| waiter.call == *call);
         }
         if link.serial == call.serial {
@@ -242,7 +259,7 @@ impl<T> Machine<T> {
         let Some((call, _)) = self.reply.held.filter(|(call, _)| call.deadline <= now) else { return };
         self.reply.held = None;
         let link = self.links.get_mut(usize::from(call.link));
-        let mut waiters = link.into_iter().flat_map(|link| link.waiters.iter_mut().flatten());
+        let mut waiters = link.into_iter().flat_map(|link| link.places().flatten());
         if let Some(waiter) = waiters.find(|waiter| waiter.call == call) {
             waiter.outcome = Some(Err(Error::TimedOut));
         }

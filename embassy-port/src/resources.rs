@@ -15,6 +15,7 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
 use cara_core::services::CallHead;
 use cara_core::services::hub::Hub;
+use cara_core::services::lease::Latch;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::session::{Publication, SessionStorage};
@@ -264,6 +265,13 @@ impl<
             }
             node.store_claims();
         }
+        let functions = FunctionList::new(
+            self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
+            self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
+        );
+        if let Some(reason) = config.starts_stopped {
+            functions.stopped().inhibit(now(), Latch { by: 0, reason });
+        }
         let pool = self.pool.write([const { None }; BUFFERS]);
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
@@ -282,10 +290,7 @@ impl<
                 store_own: config.store_own,
                 store: config.store,
                 unstored: None,
-                functions: FunctionList::new(
-                    self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
-                    self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
-                ),
+                functions,
                 pool: Pool::new(&mut pool[..]),
                 links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
                 mail: EmbassyMailman {

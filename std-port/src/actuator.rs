@@ -42,8 +42,18 @@ pub struct Actuator {
     pub(crate) lease: Arc<ServiceLease>,
     pub(crate) safe: Arc<SafeHook>,
     pub(crate) clock: Clock,
-    /// Lets the unit look at the orders of all its links.
-    pub(crate) look: Arc<dyn Fn() + Send + Sync>,
+    /// Lets the unit look at what a stop, or a reset, has changed.
+    pub(crate) look: Arc<dyn Fn(Change) + Send + Sync>,
+}
+
+/// What happened to an actuator's latch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Change {
+    Stopped,
+    /// By a call, which does the same for the unit.
+    Reset,
+    /// By the unit's own program.
+    ResetHere,
 }
 
 impl Actuator {
@@ -70,13 +80,19 @@ impl Actuator {
     pub(crate) fn inhibit_at(&self, now: Instant, latch: Latch) {
         self.safe.inhibit(now, latch);
         self.lease.wake();
-        (self.look)();
+        (self.look)(Change::Stopped);
     }
 
     /// Lets it move again.
     pub fn reset(&self) {
         let now = self.clock.now();
         self.safe.reset(now, now);
+        (self.look)(Change::ResetHere);
+    }
+
+    pub(crate) fn reset_at(&self, now: Instant, made: Instant) {
+        self.safe.reset(now, made);
+        (self.look)(Change::Reset);
     }
 
     /// What inhibits it.

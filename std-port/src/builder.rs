@@ -66,6 +66,7 @@ pub struct Builder<T, R> {
     asks_for_itself: bool,
     state_folder: Option<PathBuf>,
     take_over: TakeOver,
+    starts_stopped: Option<u16>,
     state: T,
     role: PhantomData<fn() -> R>,
 }
@@ -113,6 +114,7 @@ impl<R> Builder<(), R> {
             asks_for_itself: true,
             state_folder: crate::claims::folder(),
             take_over: TakeOver::No,
+            starts_stopped: None,
             state: (),
             role: PhantomData,
         }
@@ -235,11 +237,18 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
-    /// The folder in which the unit stores its [claims](crate::Claim), made if it is not there; what `CARA_STATE` names unless set,
+    /// The folder in which the unit stores its [claims](crate::Claim) and whether it is stopped, made if it is not there; what `CARA_STATE` names unless set,
     /// or systemd's `STATE_DIRECTORY`. Without one, an m_unit begins with the first term again, and an s_unit forgets with its end
     /// which managers it has to refuse. A unit in plain mode stores nothing that it obeys.
     pub fn state_folder(mut self, folder: impl Into<PathBuf>) -> Self {
         self.state_folder = Some(folder.into());
+        self
+    }
+
+    /// All that the unit moves starts stopped, for this reason ([`Error::Inhibited`](crate::Error::Inhibited)), until a service
+    /// resets it: for one without a folder of state. With one it starts stopped where it was stopped when it ended.
+    pub fn starts_stopped(mut self, reason: u16) -> Self {
+        self.starts_stopped = Some(reason);
         self
     }
 
@@ -280,6 +289,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
             take_over: self.take_over,
+            starts_stopped: self.starts_stopped,
             state,
             role: PhantomData,
         }
@@ -366,6 +376,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
             take_over: self.take_over,
+            starts_stopped: self.starts_stopped,
             #[cfg(feature = "control")]
             audit: self.audit,
         };

@@ -199,7 +199,7 @@ impl<T: 'static> Service for Handler<T> {
 
     fn reset(&self, now: Instant, made: Instant) {
         if let Some(actuator) = &self.actuator {
-            actuator.safe.reset(now, made);
+            actuator.reset_at(now, made);
         }
     }
 

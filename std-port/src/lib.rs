@@ -43,6 +43,7 @@ mod handler;
 mod heart;
 mod interfaces;
 pub mod keys;
+mod latch;
 mod lease;
 mod locks;
 #[cfg(feature = "metrics")]

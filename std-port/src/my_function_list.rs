@@ -159,7 +159,8 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let late = self.engine.hooks_late();
         let safe = Arc::new(SafeHook::start(Parts { lease: lease.clone(), clock, hook, then, late })?);
         let engine = Arc::downgrade(self.engine);
-        let look = Arc::new(move || engine.upgrade().into_iter().for_each(|engine| engine.look_at_orders()));
+        self.engine.keep_latch()?;
+        let look = Arc::new(move |change| engine.upgrade().into_iter().for_each(|engine| engine.latch_changed(change)));
         Ok(Actuator { lease, safe, clock, look })
     }
 

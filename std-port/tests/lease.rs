@@ -9,11 +9,18 @@
 extern crate self as core;
 use std::*;
 
+#[allow(dead_code, unreachable_pub, reason = "the file is included for the type it defines")]
+#[path = "../../core/src/distribution/latch.rs"]
+mod latch;
 #[allow(dead_code, unused_imports, unreachable_pub, reason = "the file is included for the type it defines")]
 #[path = "../../core/src/services/lease.rs"]
 mod lease;
 
-use cara_core::{config, distribution, error, time};
+use cara_core::{config, error, time};
+mod distribution {
+    pub(crate) use crate::latch;
+    pub(crate) use cara_core::distribution::*;
+}
 mod services {
     pub(crate) use cara_core::services::{heart, requests};
 }

@@ -300,7 +300,7 @@ class Unit:
         self.stamp = None
         self.hear_stamp(self.peer["stamp"])
         self.windows = {priority: wire.Window() for priority in wire.PRIORITIES}
-        self.lease, self.renewals = None, 0
+        self.lease, self.renewals, self.newest_order = None, 0, 0
         self.theirs, self.not_kept = {}, 0
         self.waiting, self.held = {}, {}
         self.datagrams_pass, self.missed, self.next_question = False, 0, 0
@@ -547,7 +547,7 @@ class Unit:
             }
         request = {"request": {
             "id": number, "slot": theirs["slot"], "generation": theirs["generation"], "wants_reply": True, "unknown": 0,
-            "remaining": int(REPLY_WITHIN * 1e6), "stamp": self.stamp, "since": clock() - self.heard_at,
+            "remaining": int(REPLY_WITHIN * 1e6), "stamp": self.stamp, "since": clock() - self.heard_at, "number": number,
             "block": wire.encode_block(values, theirs["signature"]["arguments"]).hex(),
         }}
         if priority == "emergency":
@@ -626,6 +626,9 @@ class Unit:
         function = self.functions[request["slot"]]
         signature = function.signature
         arguments = wire.decode_block(bytes.fromhex(request["block"]), signature["arguments"])
+        # It was overtaken on its way.
+        if function.lease and request["number"] < self.newest_order:
+            raise Refused("replaced")
         if function.lease and self.lease is not None:
             # An operator and the program of the peer hold for themselves.
             operator = self.lease["operator"]
@@ -635,6 +638,7 @@ class Unit:
         say("run", signature["name"], arguments)
         if function.lease:
             end = made(request) + function.lease
+            self.newest_order = max(self.newest_order, request["number"])
             self.lease = {
                 "slot": request["slot"], "call": request["id"], "end": end, "length": function.lease,
                 "operator": request["operator"],

@@ -383,7 +383,7 @@ ERRORS = {
     4: ("wrong_type", ("index",)), 5: ("wrong_size", ("index", "expected", "found")), 6: ("expired", ()),
     7: ("stale", ()), 8: ("busy", ()), 9: ("malformed", ()), 10: ("not_allowed", ()), 11: ("would_deadlock", ()),
     12: ("too_large", ("limit",)), 13: ("too_soon", ("wait",)), 14: ("result_would_not_fit", ("need", "have")),
-    15: ("result_lost", ()), 16: ("unsupported", ()), 17: ("held", ("by", "operator")), 18: ("inhibited", ("by", "reason")),
+    15: ("result_lost", ()), 16: ("unsupported", ()), 17: ("held", ("by", "operator")), 18: ("inhibited", ("by", "reason")), 19: ("replaced", ()),
     20: ("service_failed", ("code",)), 21: ("service_panicked", ()), 22: ("service_not_ready", ()),
     23: ("service_bad_results", ()),
 }
@@ -436,7 +436,7 @@ def encode_message(message):
     if name == "request":
         flags = value["unknown"] | (1 if value["wants_reply"] else 0) | (16 if value.get("takes_over") else 0)
         flags |= (2 if value.get("wants_progress") else 0) | (4 if value.get("operator") else 0)
-        numbers = (value["id"], value["remaining"], value["stamp"], value["since"], 0)
+        numbers = (value["id"], value["remaining"], value["stamp"], value["since"], value["number"])
         place = (value["slot"], value["generation"], REQUEST_BYTES // 4, 0)
         return struct.pack("<BBHHBBIIQII", 1, flags, *place, *numbers) + bytes.fromhex(value["block"])
     if name in ("reply", "failure"):
@@ -458,12 +458,13 @@ def behind_header(reader, words, least):
 
 def read_request(reader):
     form = "BBHHBBIIQII"
-    _, flags, slot, generation, words, _, number, remaining, stamp, since, _ = reader.fixed(form)
+    _, flags, slot, generation, words, _, number, remaining, stamp, since, made = reader.fixed(form)
     return {
         "id": number, "slot": slot, "generation": generation, "wants_reply": flags & 1 == 1,
         "wants_progress": flags & 2 != 0,
         "takes_over": flags & 0x10 != 0, "operator": flags & 4 != 0, "unknown": flags & 0xE0,
-        "remaining": remaining, "stamp": stamp, "since": since, "block": behind_header(reader, words, REQUEST_BYTES),
+        "remaining": remaining, "stamp": stamp, "since": since, "number": made,
+        "block": behind_header(reader, words, REQUEST_BYTES),
     }
 
 

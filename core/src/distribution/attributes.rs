@@ -50,6 +50,12 @@ impl Attributes {
     #[cfg(feature = "streams")]
     const STREAM: u8 = 1 << 5;
 
+    /// Whether a call in this class has a place where other calls find none: it stops, or is an emergency of an emergency
+    /// service.
+    pub fn is_urgent(&self, class: Priority) -> bool {
+        self.stop || class == Priority::Emergency && self.priority == Priority::Emergency
+    }
+
     /// Bits 0 and 1: priority; bits 2 to 5: idempotent, stop, reset, stream; actuator, u8; of a stream the least interval in
     /// milliseconds, u16 little-endian, otherwise zero; the lease in milliseconds, u32 little-endian, 0 for none. A lease is rounded down, but never to none.
     pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {

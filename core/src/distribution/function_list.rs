@@ -5,7 +5,8 @@
 
 use core::fmt;
 
-use super::function::{Definition, Signature};
+use super::function::Signature;
+use super::latch::LatchWord;
 use super::table::Table;
 #[cfg(feature = "streams")]
 pub(crate) use super::table::Wish;
@@ -25,33 +26,34 @@ use super::attributes::Attributes;
 /// use cara_core::storage::Lent;
 ///
 /// // A port lends room for 4 functions in 256 bytes of signatures.
-/// let entries: &'static mut [_] = Box::leak(Box::new([const { Entry::<fn()>::empty() }; 4]));
+/// let entries: &'static mut [_] = Box::leak(Box::new([const { Entry::<()>::empty() }; 4]));
 /// let bytes: &'static mut [u8] = Box::leak(Box::new([0; 256]));
-/// let mut list: FunctionList<Lent, fn()> = FunctionList::new(entries, bytes);
+/// let mut list: FunctionList<Lent, ()> = FunctionList::new(entries, bytes);
 ///
 /// let call_mechanic = Definition::parse("call_mechanic(code: int) -> (minutes: int)").unwrap();
-/// list.add_function(&call_mechanic, Attributes::default(), || ())?;
+/// list.add_function(&call_mechanic, Attributes::default(), ())?;
 /// assert_eq!(list.show_functions().to_string(), "call_mechanic(code: int) -> (minutes: int)\n");
 /// # Ok::<(), cara_core::error::Error>(())
 /// ```
 #[doc(alias = "Function_list")]
 pub struct FunctionList<S: Storage, H: 'static> {
     table: Table<S, H>,
+    /// Closed by a stop of all, and by the removal of what was latched: what is added later begins with it.
+    stopped: LatchWord,
 }
 
 impl<S: Storage, H: 'static> FunctionList<S, H> {
     /// An empty list with room for as many functions as there are entries, and for `bytes` of signatures.
     pub fn new(entries: S::Slice<Entry<H>>, bytes: S::Slice<u8>) -> Self {
-        Self { table: Table::new(entries, bytes) }
+        Self { table: Table::new(entries, bytes), stopped: LatchWord::new() }
     }
 
-    /// Adds a function; [`Error::NameTaken`] or [`Error::Full`] leave the list unchanged.
-    pub fn add_function(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
-        self.add_signature(definition.signature(), attributes, handler)
+    /// The unit's own latch.
+    pub const fn stopped(&self) -> &LatchWord {
+        &self.stopped
     }
 
-    /// As [`add_function`](Self::add_function), by a signature.
-    pub fn add_signature(
+    pub(crate) fn insert(
         &mut self,
         signature: Signature<'_>,
         attributes: Attributes,
@@ -66,27 +68,14 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         Ok(slot)
     }
 
-    /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`].
-    pub fn remove(&mut self, name: &str) -> Result<(Slot, H), Error> {
+    pub(crate) fn take(&mut self, name: &str) -> Result<(Slot, H), Error> {
         let index = self.table.find(name).ok_or(Error::UnknownFunction)?;
         let stored = self.table.take(index).ok_or(Error::UnknownFunction)?;
         self.table.bump(index);
         Ok((stored.slot, stored.handler))
     }
 
-    /// Puts another function in the place of the one of its name; [`Error::UnknownFunction`] or [`Error::Full`] leave
-    /// the list unchanged.
-    pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
-        self.replace_signature(definition.signature(), attributes, handler)
-    }
-
-    /// As [`replace`](Self::replace), by a signature.
-    pub fn replace_signature(
-        &mut self,
-        signature: Signature<'_>,
-        attributes: Attributes,
-        handler: H,
-    ) -> Result<Slot, Error> {
+    pub(crate) fn swap(&mut self, signature: Signature<'_>, attributes: Attributes, handler: H) -> Result<Slot, Error> {
         let index = self.table.find(signature.name()).ok_or(Error::UnknownFunction)?;
         let freed = self.table.function(index).map_or(0, |old| old.signature.as_bytes().len());
         if signature.as_bytes().len() > self.table.free_bytes().saturating_add(freed) {
@@ -132,6 +121,11 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
     /// The functions by slot.
     pub fn iter(&self) -> impl Iterator<Item = Function<'_, H>> + Clone {
         self.table.iter()
+    }
+
+    /// How many places there are, empty ones included.
+    pub fn places(&self) -> u16 {
+        u16::try_from(self.table.entries.len()).unwrap_or(u16::MAX)
     }
 
     /// Number of functions.

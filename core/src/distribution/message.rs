@@ -161,6 +161,8 @@ pub struct RequestHeader {
     pub stamp: u64,
     /// Time since the caller heard it, saturating.
     pub since: Duration,
+    /// The call's place among those that its caller has made on this link: a later one has a higher number.
+    pub number: u32,
 }
 
 impl RequestHeader {
@@ -179,6 +181,7 @@ impl RequestHeader {
         let [r0, r1, r2, r3] = self.remaining.as_wire().to_le_bytes();
         let [t0, t1, t2, t3, t4, t5, t6, t7] = self.stamp.to_le_bytes();
         let [e0, e1, e2, e3] = self.since.as_wire().to_le_bytes();
+        let [n0, n1, n2, n3] = self.number.to_le_bytes();
         with_more([
             REQUEST,
             flags,
@@ -208,17 +211,17 @@ impl RequestHeader {
             e1,
             e2,
             e3,
-            0,
-            0,
-            0,
-            0,
+            n0,
+            n1,
+            n2,
+            n3,
         ])
     }
 
     #[inline]
     fn decode(bytes: &[u8; LEAST_REQUEST_BYTES]) -> Self {
         let [_, flags, s0, s1, g0, g1, _, _, i0, i1, i2, i3, r0, r1, r2, r3, rest @ ..] = bytes;
-        let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, ..] = rest;
+        let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, n0, n1, n2, n3] = rest;
         Self {
             id: u32::from_le_bytes([*i0, *i1, *i2, *i3]),
             slot: Slot(u16::from_le_bytes([*s0, *s1])),
@@ -231,6 +234,7 @@ impl RequestHeader {
             remaining: micros([*r0, *r1, *r2, *r3]),
             stamp: u64::from_le_bytes([*t0, *t1, *t2, *t3, *t4, *t5, *t6, *t7]),
             since: micros([*e0, *e1, *e2, *e3]),
+            number: u32::from_le_bytes([*n0, *n1, *n2, *n3]),
         }
     }
 }
@@ -383,6 +387,7 @@ fn error_code(error: Error) -> (u8, u8, u32, u32) {
         Error::Unsupported => (16, 0, 0, 0),
         Error::Held { by, operator } => (17, 0, by, operator.into()),
         Error::Inhibited { by, reason } => (18, 0, by, reason.into()),
+        Error::Replaced => (19, 0, 0, 0),
         Error::Service(ServiceError::Failed(code)) => (SERVICE_FAILED, 0, u32::from(code), 0),
         Error::Service(ServiceError::Panicked) => (21, 0, 0, 0),
         Error::Service(ServiceError::NotReady) => (22, 0, 0, 0),
@@ -411,6 +416,7 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
         16 => Error::Unsupported,
         17 => Error::Held { by: first, operator: second & 1 != 0 },
         18 => Error::Inhibited { by: first, reason: second as u16 },
+        19 => Error::Replaced,
         SERVICE_FAILED => Error::Service(ServiceError::Failed(first as u16)),
         21 => Error::Service(ServiceError::Panicked),
         22 => Error::Service(ServiceError::NotReady),
@@ -606,6 +612,7 @@ mod tests {
                 remaining: Duration::from_micros(u64::from(remaining)),
                 stamp,
                 since: Duration::from_micros(u64::from(since)),
+                number: !id,
             },
         )
     }
@@ -716,6 +723,7 @@ mod tests {
             remaining: MS,
             stamp: 3,
             since: MS,
+            number: 8,
         };
         let (operators, programs) = (header.encode(), RequestHeader { operator: false, ..header }.encode());
         assert_eq!((operators[1] & !SKIPPABLE, programs[1] & !SKIPPABLE), (1 << 2, 0));

@@ -18,6 +18,7 @@ pub mod hello;
 mod help;
 pub mod identity;
 pub mod items;
+pub mod latch;
 pub mod message;
 pub mod name;
 pub mod nested;

@@ -1,8 +1,8 @@
 //! Calls of a peer: at most once, begun in order within a class, side by side, bounded.
 //!
 //! A call that may begin now becomes a ticket, whatever else runs; one for which no slot is free waits in its class's
-//! queue, and those behind it wait as well. Some slots are kept for emergencies, and one place to wait, so that other
-//! calls cannot keep them out, nor two calls of one emergency service those of another one.
+//! queue, and those behind it wait as well. Some slots are kept for emergencies, and a queue of their own to wait in, so
+//! that other calls cannot keep them out, nor two calls of one emergency service those of another one.
 
 use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
@@ -103,13 +103,15 @@ pub struct CallHead {
     pub deadline: Instant,
     /// The earliest time at which the caller can have made the request: its age is counted from here.
     pub sent_at: Instant,
+    /// The caller's number of it: a call that it made later has a higher one.
+    pub number: u32,
 }
 
 /// So many requests that were given up before they arrived are remembered beside the windows.
 const UNWANTED: usize = 8;
 
 /// Bytes of a call's head in a queue.
-const HEAD_BYTES: usize = 32;
+const HEAD_BYTES: usize = 36;
 /// Where its deadline is.
 const DEADLINE: usize = 16;
 
@@ -120,7 +122,8 @@ pub(crate) struct Calls<S: Storage> {
     unwanted: heapless::Vec<(u32, Priority), UNWANTED>,
     running: S::Slice<Option<CallHead>>,
     queues: [Option<Queue<S>>; 3],
-    emergency: Option<(CallHead, heapless::Vec<u8, EMERGENCY_BYTES>)>,
+    /// Emergencies that wait: one of the longest, or several short ones.
+    emergencies: ([u8; HEAD_BYTES + EMERGENCY_BYTES], Span),
     held: u16,
     /// When the next request is due by the minimum interval.
     due: Instant,
@@ -128,11 +131,17 @@ pub(crate) struct Calls<S: Storage> {
 
 struct Queue<S: Storage> {
     buffer: Buffer<S>,
+    span: Span,
+}
+
+/// Where the calls that wait are among the bytes of their queue.
+#[derive(Clone, Copy, Default)]
+struct Span {
     start: usize,
     end: usize,
 }
 
-/// Calls of one emergency service that one peer may have running; the next one is told `Busy`.
+/// Calls of one emergency service that one peer may have running or waiting; the next one is told `Busy`.
 const EMERGENCIES_OF_ONE: usize = 2;
 
 /// Of so many slots, those that are kept for emergencies.
@@ -154,7 +163,7 @@ impl<S: Storage> Calls<S> {
             unwanted: heapless::Vec::new(),
             running,
             queues: [const { None }; 3],
-            emergency: None,
+            emergencies: ([0; _], Span::default()),
             held: 0,
             due: Instant::START,
         }
@@ -179,10 +188,30 @@ impl<S: Storage> Calls<S> {
     /// Whether a call has arrived and not begun yet.
     pub(crate) fn is_waiting(&self, class: Priority, id: u32) -> bool {
         match queue_index(class) {
-            None => self.emergency.as_ref().is_some_and(|(head, _)| head.id == id),
+            None => self.emergencies.1.find(&self.emergencies.0, id).is_some(),
             Some(index) => {
-                self.queues.get(index).and_then(Option::as_ref).is_some_and(|queue| queue.find(id).is_some())
+                let queue = self.queues.get(index).and_then(Option::as_ref);
+                queue.is_some_and(|queue| queue.span.find(&queue.buffer, id).is_some())
             }
+        }
+    }
+
+    /// The bytes in which the calls of a class wait; `None` where none does.
+    fn queue(&mut self, class: Priority) -> Option<(&mut [u8], &mut Span)> {
+        match queue_index(class) {
+            None => Some((&mut self.emergencies.0, &mut self.emergencies.1)),
+            Some(index) => {
+                let queue = self.queues.get_mut(index)?.as_mut()?;
+                Some((&mut queue.buffer, &mut queue.span))
+            }
+        }
+    }
+
+    /// Gives the buffer of a class back when none of its calls waits any more.
+    fn give_drained(&mut self, buffers: &mut dyn Buffers<S>, class: Priority) {
+        let queue = queue_index(class).and_then(|index| self.queues.get_mut(index));
+        if let Some(queue) = queue.and_then(|queue| queue.take_if(|queue| queue.span.is_empty())) {
+            buffers.give(queue.buffer);
         }
     }
 
@@ -192,17 +221,8 @@ impl<S: Storage> Calls<S> {
         if !self.has_arrived(class, id) {
             return self.keep_out(class, id);
         }
-        match queue_index(class) {
-            None => {
-                if let Some((head, _)) = self.emergency.as_mut().filter(|(head, _)| head.id == id) {
-                    head.deadline = Instant::START;
-                }
-            }
-            Some(index) => {
-                if let Some(queue) = self.queues.get_mut(index).and_then(Option::as_mut) {
-                    queue.run_out(id);
-                }
-            }
+        if let Some((bytes, span)) = self.queue(class) {
+            span.run_out(bytes, id);
         }
     }
 
@@ -220,7 +240,7 @@ impl<S: Storage> Calls<S> {
 
     /// Whether any call has not begun yet.
     pub(crate) fn any_waiting(&self) -> bool {
-        self.emergency.is_some() || self.queues.iter().any(Option::is_some)
+        !self.emergencies.1.is_empty() || self.queues.iter().any(Option::is_some)
     }
 
     /// The callee's side of the minimum interval. One request may come early by a whole interval, because a network
@@ -257,13 +277,13 @@ impl<S: Storage> Calls<S> {
 
     fn class_waits(&self, priority: Priority) -> bool {
         match queue_index(priority) {
-            None => self.emergency.is_some(),
+            None => !self.emergencies.1.is_empty(),
             Some(index) => self.queues.get(index).is_some_and(Option::is_some),
         }
     }
 
-    /// [`Error::Busy`] when the peer has as many calls here as it may; of an emergency service it may have two running,
-    /// whatever else there is.
+    /// [`Error::Busy`] when the peer has as many calls here as it may; of an emergency service it may have two, whatever
+    /// else there is.
     pub(crate) fn admit(&self, slot: Slot, is_emergency: bool, limit: u16) -> Result<(), Error> {
         let free = if is_emergency { self.emergencies_of(slot) < EMERGENCIES_OF_ONE } else { self.held < limit };
         if free { Ok(()) } else { Err(Error::Busy) }
@@ -271,13 +291,15 @@ impl<S: Storage> Calls<S> {
 
     fn emergencies_of(&self, slot: Slot) -> usize {
         let same = |head: &&CallHead| head.slot == slot && head.priority == Priority::Emergency;
-        self.running.iter().flatten().filter(same).count()
+        let running = self.running.iter().flatten().filter(same).count();
+        let (bytes, span) = &self.emergencies;
+        running.saturating_add(span.heads(bytes).filter(|(_, head, _)| head.slot == slot).count())
     }
 
     /// Whether one more call of any class with a block of `bytes` could wait, as far as this peer's own calls go.
     pub(crate) fn has_room(&self, limit: u16, bytes: usize) -> bool {
         let needed = HEAD_BYTES.saturating_add(bytes);
-        self.held < limit && self.queues.iter().flatten().all(|queue| queue.room() >= needed)
+        self.held < limit && self.queues.iter().flatten().all(|queue| queue.span.room(&queue.buffer) >= needed)
     }
 
     /// Begins a call; one of an emergency service may take a slot that is kept for those.
@@ -334,31 +356,19 @@ impl<S: Storage> Calls<S> {
         head: CallHead,
         block: &[u8],
     ) -> Result<(), Error> {
-        let Some(index) = queue_index(head.priority) else { return self.wait_emergency(head, block) };
-        let slot = self.queues.get_mut(index).ok_or(Error::Busy)?;
-        let queue = match slot {
-            Some(queue) => queue,
-            None => slot.insert(Queue { buffer: buffers.take_leaving(left).ok_or(Error::Busy)?, start: 0, end: 0 }),
-        };
-        let result = queue.push(head, block);
+        if let Some(slot) = queue_index(head.priority).and_then(|index| self.queues.get_mut(index))
+            && slot.is_none()
+        {
+            *slot = Some(Queue { buffer: buffers.take_leaving(left).ok_or(Error::Busy)?, span: Span::default() });
+        }
+        let (bytes, span) = self.queue(head.priority).ok_or(Error::Busy)?;
+        let result = span.push(bytes, head, block);
         if result.is_ok() {
             self.held = self.held.saturating_add(1);
-        } else if queue.is_empty()
-            && let Some(queue) = slot.take()
-        {
-            buffers.give(queue.buffer);
+        } else {
+            self.give_drained(buffers, head.priority);
         }
         result
-    }
-
-    fn wait_emergency(&mut self, head: CallHead, block: &[u8]) -> Result<(), Error> {
-        if self.emergency.is_some() {
-            return Err(Error::Busy);
-        }
-        let block = heapless::Vec::from_slice(block).map_err(|_| Error::Busy)?;
-        self.emergency = Some((head, block));
-        self.held = self.held.saturating_add(1);
-        Ok(())
     }
 
     /// Whether a call waits for which a slot is free.
@@ -368,7 +378,7 @@ impl<S: Storage> Calls<S> {
 
     /// Whether an emergency waits for which a slot is free.
     pub(crate) fn has_next_emergency(&self) -> bool {
-        self.emergency.is_some() && self.free_slot(true).is_some()
+        !self.emergencies.1.is_empty() && self.free_slot(true).is_some()
     }
 
     /// Takes the next call that may begin and shows its block to `look`.
@@ -379,19 +389,9 @@ impl<S: Storage> Calls<S> {
     ) -> Option<(CallHead, R)> {
         let class = self.next_class()?;
         self.held = self.held.saturating_sub(1);
-        let Some(index) = queue_index(class) else {
-            let (head, block) = self.emergency.take()?;
-            let result = look(head, &block);
-            return Some((head, result));
-        };
-        let slot = self.queues.get_mut(index)?;
-        let queue = slot.as_mut()?;
-        let taken = queue.pop(class, look);
-        if queue.is_empty()
-            && let Some(queue) = slot.take()
-        {
-            buffers.give(queue.buffer);
-        }
+        let (bytes, span) = self.queue(class)?;
+        let taken = span.pop(bytes, class, look);
+        self.give_drained(buffers, class);
         taken
     }
 
@@ -409,7 +409,7 @@ impl<S: Storage> Calls<S> {
         for queue in self.queues.iter_mut().filter_map(Option::take) {
             buffers.give(queue.buffer);
         }
-        self.emergency = None;
+        self.emergencies.1 = Span::default();
         self.held = self.running.iter().flatten().count() as u16;
     }
 
@@ -441,24 +441,24 @@ impl<S: Storage> Calls<S> {
     }
 }
 
-impl<S: Storage> Queue<S> {
-    fn room(&self) -> usize {
-        self.buffer.len().saturating_sub(self.end.saturating_sub(self.start))
+impl Span {
+    const fn room(self, bytes: &[u8]) -> usize {
+        bytes.len().saturating_sub(self.end.saturating_sub(self.start))
     }
 
-    fn is_empty(&self) -> bool {
+    const fn is_empty(self) -> bool {
         self.start >= self.end
     }
 
-    fn push(&mut self, head: CallHead, block: &[u8]) -> Result<(), Error> {
+    fn push(&mut self, bytes: &mut [u8], head: CallHead, block: &[u8]) -> Result<(), Error> {
         let needed = HEAD_BYTES.saturating_add(block.len());
-        if needed > self.buffer.len().saturating_sub(self.end) {
-            bytes::move_down(&mut self.buffer, self.start..self.end);
+        if needed > bytes.len().saturating_sub(self.end) {
+            bytes::move_down(bytes, self.start..self.end);
             self.end = self.end.saturating_sub(self.start);
             self.start = 0;
         }
         let end = self.end.saturating_add(needed);
-        let place = self.buffer.get_mut(self.end..end).ok_or(Error::Busy)?;
+        let place = bytes.get_mut(self.end..end).ok_or(Error::Busy)?;
         let (head_place, block_place) = place.split_first_chunk_mut().ok_or(Error::Busy)?;
         *head_place = encode_head(&head, block.len());
         bytes::copy(block, block_place);
@@ -466,32 +466,38 @@ impl<S: Storage> Queue<S> {
         Ok(())
     }
 
-    /// Where the head of a call is.
-    fn find(&self, id: u32) -> Option<usize> {
+    /// The calls that wait: where each begins, its head without the class, and its block.
+    fn heads(self, bytes: &[u8]) -> impl Iterator<Item = (usize, CallHead, &[u8])> {
         let mut at = self.start;
-        while at < self.end {
-            let head = self.buffer.get(at..self.end)?.first_chunk()?;
-            let (head, length) = decode_head(head, Priority::Normal);
-            if head.id == id {
-                return Some(at);
-            }
+        core::iter::from_fn(move || {
+            let (head, rest) = bytes.get(at..self.end)?.split_first_chunk()?;
+            let (begin, (head, length)) = (at, decode_head(head, Priority::Normal));
             at = at.saturating_add(HEAD_BYTES).saturating_add(length);
-        }
-        None
+            Some((begin, head, rest.get(..length)?))
+        })
     }
 
-    fn run_out(&mut self, id: u32) {
-        let Some(at) = self.find(id) else { return };
+    /// Where the head of a call is.
+    fn find(self, bytes: &[u8], id: u32) -> Option<usize> {
+        self.heads(bytes).find(|(_, head, _)| head.id == id).map(|(at, ..)| at)
+    }
+
+    fn run_out(self, bytes: &mut [u8], id: u32) {
+        let Some(at) = self.find(bytes, id) else { return };
         let deadline = at.saturating_add(DEADLINE)..at.saturating_add(DEADLINE).saturating_add(8);
-        self.buffer.get_mut(deadline).unwrap_or_default().fill(0);
+        bytes.get_mut(deadline).unwrap_or_default().fill(0);
     }
 
-    fn pop<R>(&mut self, priority: Priority, look: impl FnOnce(CallHead, &[u8]) -> R) -> Option<(CallHead, R)> {
-        let waiting = self.buffer.get(self.start..self.end)?;
-        let (head, rest) = waiting.split_first_chunk::<HEAD_BYTES>()?;
-        let (head, length) = decode_head(head, priority);
-        let result = look(head, rest.get(..length)?);
-        self.start = self.start.saturating_add(HEAD_BYTES).saturating_add(length);
+    fn pop<R>(
+        &mut self,
+        bytes: &[u8],
+        priority: Priority,
+        look: impl FnOnce(CallHead, &[u8]) -> R,
+    ) -> Option<(CallHead, R)> {
+        let (_, head, block) = self.heads(bytes).next()?;
+        let head = CallHead { priority, ..head };
+        let result = look(head, block);
+        self.start = self.start.saturating_add(HEAD_BYTES).saturating_add(block.len());
         Some((head, result))
     }
 }
@@ -503,16 +509,17 @@ fn encode_head(head: &CallHead, block: usize) -> [u8; HEAD_BYTES] {
     let [f0, f1, f2, f3] = [head.wants_reply, head.takes_over, head.operator, head.wants_progress].map(u8::from);
     let [d0, d1, d2, d3, d4, d5, d6, d7] = head.deadline.as_micros().to_le_bytes();
     let [m0, m1, m2, m3, m4, m5, m6, m7] = head.sent_at.as_micros().to_le_bytes();
+    let [n0, n1, n2, n3] = head.number.to_le_bytes();
     [
         l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, f0, f1, f2, f3, d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3,
-        m4, m5, m6, m7,
+        m4, m5, m6, m7, n0, n1, n2, n3,
     ]
 }
 
 fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize) {
     let [l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, wants_reply, takes_over, operator, wants_progress, rest @ ..] =
         *bytes;
-    let [d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3, m4, m5, m6, m7] = rest;
+    let [d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3, m4, m5, m6, m7, n0, n1, n2, n3] = rest;
     let head = CallHead {
         id: u32::from_le_bytes([i0, i1, i2, i3]),
         slot: Slot(u16::from_le_bytes([s0, s1])),
@@ -526,6 +533,7 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         resets: false,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
         sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
+        number: u32::from_le_bytes([n0, n1, n2, n3]),
     };
     (head, u32::from_le_bytes([l0, l1, l2, l3]) as usize)
 }

@@ -11,6 +11,8 @@ use core::sync::atomic::{AtomicBool, AtomicU8, AtomicU16, AtomicU32, Ordering};
 
 use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::latch::LatchWord;
+pub(crate) use crate::distribution::latch::odd_millis;
 pub use crate::distribution::message::{ActuatorState, LastOrder, Latch, LeaseEnd, OrderOutcome};
 use crate::error::{Error, ServiceError};
 use crate::services::heart::Renew;
@@ -80,15 +82,8 @@ pub struct Lease {
     call: AtomicU32,
     /// How it ended, as the number of a [`LeaseEnd`].
     how: AtomicU8,
-    /// When it was inhibited last, as `end` has its time; 0 when it never was. Written by [`inhibit`](Self::inhibit) alone, which
-    /// may interrupt a reset.
-    inhibited: AtomicU32,
-    /// What `inhibited` was when it was reset last. Where the two differ, no order begins.
-    cleared: AtomicU32,
-    /// The ID number of the unit that inhibited it; 0 for this one.
-    inhibitor: AtomicU32,
-    /// Why.
-    reason: AtomicU16,
+    /// While it is latched, no order begins.
+    latch: LatchWord,
     /// How long what moves takes to stand still, in milliseconds.
     ramp: AtomicU16,
     /// When the last order was stopped, as `end` has its time; 0 where none was since the last one began.
@@ -130,10 +125,7 @@ impl Lease {
             link: AtomicU32::new(0),
             call: AtomicU32::new(0),
             how: AtomicU8::new(0),
-            inhibited: AtomicU32::new(0),
-            cleared: AtomicU32::new(0),
-            inhibitor: AtomicU32::new(0),
-            reason: AtomicU16::new(0),
+            latch: LatchWord::new(),
             ramp: AtomicU16::new(0),
             stopped: AtomicU32::new(0),
         }
@@ -232,7 +224,7 @@ impl Lease {
         if let Some(latch) = self.latch() {
             return Err(latch.into());
         }
-        if !self.is_behind_stop(now, claim.made) {
+        if !self.latch.is_behind_stop(now, claim.made) {
             return Err(Error::Expired);
         }
         let operator = self.operator.load(Ordering::Acquire);
@@ -302,42 +294,39 @@ impl Lease {
     /// vehicle's own, as of a bumper; then `latch.by` is 0. May be called from an interrupt. The first latch stays when
     /// there is one, but with the time of the newest. The safe hook is due like that of an order that was [`cut`](Self::cut).
     pub fn inhibit(&self, now: Instant, latch: Latch) {
-        if !self.is_inhibited() {
-            self.inhibitor.store(latch.by, Ordering::Release);
-            self.reason.store(latch.reason, Ordering::Release);
-        }
+        self.latch.note(latch);
         self.stop_at(now, self.end.load(Ordering::Acquire));
-        let at = odd_millis(now) as u32;
-        let at = if at == self.cleared.load(Ordering::Acquire) { at.wrapping_add(2) } else { at };
-        self.inhibited.store(at, Ordering::Release);
+        self.latch.close(now);
         self.seen_dead.store(true, Ordering::Release);
+    }
+
+    /// Takes a latch along: that of the service that this one's replaces, or of the unit that it is new in.
+    pub fn inherit(&self, from: &LatchWord) {
+        self.latch.inherit(from);
+        if self.is_inhibited() {
+            self.seen_dead.store(true, Ordering::Release);
+        }
+    }
+
+    /// Its latch.
+    pub const fn latch_word(&self) -> &LatchWord {
+        &self.latch
     }
 
     /// Lets orders begin again, if it was inhibited before `made`, at which the reset was asked for: an earlier wish does not
     /// undo a later stop, nor one made within 3 ms of it.
     pub fn reset(&self, now: Instant, made: Instant) {
-        // A stop that interrupts this is not undone: it writes another time.
-        let inhibited = self.inhibited.load(Ordering::Acquire);
-        if is_behind(now, made, inhibited) {
-            self.cleared.store(inhibited, Ordering::Release);
-        }
-    }
-
-    /// Whether what was `made` then was made after the last stop, reset or not.
-    fn is_behind_stop(&self, now: Instant, made: Instant) -> bool {
-        let inhibited = self.inhibited.load(Ordering::Acquire);
-        inhibited == 0 || is_behind(now, made, inhibited)
+        self.latch.reset(now, made);
     }
 
     /// What inhibits it.
     pub fn latch(&self) -> Option<Latch> {
-        self.is_inhibited()
-            .then(|| Latch { by: self.inhibitor.load(Ordering::Acquire), reason: self.reason.load(Ordering::Acquire) })
+        self.latch.latch()
     }
 
     /// Whether no order may begin.
     pub fn is_inhibited(&self) -> bool {
-        self.inhibited.load(Ordering::Acquire) != self.cleared.load(Ordering::Acquire)
+        self.latch.is_inhibited()
     }
 
     /// Whether an order is dead and has not been ended: its safe hook comes before anything else.
@@ -399,7 +388,7 @@ impl Lease {
     /// Differs when the [state](Self::state) does; 0 for one that nothing has happened to.
     pub(crate) fn changes(&self) -> u32 {
         let order = self.order.load(Ordering::Acquire);
-        let latched = self.inhibited.load(Ordering::Acquire) ^ self.cleared.load(Ordering::Acquire);
+        let latched = self.latch.changes();
         order.wrapping_mul(2).wrapping_add(self.has_order().into()) ^ latched.reverse_bits()
     }
 
@@ -422,21 +411,6 @@ const fn is_before(time: Instant, end: u32) -> bool {
     let time = (time.as_micros() / 1_000) as u32;
     // A lease is far shorter than half of the range, so the sign of the difference tells the order.
     end != 0 && (end.wrapping_sub(time) as i32) > 0
-}
-
-/// Whether what was `made` then is later than a stop, of which the time is one of [`odd_millis`].
-fn is_behind(now: Instant, made: Instant, stop: u32) -> bool {
-    // As long as the word's 49 days, after which a wish may have to be made twice; its age is seconds.
-    let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(stop);
-    let age = now.since(made).as_millis();
-    // The moment is rounded down by up to 2 ms; at the clock's beginning it is rounded up.
-    stop != 0 && since != u32::MAX && age.saturating_add(2) < u64::from(since)
-}
-
-/// A time in milliseconds, rounded down to an odd number, which is never the 0 of "none".
-pub(crate) const fn odd_millis(time: Instant) -> u64 {
-    let millis = time.as_micros() / 1_000;
-    if millis & 1 == 0 { millis.saturating_sub(1) | 1 } else { millis }
 }
 
 /// What the core asks of a port's service: where its lease is, if it has one, and all writes to it.

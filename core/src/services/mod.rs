@@ -189,6 +189,7 @@ pub mod event;
 pub mod heart;
 pub mod hub;
 pub mod lease;
+mod own_list;
 pub mod publications;
 pub mod requests;
 pub mod session;
@@ -201,6 +202,7 @@ pub use calls::{CallHead, Ticket, slots_for};
 
 use crate::distribution::function_list::{Function, FunctionList, Generation, Slot};
 use crate::distribution::hello::Hello;
+use crate::distribution::latch::LatchWord;
 use crate::error::Error;
 use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
@@ -247,6 +249,10 @@ pub trait OwnFunctions {
     fn lookup(&self, slot: Slot, generation: Generation) -> Result<Function<'_, dyn Service>, Error>;
     /// [`FunctionList::generation`]
     fn generation(&self, slot: Slot) -> Option<Generation>;
+    /// [`FunctionList::places`]
+    fn places(&self) -> u16;
+    /// [`FunctionList::stopped`]
+    fn stopped(&self) -> &LatchWord;
 }
 
 impl<S: Storage, H: Service + 'static> OwnFunctions for FunctionList<S, H> {
@@ -260,6 +266,14 @@ impl<S: Storage, H: Service + 'static> OwnFunctions for FunctionList<S, H> {
 
     fn generation(&self, slot: Slot) -> Option<Generation> {
         Self::generation(self, slot)
+    }
+
+    fn places(&self) -> u16 {
+        Self::places(self)
+    }
+
+    fn stopped(&self) -> &LatchWord {
+        Self::stopped(self)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Calls of this unit that wait for a reply, and the gate that keeps the minimum interval.
 
-use crate::config::Priority;
+use crate::config::{EMERGENCY_CALLS, Priority};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
@@ -9,6 +9,16 @@ use crate::time::{Duration, Instant};
 /// Names a request within its session; rises with each one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CallId(pub u32);
+
+/// The place of a call among those of its link, in the order in which they were made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Made(u32);
+
+impl Made {
+    pub(crate) const fn number(self) -> u32 {
+        self.0
+    }
+}
 
 /// A call that waits for its reply.
 #[derive(Clone, Copy, Debug)]
@@ -26,11 +36,17 @@ pub struct Pending {
     pub(crate) release_unsent: bool,
 }
 
-/// The table of calls in flight to one peer: lent slots, found by id without a search.
+/// The table of calls in flight to one peer: lent slots, found by id without a search, and a few of its own that are kept
+/// for emergencies.
 pub struct Requests<S: Storage> {
     pending: S::Slice<Option<Pending>>,
+    /// Those of `pending` that are taken.
     in_flight: usize,
+    /// Emergencies that found all of `pending` taken.
+    urgent: [Option<Pending>; EMERGENCY_CALLS],
     next_id: u32,
+    /// How many calls have been made, those among them that wait until they can be sent.
+    made: u32,
     /// No call's deadline is earlier; a call that was closed may leave it too early until the next look.
     earliest: Instant,
     last_request: Option<Instant>,
@@ -39,7 +55,15 @@ pub struct Requests<S: Storage> {
 impl<S: Storage> Requests<S> {
     /// A table with as many slots as were lent.
     pub fn new(pending: S::Slice<Option<Pending>>) -> Self {
-        Self { pending, in_flight: 0, next_id: 1, earliest: Instant::FAR_FUTURE, last_request: None }
+        Self {
+            pending,
+            in_flight: 0,
+            urgent: [None; EMERGENCY_CALLS],
+            next_id: 1,
+            made: 0,
+            earliest: Instant::FAR_FUTURE,
+            last_request: None,
+        }
     }
 
     /// [`Error::TooSoon`] when `interval` has not passed since the last request.
@@ -61,12 +85,28 @@ impl<S: Storage> Requests<S> {
         Some(CallId(id))
     }
 
+    /// A call is made, which may wait for room before it is sent. They are no more than ids, of which the last one ends the
+    /// link.
+    pub(crate) fn make(&mut self) -> Made {
+        self.made = self.made.saturating_add(1);
+        Made(self.made)
+    }
+
+    /// The place of a call that is sent now: the one that it was given when it was made. One of an earlier link to the peer was
+    /// made before all of this one.
+    pub(crate) fn made(&mut self, earlier: Option<Made>) -> Made {
+        match earlier {
+            Some(made) if made.0 <= self.made => made,
+            _ => self.make(),
+        }
+    }
+
     /// The newest id that was given; 0 before the first.
     pub(crate) const fn newest(&self) -> CallId {
         CallId(self.next_id.saturating_sub(1))
     }
 
-    /// An id and a slot for a call.
+    /// An id and a slot for a call; an emergency finds one when all others have none.
     pub(crate) fn open(
         &mut self,
         slot: Slot,
@@ -74,25 +114,34 @@ impl<S: Storage> Requests<S> {
         deadline: Instant,
         class: Priority,
         leased: bool,
+        is_urgent: bool,
     ) -> Result<Option<CallId>, Error> {
+        let pending = |id| Pending {
+            id,
+            slot,
+            generation,
+            deadline,
+            leased: leased.then_some(class),
+            #[cfg(feature = "details")]
+            class,
+            release_unsent: false,
+        };
         if self.in_flight >= self.pending.len() {
-            return Err(Error::Full(Limit::Calls));
+            let free = self.urgent.iter().position(Option::is_none).filter(|_| is_urgent);
+            let Some(free) = free else { return Err(Error::Full(Limit::Calls)) };
+            let Some(id) = self.next_id() else { return Ok(None) };
+            if let Some(place) = self.urgent.get_mut(free) {
+                *place = Some(pending(id));
+            }
+            self.earliest = self.earliest.min(deadline);
+            return Ok(Some(id));
         }
         // The slot follows from the id, so an id whose slot is taken is passed over; one is free, so the loop ends.
         for _ in 0..self.pending.len() {
             let Some(id) = self.next_id() else { return Ok(None) };
             let Some(place) = self.place(id) else { continue };
             if place.is_none() {
-                *place = Some(Pending {
-                    id,
-                    slot,
-                    generation,
-                    deadline,
-                    leased: leased.then_some(class),
-                    #[cfg(feature = "details")]
-                    class,
-                    release_unsent: false,
-                });
+                *place = Some(pending(id));
                 self.in_flight = self.in_flight.saturating_add(1);
                 self.earliest = self.earliest.min(deadline);
                 return Ok(Some(id));
@@ -103,10 +152,17 @@ impl<S: Storage> Requests<S> {
 
     /// Ends a call and frees its slot. `None` when it had ended already.
     pub(crate) fn close(&mut self, id: CallId) -> Option<Pending> {
-        let place = self.place(id)?;
-        let pending = place.take_if(|pending| pending.id == id && !pending.release_unsent)?;
-        self.in_flight = self.in_flight.saturating_sub(1);
-        Some(pending)
+        self.take(id, false)
+    }
+
+    /// Takes a call that waits for its reply, or else one whose release is still to be sent.
+    fn take(&mut self, id: CallId, release_unsent: bool) -> Option<Pending> {
+        let is_meant = |pending: &mut Pending| pending.id == id && pending.release_unsent == release_unsent;
+        if let Some(pending) = self.place(id).and_then(|place| place.take_if(is_meant)) {
+            self.in_flight = self.in_flight.saturating_sub(1);
+            return Some(pending);
+        }
+        self.urgent.iter_mut().find_map(|place| place.take_if(is_meant))
     }
 
     /// Ends one call whose deadline has passed.
@@ -132,32 +188,40 @@ impl<S: Storage> Requests<S> {
     #[cfg(feature = "details")]
     pub(crate) fn waiting_for(&self, id: CallId) -> Option<&Pending> {
         let index = (id.0 as usize).checked_rem(self.pending.len())?;
-        self.pending.get(index)?.as_ref().filter(|pending| pending.id == id && !pending.release_unsent)
+        let place = self.pending.get(index)?.as_ref().filter(|pending| pending.id == id);
+        place.or_else(|| self.urgent.iter().flatten().find(|pending| pending.id == id)).filter(|it| !it.release_unsent)
     }
 
     fn waiting(&self) -> impl Iterator<Item = &Pending> {
-        self.pending.iter().flatten().filter(|pending| !pending.release_unsent)
+        self.all().filter(|pending| !pending.release_unsent)
+    }
+
+    fn all(&self) -> impl Iterator<Item = &Pending> {
+        self.pending.iter().chain(&self.urgent).flatten()
     }
 
     /// Keeps a call that was closed just now in its slot until its release has been sent.
     pub(crate) fn keep_unsent_release(&mut self, pending: Pending) {
-        if let Some(place) = self.place(pending.id) {
-            *place = Some(Pending { release_unsent: true, ..pending });
-            self.in_flight = self.in_flight.saturating_add(1);
+        let kept = Some(Pending { release_unsent: true, ..pending });
+        match self.place(pending.id) {
+            Some(place) if place.is_none() => {
+                *place = kept;
+                self.in_flight = self.in_flight.saturating_add(1);
+            }
+            // It was an emergency's, and another call has the slot of its id.
+            _ => self.urgent.iter_mut().filter(|place| place.is_none()).take(1).for_each(|place| *place = kept),
         }
     }
 
     /// A call whose release is still to be sent, and its class.
     pub(crate) fn unsent_release(&self) -> Option<(CallId, Priority)> {
-        let due = self.pending.iter().flatten().find(|pending| pending.release_unsent)?;
+        let due = self.all().find(|pending| pending.release_unsent)?;
         due.leased.map(|class| (due.id, class))
     }
 
     /// The release has been sent.
     pub(crate) fn release_sent(&mut self, id: CallId) {
-        if self.place(id).and_then(|place| place.take_if(|pending| pending.id == id)).is_some() {
-            self.in_flight = self.in_flight.saturating_sub(1);
-        }
+        self.take(id, true);
     }
 
     /// Moves to more slots: a multiple of those before, since the slot of an id follows from their number. Returns the
@@ -189,8 +253,8 @@ impl<S: Storage> Requests<S> {
     }
 
     /// Calls that wait for a reply.
-    pub const fn in_flight(&self) -> usize {
-        self.in_flight
+    pub fn in_flight(&self) -> usize {
+        self.in_flight.saturating_add(self.urgent.iter().flatten().count())
     }
 
     pub(crate) const fn deadline(&self) -> Instant {
@@ -205,19 +269,20 @@ impl<S: Storage> Requests<S> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, clippy::arithmetic_side_effects)]
+    #![allow(clippy::unwrap_used, clippy::arithmetic_side_effects, clippy::indexing_slicing)]
     use super::*;
     use crate::storage::Boxed;
     use proptest::prelude::*;
     use std::collections::BTreeMap;
     use std::vec;
+    use std::vec::Vec;
 
     fn table(slots: usize) -> Requests<Boxed> {
         Requests::new(vec![None; slots].into_boxed_slice())
     }
 
     fn open(requests: &mut Requests<Boxed>, deadline: u64) -> Result<Option<CallId>, Error> {
-        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline), Priority::Low, false)
+        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline), Priority::Low, false, false)
     }
 
     #[test]
@@ -229,6 +294,33 @@ mod tests {
         assert!(requests.close(first).is_some());
         assert!(requests.close(first).is_none());
         assert!(open(&mut requests, 10).unwrap().is_some());
+    }
+
+    /// `docs/safety.md`, what a stop waits for: the caller's table of calls.
+    #[test]
+    fn a_full_table_has_slots_left_for_emergencies() {
+        let stop = |requests: &mut Requests<Boxed>, deadline, leased| {
+            let deadline = Instant::from_micros(deadline);
+            requests.open(Slot(1), Generation(0), deadline, Priority::Emergency, leased, true).map(Option::unwrap)
+        };
+        let mut requests = table(2);
+        let (first, _) = (open(&mut requests, 90).unwrap().unwrap(), open(&mut requests, 90).unwrap());
+        let stops: Vec<_> = (0..8).map(|at| stop(&mut requests, 20 + at, at == 7).unwrap()).collect();
+        assert_eq!((requests.in_flight(), requests.deadline()), (10, Instant::from_micros(20)));
+        assert_eq!(stop(&mut requests, 20, false), Err(Error::Full(Limit::Calls)), "so many and no more");
+        // The slot of its id is another call's, which keeps it.
+        assert!(requests.close(stops[0]).is_some() && requests.close(stops[0]).is_none());
+        assert!(requests.close(first).is_some());
+        assert!(stop(&mut requests, 30, false).is_ok() && stop(&mut requests, 30, false).is_ok());
+        assert_eq!(open(&mut requests, 90), Err(Error::Full(Limit::Calls)), "none of them is for other calls");
+        let late = requests.expire(Instant::from_micros(21)).unwrap();
+        assert_eq!(late.id, stops[1]);
+        let leased = requests.close(stops[7]).unwrap();
+        requests.keep_unsent_release(leased);
+        assert_eq!(requests.unsent_release(), Some((stops[7], Priority::Emergency)));
+        requests.release_sent(stops[7]);
+        while requests.interrupt().is_some() {}
+        assert_eq!((requests.in_flight(), requests.unsent_release()), (0, None));
     }
 
     #[test]
@@ -246,7 +338,8 @@ mod tests {
     #[test]
     fn a_release_that_waits_for_room_keeps_its_slot_and_no_reply() {
         let mut requests = table(2);
-        let leased = requests.open(Slot(0), Generation(0), Instant::from_micros(10), Priority::Low, true).unwrap();
+        let leased =
+            requests.open(Slot(0), Generation(0), Instant::from_micros(10), Priority::Low, true, false).unwrap();
         let pending = requests.expire(Instant::from_micros(10)).unwrap();
         requests.keep_unsent_release(pending);
         assert_eq!(requests.unsent_release(), Some((leased.unwrap(), Priority::Low)));

@@ -89,6 +89,7 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         renew: Renew::Never,
         take_over: question.take_over,
         operator: true,
+        made: None,
         // Also for why it fails.
         progress: true,
     })

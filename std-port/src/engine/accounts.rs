@@ -123,7 +123,7 @@ impl<T: Send + 'static> Engine<T> {
         self.accounts.hooks_late.clone()
     }
 
-    fn port_readings(&self, held: &Held) -> [Reading; 14] {
+    fn port_readings(&self, held: &Held) -> [Reading; 15] {
         // One that is stuck has not counted itself.
         let functions = self.functions();
         let actuators = functions.iter().filter_map(|function| function.handler.actuator.as_ref());
@@ -140,6 +140,7 @@ impl<T: Send + 'static> Engine<T> {
                 load(&self.accounts.connections_refused),
             ),
             count("HooksLate", "Safe hooks that took longer than 100 ms.", load(&self.accounts.hooks_late)),
+            count("LatchesUnkept", "Times that a stop or its end could not be written.", self.latch.failed()),
             count(
                 "BuffersRefused",
                 "Times that all message buffers were in use when one was asked for.",

@@ -209,9 +209,12 @@ pub(crate) enum Told {
 impl<T: Send + 'static> PendingCall<T> {
     /// One that has not been tried yet. Its deadline counts from here.
     fn new(engine: &Arc<Engine<T>>, link: Arc<LinkCell>, function: &str, options: &RequestOptions) -> Self {
-        let usual = || link.lock().session.constraints().request_timeout;
-        let deadline = engine.now() + options.timeout.unwrap_or_else(usual);
-        let stage = Stage::Unsent { function: function.into(), options: *options, deadline };
+        let (usual, made) = {
+            let session = &mut link.lock().session;
+            (session.constraints().request_timeout, Some(session.make()))
+        };
+        let deadline = engine.now() + options.timeout.unwrap_or(usual);
+        let stage = Stage::Unsent { function: function.into(), options: RequestOptions { made, ..*options }, deadline };
         let noted = engine.noted(&link, function, options);
         Self { engine: engine.clone(), link, stage, mark: None, noted }
     }

@@ -139,13 +139,15 @@ impl<T: Send + 'static> Engine<T> {
         let mut state = link.lock();
         let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
         let deadline = now + timeout;
+        // It keeps its place among the calls that move the same thing, however long it waits for room.
+        let made = Some(state.session.make());
         loop {
             if canceller.is_some_and(Canceller::is_cancelled) {
                 return Err(Error::Cancelled);
             }
             // Before the request goes out: a thread of the pool must not wake for the reply.
             let token = self.take_token(now, link, &mut state);
-            let options = RequestOptions { timeout: Some(deadline.since(now)), ..*options };
+            let options = RequestOptions { timeout: Some(deadline.since(now)), made, ..*options };
             let sent = self.request_on(now, link, &mut state, function, parameters, &options, true);
             let (error, wait) = match sent {
                 Ok(id) => {

@@ -94,6 +94,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::services::Context;
 use cara_core::services::access::Access;
+use cara_core::services::lease::Latch;
 use cara_core::services::session::{Session, buffer_bytes};
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
@@ -104,6 +105,7 @@ use crate::config::Capacities;
 use crate::control::Audit;
 use crate::event::UnitEvent;
 use crate::handler::Handler;
+use crate::latch::Keeper;
 use crate::locks::{Held, Locked, Rank};
 use crate::news::News;
 use crate::pool::MessagePool;
@@ -137,6 +139,7 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) key_watch: KeyWatch,
     guard: access::Guard,
     claims: claims::Claims,
+    pub(crate) latch: Keeper,
     accounts: accounts::Accounts,
     #[cfg(feature = "control")]
     audit: Option<Arc<Audit>>,
@@ -163,6 +166,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) asks_for_itself: bool,
     pub(crate) state_folder: Option<PathBuf>,
     pub(crate) take_over: claims::TakeOver,
+    pub(crate) starts_stopped: Option<u16>,
     #[cfg(feature = "control")]
     pub(crate) audit: Option<Arc<Audit>>,
 }
@@ -170,6 +174,12 @@ pub(crate) struct EngineParts<T: 'static> {
 impl<T: Send + 'static> Engine<T> {
     pub(crate) fn new(parts: EngineParts<T>) -> Arc<Self> {
         let driver = Driver::new(parts.threads, parts.own_threads, parts.asks_for_itself);
+        let node = &parts.hub.hub.node;
+        let latch = Keeper::new(parts.state_folder.as_deref(), node.identity(), node.fleet());
+        let stopped = latch.kept().or(parts.starts_stopped.map(|reason| Latch { by: 0, reason }));
+        if let Some(stopped) = stopped {
+            parts.functions.stopped().inhibit(driver.born(), stopped);
+        }
         Arc::new_cyclic(|me| Self {
             me: me.clone(),
             fleet: parts.hub.hub.node.fleet(),
@@ -183,6 +193,7 @@ impl<T: Send + 'static> Engine<T> {
             driver,
             guard: access::Guard::default(),
             claims: claims::Claims::new(parts.state_folder, parts.take_over),
+            latch,
             accounts: accounts::Accounts::default(),
             #[cfg(feature = "control")]
             audit: parts.audit,

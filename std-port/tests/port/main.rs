@@ -19,6 +19,7 @@ mod in_use;
 mod junk;
 #[path = "../keyed/mod.rs"]
 mod keyed;
+mod latches;
 mod leases;
 mod many;
 mod members;

@@ -59,6 +59,7 @@ impl Blocks {
             remaining: Duration::from_millis(500),
             stamp: 1_000_000,
             since: Duration::from_millis(20),
+            number: 3,
         };
         let arguments = self.definition.signature().arguments();
         block::measure(arguments, self.sender).expect("the parameters match");

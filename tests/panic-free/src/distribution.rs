@@ -176,12 +176,13 @@ entry!(signatures, {
 entry!(attributes, {
     keep((Attributes::decode(unknown_slice()), unknown::<Attributes>().encode()));
     show(*unknown::<Attributes>());
+    keep(unknown::<Attributes>().is_urgent(*unknown()));
 });
 
 entry!(own_list, {
     keep(Entry::<u32>::empty());
     keep(FunctionList::<Lent, u32>::new(unknown_slice(), unknown_slice()));
-    let list: &mut FunctionList<Lent, u32> = unknown();
+    let list: &mut FunctionList<Lent, ()> = unknown();
     keep(list.add_function(unknown(), *unknown(), *unknown()));
     keep(list.replace(unknown(), *unknown(), *unknown()));
     keep(list.add_signature(*unknown::<Signature<'static>>(), *unknown(), *unknown()));
@@ -190,6 +191,7 @@ entry!(own_list, {
     keep((list.find(unknown_text()), list.function(*unknown()), list.lookup(*unknown(), *unknown())));
     keep(list.handler_mut(*unknown()));
     keep((list.generation(*unknown()), list.len(), list.is_empty()));
+    keep((list.stopped(), list.places()));
     drain(list.iter());
 });
 

@@ -121,6 +121,7 @@ entry!(session_asked, {
         session.hello(),
     ));
     keep(session.version());
+    keep(self::session().make());
     keep((session.identity(), session.peer(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((
         session.their_function_list(),
@@ -245,6 +246,12 @@ entry!(leases, {
     keep((lease.begin(*unknown(), *unknown()), lease.claim(*unknown(), *unknown(), unknown())));
     lease.inhibit(*unknown(), *unknown());
     lease.reset(*unknown(), *unknown());
+    lease.inherit(lease.latch_word());
+    let latch: &cara_core::distribution::latch::LatchWord = unknown();
+    keep((cara_core::distribution::latch::LatchWord::new(), latch.latch(), latch.is_inhibited()));
+    latch.inhibit(*unknown(), *unknown());
+    latch.reset(*unknown(), *unknown());
+    latch.inherit(unknown());
     keep((lease.latch(), lease.is_inhibited(), lease.awaits_hook(), lease.is_cut(*unknown())));
     keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));

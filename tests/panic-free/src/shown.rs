@@ -19,7 +19,7 @@ entry!(shown_definitions, {
 });
 
 entry!(shown_lists, {
-    show(unknown::<FunctionList<Lent, u32>>().show_functions());
+    show(unknown::<FunctionList<Lent, ()>>().show_functions());
     show(unknown::<TheirFunctionList<Lent>>().show_functions());
 });
 

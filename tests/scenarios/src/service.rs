@@ -29,6 +29,8 @@ pub struct Service {
     pub(crate) calls_back: Option<String>,
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
+    pub(crate) stops_all: bool,
+    pub(crate) resets_all: bool,
     pub(crate) in_turns: bool,
     pub(crate) tells: i64,
     pub(crate) failure: Option<Failure>,
@@ -46,6 +48,8 @@ impl Service {
             calls_back: None,
             priority: Priority::Normal,
             lease: None,
+            stops_all: false,
+            resets_all: false,
             in_turns: false,
             tells: 0,
             failure: None,
@@ -85,6 +89,16 @@ impl Service {
     /// What it starts may go on only this long after the last renewal; then its safe hook notes the stop.
     pub fn lease(self, length: Duration) -> Self {
         Self { lease: Some(length), ..self }
+    }
+
+    /// A call of it stops all that its unit moves.
+    pub fn stops_all(self) -> Self {
+        Self { stops_all: true, ..self }
+    }
+
+    /// A call of it lets all that its unit moves move again.
+    pub fn resets_all(self) -> Self {
+        Self { resets_all: true, ..self }
     }
 
     /// Its calls take the application's state, and so run one after the other, in the order in which they began. The handlers of

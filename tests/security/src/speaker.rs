@@ -358,6 +358,7 @@ impl Speaker {
             remaining: cara_core::time::Duration::from_secs(600),
             stamp: self.theirs.as_ref().map_or(0, |them| them.stamp),
             since: cara_core::time::Duration::ZERO,
+            number: self.next_id,
         };
         self.next_id += 1;
         [&header.encode()[..], &mark.to_le_bytes()].concat()
@@ -409,6 +410,7 @@ pub fn request_in_clear() -> Vec<u8> {
         remaining: cara_core::time::Duration::from_secs(600),
         stamp: 0,
         since: cara_core::time::Duration::ZERO,
+        number: 1,
     };
     let message = [&header.encode()[..], &fresh_mark().to_le_bytes()].concat();
     let body = [&[WHOLE, 2][..], &(message.len() as u32).to_le_bytes(), &message].concat();

@@ -262,6 +262,7 @@ fn header(id: u32, slot: u16) -> RequestHeader {
         remaining: Duration::from_secs(1),
         stamp: 1_001_000,
         since: Duration::ZERO,
+        number: id,
     }
 }
 

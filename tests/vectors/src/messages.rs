@@ -35,6 +35,7 @@ fn request(wants_reply: bool, block: &[u8]) -> Vec<u8> {
         remaining: Duration::from_millis(2_000),
         stamp: 0x0001_0203_0405_0607,
         since: Duration::from_micros(250_000),
+        number: 0x0506_0708,
     };
     [&header.encode()[..], block].concat()
 }
@@ -49,7 +50,8 @@ fn messages() -> Vec<Vector> {
         json!({ "request": {
             "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "wants_progress": false, "takes_over": false, "operator": false,
             "unknown": 0,
-            "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": hex(block),
+            "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "number": 0x0506_0708,
+            "block": hex(block),
         }})
     };
     let flags = |flags: u8| {
@@ -153,7 +155,7 @@ fn messages() -> Vec<Vector> {
 fn errors() -> Vec<Vector> {
     let wait = Duration::from_millis(30);
     let service = |error: ServiceError| Error::Service(error);
-    let answers: [(&'static str, Error, Value); 24] = [
+    let answers: [(&'static str, Error, Value); 25] = [
         ("error_unknown_function", Error::UnknownFunction, json!("unknown_function")),
         ("error_stale_function", Error::StaleFunction, json!("stale_function")),
         ("error_missing_argument", Error::MissingArgument { index: 3 }, json!({ "missing_argument": { "index": 3 } })),
@@ -185,6 +187,7 @@ fn errors() -> Vec<Vector> {
             json!({ "held": { "by": 7, "operator": true } }),
         ),
         ("error_inhibited", Error::Inhibited { by: 0, reason: 9 }, json!({ "inhibited": { "by": 0, "reason": 9 } })),
+        ("error_replaced", Error::Replaced, json!("replaced")),
         ("error_service_failed", service(ServiceError::Failed(513)), json!({ "service_failed": { "code": 513 } })),
         ("error_service_panicked", service(ServiceError::Panicked), json!("service_panicked")),
         ("error_service_not_ready", service(ServiceError::NotReady), json!("service_not_ready")),
@@ -455,7 +458,8 @@ fn session_bodies() -> Vec<Vector> {
             &emergency,
             &json!({ "message": { "priority": "emergency", "message": { "request": {
                 "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "wants_progress": false, "takes_over": false, "operator": false,
-                "unknown": 0, "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
+                "unknown": 0, "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "number": 0x0506_0708,
+                "block": "",
             }}}}),
         ),
     ]

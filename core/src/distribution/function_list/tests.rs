@@ -14,6 +14,7 @@ use std::{format, vec};
 use proptest::prelude::*;
 
 use super::*;
+use crate::distribution::function::Definition;
 use crate::storage::Boxed;
 
 type Mine = FunctionList<Boxed, u32>;

@@ -29,6 +29,7 @@ fn head(id: u32, priority: Priority) -> CallHead {
         resets: false,
         deadline: Instant::from_micros(u64::from(id) << 20),
         sent_at: Instant::from_micros(u64::from(id) << 10),
+        number: id ^ 0x8000_0001,
     }
 }
 
@@ -206,10 +207,10 @@ fn a_call_begins_while_others_of_its_class_run_and_never_before_one_that_waits()
 #[test]
 fn room_ends_with_the_calls_that_may_wait_or_with_the_bytes() {
     let (mut calls, mut pool) = (calls(3), pool(4, 100));
-    assert!(calls.has_room(1, 68) && !calls.has_room(0, 0));
+    assert!(calls.has_room(1, 64) && !calls.has_room(0, 0));
     calls.wait(&mut pool, LEFT_BY_WAITING, head(1, Priority::Normal), b"12345678").unwrap();
-    assert_eq!([(1, 0), (2, 28), (2, 29)].map(|(limit, bytes)| calls.has_room(limit, bytes)), [false, true, false]);
-    assert!(calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Normal), &[0; 28]).is_ok());
+    assert_eq!([(1, 0), (2, 20), (2, 21)].map(|(limit, bytes)| calls.has_room(limit, bytes)), [false, true, false]);
+    assert!(calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Normal), &[0; 20]).is_ok());
 }
 
 #[test]
@@ -218,10 +219,30 @@ fn one_emergency_waits_without_a_buffer() {
     for id in 11..=13 {
         calls.begin(head(id, Priority::Emergency), true).unwrap();
     }
-    calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Emergency), b"stop").unwrap();
-    assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Emergency), b"stop"), Err(Error::Busy));
+    calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Emergency), &[1; EMERGENCY_BYTES]).unwrap();
+    assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Emergency), b""), Err(Error::Busy));
     assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Normal), b"go"), Err(Error::Busy));
     assert!(!calls.can_begin());
+}
+
+#[test]
+fn several_short_emergencies_wait_in_their_order() {
+    let (mut calls, mut pool) = (calls(1), pool(0, 0));
+    let running = calls.begin(head(11, Priority::Emergency), true).unwrap();
+    let same = |id| CallHead { slot: Slot(7), ..head(id, Priority::Emergency) };
+    for id in 2..=7 {
+        calls.note(Priority::Emergency, id);
+        calls.wait(&mut pool, LEFT_BY_WAITING, same(id), b"stop").unwrap();
+    }
+    assert_eq!((calls.admit(Slot(7), true, 1), calls.admit(Slot(8), true, 1)), (Err(Error::Busy), Ok(())));
+    calls.give_up(Priority::Emergency, 3);
+    assert!(calls.end(running));
+    let mut next = || calls.take_next(&mut pool, |head, block| (head, block.to_vec())).map(|(_, taken)| taken);
+    for id in 2..=7 {
+        let (head, block) = next().unwrap();
+        assert_eq!((head.id, head.deadline == Instant::START, &block[..]), (id, id == 3, &b"stop"[..]));
+    }
+    assert!(next().is_none() && !calls.any_waiting() && calls.held() == 0);
 }
 
 #[test]

@@ -37,6 +37,14 @@ impl<P: Port> Session<P> {
         let is_same = |known: &Granted| {
             known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))
         };
+        // It was overtaken on its way, in another class or on the other way: what was asked for last counts.
+        let moves_it = |slot| {
+            let function = cx.functions.function(slot);
+            slot == head.slot || function.is_some_and(|function| share_a_lease(service, Some(function.handler)))
+        };
+        if self.publishing.ordered_after(head.number).any(moves_it) {
+            return Err(Error::Replaced);
+        }
         let known = self.granted.iter().position(is_same);
         let earlier = known.and_then(|index| self.granted.get(index)).copied();
         // The safe hook of that lease is still to run, from `poll`. Granting now would let a new motion begin before it, and the hook
@@ -70,6 +78,7 @@ impl<P: Port> Session<P> {
         let (slot, generation) = (head.slot, head.generation);
         let granted = Granted { call: head.id, slot, generation, order, length, end };
         self.timers.lease = self.timers.lease.min(end);
+        self.publishing.note_order(slot, head.number);
         match known.and_then(|index| self.granted.get_mut(index)) {
             Some(known) => {
                 let replaced = core::mem::replace(known, granted).call;
@@ -147,7 +156,18 @@ impl<P: Port> Session<P> {
     #[inline(never)]
     pub(super) fn stop_orders(&mut self, cx: &mut Context<'_, P>, header: &RequestHeader) {
         let latch = Latch { by: self.identity().map_or(0, Identity::id), reason: 0 };
-        self.each_moved_by(cx, header.slot, header.generation, &mut |service| service.inhibit(cx.now, latch));
+        let charge = service_of(cx, header.slot, header.generation).and_then(Service::lease);
+        // Before the services, which may be locked: another thread may add one now.
+        if charge.is_none() {
+            cx.functions.stopped().inhibit(cx.now, latch);
+        }
+        // The words of all first: a port may wait for one of its locks, behind which what stops is dead already.
+        self.each_moved_by(cx, charge, &mut |service| {
+            if let Some(lease) = service.lease() {
+                lease.inhibit(cx.now, latch);
+            }
+        });
+        self.each_moved_by(cx, charge, &mut |service| service.inhibit(cx.now, latch));
         if self.was_stopped(cx) {
             self.timers.lease = cx.now;
         }
@@ -162,29 +182,29 @@ impl<P: Port> Session<P> {
         if head.deadline <= cx.now || head.cancelled != Cancelled::No {
             return Err(Error::Expired);
         }
-        let mut latched = None;
+        let charge = service_of(cx, head.slot, head.generation).and_then(Service::lease);
+        let (mut latched, mut any) = (None, false);
         self.publishing.actuators_due = true;
-        self.each_moved_by(cx, head.slot, head.generation, &mut |service| {
+        self.each_moved_by(cx, charge, &mut |service| {
             service.reset(cx.now, head.sent_at);
             latched = latched.or_else(|| service.lease().and_then(Lease::latch));
         });
+        self.each_moved_by(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
+        // A stop of all has ended as well once each that it has stopped is reset.
+        if charge.is_none() || !any {
+            cx.functions.stopped().reset(cx.now, head.sent_at);
+        }
         latched.map_or(Ok(()), |latch| Err(latch.into()))
     }
 
     /// The leased services that move what a function has in its charge: its own actuator, or all. One piece of code whatever
     /// is done with them.
     #[inline(never)]
-    fn each_moved_by(
-        &self,
-        cx: &Context<'_, P>,
-        slot: Slot,
-        generation: Generation,
-        act: &mut dyn FnMut(&dyn Service),
-    ) {
-        let charge = service_of(cx, slot, generation);
-        let all = charge.and_then(Service::lease).is_none();
-        for function in self.publishing.all_slots().filter_map(|slot| cx.functions.function(slot)) {
-            let is_meant = all || share_a_lease(charge, Some(function.handler));
+    fn each_moved_by(&self, cx: &Context<'_, P>, charge: Option<&Lease>, act: &mut dyn FnMut(&dyn Service)) {
+        // Also what this peer has not been shown.
+        for function in (0..cx.functions.places()).filter_map(|place| cx.functions.function(Slot(place))) {
+            let lease = function.handler.lease();
+            let is_meant = charge.is_none() || charge.zip(lease).is_some_and(|(one, other)| core::ptr::eq(one, other));
             if is_meant && function.attributes.lease.is_some() {
                 act(function.handler);
             }
@@ -249,7 +269,8 @@ impl<P: Port> Session<P> {
     #[inline(never)]
     pub(super) fn awaits_hook(&self, cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
         let mut awaits = false;
-        self.each_moved_by(cx, slot, generation, &mut |service| {
+        let charge = service_of(cx, slot, generation).and_then(Service::lease);
+        self.each_moved_by(cx, charge, &mut |service| {
             awaits |= service.lease().is_some_and(Lease::awaits_hook);
         });
         awaits

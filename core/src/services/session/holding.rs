@@ -207,7 +207,7 @@ impl<P: Port> Session<P> {
         match (pending, held) {
             (Some(pending), _) => self.requests.keep_unsent_release(pending),
             (None, Some(held)) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
-            (None, None) => drop(answered.map(|known| self.releases.push((known.slot, id)))),
+            (None, None) => drop(answered.map(|known| self.keep_release(known.slot, id))),
         }
         self.timers.release = cx.now + RETRY;
     }
@@ -226,8 +226,13 @@ impl<P: Port> Session<P> {
             return Ok(());
         }
         self.timers.release = cx.now + RETRY;
+        self.keep_release(slot, newest)
+    }
+
+    /// Calls of a function up to this one are still to be released in the stream.
+    fn keep_release(&mut self, slot: Slot, newest: CallId) -> Result<(), Error> {
         match self.releases.iter_mut().find(|(known, _)| *known == slot) {
-            Some((_, id)) => *id = newest,
+            Some((_, id)) => *id = newest.max(*id),
             None => self.releases.push((slot, newest)).map_err(|_| Error::Full(Limit::SendQueue))?,
         }
         Ok(())

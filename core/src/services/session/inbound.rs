@@ -506,6 +506,13 @@ impl<P: Port> Session<P> {
         length: usize,
         function: Result<Function<'f, dyn Service>, Error>,
     ) -> Result<(CallHead, Function<'f, dyn Service>), Error> {
+        // First of all what a stop stops, however late it is and whatever its handler has to wait for, or is refused for.
+        let stops = function.as_ref().ok().filter(|function| function.attributes.stop);
+        if let Some(function) = stops.filter(|_| self.publishing.told(header.slot, header.generation) == Told::Now)
+            && self.permit_call(cx, function, priority).is_ok()
+        {
+            self.stop_orders(cx, header);
+        }
         if seen == Seen::TooOld {
             return Err(Error::Stale);
         }
@@ -522,8 +529,9 @@ impl<P: Port> Session<P> {
         }
         let sent_at = sent_at_earliest(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
         // Counted from the earliest time at which it can have been sent: a command that was held up is never taken for a fresh one.
-        let deadline = sent_at + header.remaining;
-        if deadline <= cx.now {
+        // A stop never comes too late.
+        let deadline = if stops.is_some() { cx.now } else { sent_at } + header.remaining;
+        if deadline <= cx.now && stops.is_none() {
             return Err(Error::Expired);
         }
         // By what this peer was told, not by what the unit offers: a function that was shown to another node stays unknown here.
@@ -537,13 +545,9 @@ impl<P: Port> Session<P> {
             return Err(Error::UnknownFunction);
         }
         if cx.access.is_some() {
-            self.permit_call(cx, &function)?;
+            self.permit_call(cx, &function, priority)?;
         }
-        // Whatever its handler has to wait for, or is refused for.
-        if function.attributes.stop {
-            self.stop_orders(cx, header);
-        }
-        if priority != Priority::Emergency {
+        if priority != Priority::Emergency && !function.attributes.stop {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;
         }
         let is_emergency = is_emergency(function.attributes, priority);
@@ -561,6 +565,7 @@ impl<P: Port> Session<P> {
             resets: false,
             deadline,
             sent_at,
+            number: header.number,
         };
         Ok((head, function))
     }

@@ -394,7 +394,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Calls of this unit that wait for a reply.
-    pub const fn calls_in_flight(&self) -> usize {
+    pub fn calls_in_flight(&self) -> usize {
         self.requests.in_flight()
     }
 

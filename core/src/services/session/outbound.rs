@@ -10,7 +10,7 @@ use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
 use crate::services::heart::Renew;
-use crate::services::requests::CallId;
+use crate::services::requests::{CallId, Made};
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
@@ -43,6 +43,8 @@ pub struct RequestOptions {
     pub take_over: bool,
     /// An operator makes it, and not the unit's program: each of them holds for itself what it moves.
     pub operator: bool,
+    /// Its place among the calls of its link, where it was [made](Session::make) before it is sent; now if none.
+    pub made: Option<Made>,
     /// Tell what the call tells while it runs, if its function declares that.
     #[cfg(feature = "details")]
     pub progress: bool,
@@ -58,6 +60,7 @@ impl RequestOptions {
             renew: Renew::Never,
             take_over: false,
             operator: false,
+            made: None,
             #[cfg(feature = "details")]
             progress: false,
         }
@@ -81,6 +84,8 @@ struct Checked {
     priority: Priority,
     length: usize,
     lease: Option<Duration>,
+    /// It has a place where other calls find none.
+    is_urgent: bool,
 }
 
 impl<P: Port> Session<P> {
@@ -106,6 +111,12 @@ impl<P: Port> Session<P> {
         result
     }
 
+    /// A call is made that may have to wait for room: in [`RequestOptions::made`] it keeps its place among those that move the
+    /// same thing, and is refused as [`Error::Replaced`] behind a later one.
+    pub fn make(&mut self) -> Made {
+        self.requests.make()
+    }
+
     fn try_request(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -121,6 +132,7 @@ impl<P: Port> Session<P> {
         self.check_held(held, options, slot)?;
         let id = self.take_id(cx, &checked, wants_reply)?;
         checked.header.id = id.0;
+        checked.header.number = self.requests.made(options.made).number();
         let sent = match options.delivery {
             Delivery::BestEffort if self.peer_is_live() => self.send_best_effort(cx, &checked, parameters),
             _ => self.send_reliable(cx, &checked, parameters),
@@ -157,6 +169,7 @@ impl<P: Port> Session<P> {
             return Err(Error::UnknownFunction);
         }
         let priority = options.priority.unwrap_or(function.attributes.priority);
+        let is_urgent = function.attributes.is_urgent(priority);
         let length = block::measure(function.signature.arguments(), parameters)?;
         self.check_length(priority, options.delivery, length)?;
         if wants_reply {
@@ -166,7 +179,7 @@ impl<P: Port> Session<P> {
                 return Err(Error::BadConstraint);
             }
         }
-        if priority != Priority::Emergency {
+        if priority != Priority::Emergency && !is_urgent {
             self.requests.gate(cx.now, self.interval())?;
         }
         let (stamp, since) = self.clock.tell(cx.now);
@@ -187,8 +200,9 @@ impl<P: Port> Session<P> {
             remaining,
             stamp,
             since,
+            number: 0,
         };
-        Ok(Checked { header, priority, length, lease: function.attributes.lease })
+        Ok(Checked { header, priority, length, lease: function.attributes.lease, is_urgent })
     }
 
     fn check_length(&self, priority: Priority, delivery: Delivery, length: usize) -> Result<(), Error> {
@@ -209,7 +223,8 @@ impl<P: Port> Session<P> {
         let header = &checked.header;
         let id = if wants_reply {
             let (deadline, class) = (cx.now + header.remaining, checked.priority);
-            self.requests.open(header.slot, header.generation, deadline, class, checked.lease.is_some())?
+            let leased = checked.lease.is_some();
+            self.requests.open(header.slot, header.generation, deadline, class, leased, checked.is_urgent)?
         } else {
             self.requests.next_id()
         };
@@ -234,9 +249,7 @@ impl<P: Port> Session<P> {
         let Checked { header, priority, length, .. } = checked;
         let total = REQUEST_BYTES.saturating_add(*length);
         // Beside the stream, which may be blocked; both copies have one id, and the callee runs it once.
-        if *priority == Priority::Emergency {
-            self.send_emergency_datagram(cx, header, parameters);
-        }
+        let has_left = *priority == Priority::Emergency && self.send_emergency_datagram(cx, header, parameters);
         // A caller that waits is not kept waiting for others, and an emergency for no one.
         let hold = !header.wants_reply && *priority != Priority::Emergency && self.timers.may_gather(cx.now);
         let Self { link, theirs, .. } = self;
@@ -247,7 +260,11 @@ impl<P: Port> Session<P> {
             block::write(signature.arguments(), parameters, writer);
         };
         let sent = link.send_message(cx.mailman, cx.buffers, *priority, total, hold, write);
-        self.after_sending(cx, hold, sent)
+        match self.after_sending(cx, hold, sent) {
+            // What is before it in the stream are emergencies as well.
+            Err(Error::Full(_)) if has_left => Ok(()),
+            sent => sent,
+        }
     }
 
     /// What an attempt to send means for the messages that gather. A message that is refused leaves them where they
@@ -276,18 +293,21 @@ impl<P: Port> Session<P> {
         sent
     }
 
-    /// The second copy of an emergency; at-most-once removes the double.
+    /// The second copy of an emergency; at-most-once removes the double. Whether it has left, to a peer that reads datagrams.
     fn send_emergency_datagram(
         &mut self,
         cx: &mut Context<'_, P>,
         header: &RequestHeader,
         parameters: &ParametersView,
-    ) {
+    ) -> bool {
         let mut message = [0; EMERGENCY_BYTES];
-        let Some(signature) = self.theirs.function(header.slot).map(|function| function.signature) else { return };
+        let Some(signature) = self.theirs.function(header.slot).map(|function| function.signature) else {
+            return false;
+        };
         let length = write_message(&mut message, header, signature, parameters);
         let prefix = SessionBody::message_prefix(Priority::Emergency.to_wire());
-        self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
+        let sent = self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
+        sent && self.peer_is_live() && self.liveness.datagrams_pass()
     }
 
     fn send_best_effort(

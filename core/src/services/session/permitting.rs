@@ -2,6 +2,7 @@
 
 use super::publishing::Refusals;
 use super::{Remote, Session};
+use crate::config::Priority;
 use crate::distribution::function::Signature;
 use crate::distribution::function_list::{Function, Slot};
 use crate::error::Error;
@@ -59,12 +60,13 @@ impl<P: Port> Session<P> {
         &mut self,
         cx: &Context<'_, P>,
         function: &Function<'_, dyn Service>,
+        priority: Priority,
     ) -> Result<(), Error> {
         match decide(cx.access, self.remote.as_ref(), function.name(), Verb::Call) {
             Decision::Denied => Err(Error::NotAllowed),
             Decision::Allowed { rate: None, .. } => Ok(()),
-            // A stop never comes too often.
-            Decision::Allowed { .. } if function.attributes.stop => Ok(()),
+            // A stop never comes too often, nor does another emergency.
+            Decision::Allowed { .. } if function.attributes.is_urgent(priority) => Ok(()),
             Decision::Allowed { rate: Some(rate), .. } => match self.publishing.bucket(function.slot) {
                 Some(bucket) => bucket.take(cx.now, rate),
                 None => Err(Error::UnknownFunction),

@@ -24,6 +24,8 @@ pub struct Publication {
     ever: bool,
     /// The peer has released its requests up to this one.
     released: u32,
+    /// The highest number of a request that began an order.
+    ordered: u32,
     /// What the peer has left of the rate that it may call at.
     bucket: Bucket,
     /// Of a stream.
@@ -42,6 +44,8 @@ pub(super) enum Told {
 /// What one peer is to be told.
 pub(super) struct Publishing<S: Storage> {
     table: S::Slice<Publication>,
+    /// The highest number of a request that began an order of anything.
+    newest_order: u32,
     /// Of the unit's publications, when they were looked at last.
     pub(super) version: u32,
     dirty: bool,
@@ -82,6 +86,7 @@ impl<S: Storage> Publishing<S> {
     pub(super) fn new(table: S::Slice<Publication>) -> Self {
         Self {
             table,
+            newest_order: 0,
             version: 0,
             dirty: false,
             serial: 0,
@@ -139,6 +144,21 @@ impl<S: Storage> Publishing<S> {
     /// Whether the peer has released request `id`, so that it does not begin.
     pub(super) fn is_released(&self, slot: Slot, id: u32) -> bool {
         self.table.get(usize::from(slot.0)).is_some_and(|publication| id <= publication.released)
+    }
+
+    /// A request of this number has begun an order.
+    pub(super) fn note_order(&mut self, slot: Slot, number: u32) {
+        self.newest_order = self.newest_order.max(number);
+        if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
+            publication.ordered = publication.ordered.max(number);
+        }
+    }
+
+    /// The functions of which a later request than this one has begun an order.
+    pub(super) fn ordered_after(&self, number: u32) -> impl Iterator<Item = Slot> {
+        let table = if number < self.newest_order { &*self.table } else { &[] };
+        let later = table.iter().enumerate().filter(move |(_, publication)| publication.ordered > number);
+        later.map(|(index, _)| Slot(index as u16))
     }
 
     /// What the peer has left of the rate of a function.

@@ -380,6 +380,12 @@ impl LinuxNode {
         let log = service.log();
         let start = self.start;
         let mut options = ServiceOptions::new().priority(service.priority);
+        if service.stops_all {
+            options = options.stops_all();
+        }
+        if service.resets_all {
+            options = options.resets_all();
+        }
         if let Some(length) = service.lease {
             options = options.lease(length, move || log.stop(since(start)));
         }

@@ -401,6 +401,8 @@ fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
         })
     };
     let made = made.priority(service.priority);
+    let made = if service.stops_all { made.stops_all() } else { made };
+    let made = if service.resets_all { made.resets_all() } else { made };
     match service.lease {
         Some(length) => made.lease(length, move |unit| log.stop(unit.now())),
         None => made,

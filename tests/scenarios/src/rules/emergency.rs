@@ -7,13 +7,14 @@ use cara_sim::Path;
 
 use super::met;
 use crate::scenario::scenarios;
-use crate::{Fault, Service, Spec, World, millis, number, secs, text};
+use crate::{Fault, Pending, Service, Spec, World, millis, number, secs, text};
 
 scenarios![
     an_emergency_overtakes_a_long_message: "73, emergency", Own, [Path], ["bandwidth", "loss", "overtook"];
     without_its_priority_a_stop_waits_for_the_long_message: "73 (priority removed)", Own, [Path],
         ["bandwidth", "waited"];
     an_emergency_ignores_the_interval_and_finds_room: "73, emergency", Rough, [], ["RequestsRun"];
+    emergencies_leave_when_all_calls_are_in_flight: "nothing holds up a stop", Light, [], ["left"];
 ];
 
 /// A stop behind 20,000 characters on a 1 Mbit/s path with 1 % loss. Returns when each of the two arrived.
@@ -83,6 +84,35 @@ fn an_emergency_ignores_the_interval_and_finds_room(world: &mut dyn World) {
         world.measured("emergency at a full vehicle", world.now().since(asked));
     }
     manager.change(|limits| limits.minimum_interval = millis(0));
+    for call in &calls {
+        let _ = world.finish(call);
+    }
+}
+
+/// Of 80 calls as many are in flight as the manager has room for, and the others wait for it.
+fn emergencies_leave_when_all_calls_are_in_flight(world: &mut dyn World) {
+    let stops = ["stop", "halt"].map(|name| Service::numbered(name).priority(Priority::Emergency));
+    let slow = Service::numbered("slow").takes(secs(4));
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = Spec::agv("agv", 7).service(&stops[0]).service(&stops[1]).service(&slow);
+    world.add(agv.limits(|limits| limits.calls_per_peer = 64));
+    for function in ["stop", "halt", "slow"] {
+        met(world, &manager, "agv", function);
+    }
+    let patient = RequestOptions { timeout: Some(secs(12)), ..RequestOptions::default() };
+    let calls: Vec<_> = (0..80).map(|n| manager.begin("agv", "slow", &number("n", n), patient)).collect();
+    world.wait("the AGV works", || slow.log().runs() >= 1, secs(20));
+    world.run_for(millis(100));
+    let asked = world.now();
+    let stopping: Vec<_> =
+        ["stop", "halt"].map(|function| manager.begin("agv", function, &number("n", 1), patient)).into();
+    world.wait("both are answered", || stopping.iter().all(Pending::is_over), secs(6));
+    assert!(stopping.iter().all(|call| call.outcome() == Some(Ok(()))), "{}", world.story());
+    assert!(stops.iter().all(|stop| stop.log().runs() == 1));
+    if calls.iter().filter(|call| !call.is_over()).count() > 0 {
+        world.measured("emergency of a caller whose calls are all in flight", world.now().since(asked));
+        world.reached("left");
+    }
     for call in &calls {
         let _ = world.finish(call);
     }

@@ -1,21 +1,104 @@
 //! A lease belongs to one call: what is not waited for stops, and an older call never moves again.
 
+use cara_core::config::Priority;
 use cara_core::error::Error;
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
-use cara_core::services::session::RequestOptions;
+use cara_core::services::session::{Delivery, RequestOptions};
 
-use super::pair;
+use super::{met, pair};
 use crate::scenario::scenarios;
-use crate::{Seen, Service, World, number, secs};
+use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
 
 scenarios![
     a_call_that_is_not_answered_in_time_stops_at_once: "lease of a service", Light, [], ["stopped"];
     a_released_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
+    a_call_made_earlier_never_replaces_a_later_one: "order of calls", Own, [Freeze], ["overtaken"];
+    a_call_that_waits_keeps_its_place: "order of calls", Light, [], ["waited"];
+    a_stop_of_all_outlasts_every_change_of_the_list: "latch", Light, [], ["stopped"];
     a_replaced_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
 ];
 
 const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(60)), ..RequestOptions::renewing(Renew::Process) };
+
+/// The later one goes as a datagram beside a stream that is held up.
+fn a_call_made_earlier_never_replaces_a_later_one(world: &mut dyn World) {
+    let service = mover();
+    let log = service.log();
+    let (manager, agv) = pair(world, &service);
+    world.run_for(secs(1));
+    world.fault(Fault::FreezeStreams(&manager, &agv, secs(4)));
+    let first = manager.request_with("agv", "drive", &number("n", 1), PATIENT).expect("it is accepted");
+    let best_effort = RequestOptions { delivery: Delivery::BestEffort, ..PATIENT };
+    manager.request_with("agv", "drive", &number("n", 2), best_effort).expect("it is accepted");
+    world.wait("the second moves", || log.values().contains(&2), secs(20));
+    let refused = Seen::Failed(first, Error::Replaced);
+    world.wait("the first is refused", || manager.count(|event| *event == refused) == 1, secs(30));
+    assert!(agv.lease_is_live("drive") && !log.values().contains(&1) && log.stops().is_empty(), "{}", world.story());
+    world.reached("overtaken");
+    manager.release("agv", "drive").expect("it is connected");
+    world.wait("the safe hook runs", || log.stops().len() == 1, secs(20));
+}
+
+/// The first is made before the minimum interval lets it go, and the second, in between, is an asynchronous one.
+fn a_call_that_waits_keeps_its_place(world: &mut dyn World) {
+    let (service, other) = (mover(), Service::numbered("note"));
+    let log = service.log();
+    let manager = world.add(Spec::manager("manager", 1).limits(|limits| limits.minimum_interval = secs(2)));
+    let agv = world.add(Spec::agv("agv", 7).service(&service).service(&other));
+    met(world, &manager, "agv", "drive");
+    met(world, &manager, "agv", "note");
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
+    let first = manager.begin("agv", "drive", &number("n", 1), PATIENT);
+    world.run_for(millis(500));
+    if first.is_over() || !log.values().is_empty() {
+        return;
+    }
+    manager.change(|limits| limits.minimum_interval = millis(0));
+    manager.request_with("agv", "drive", &number("n", 2), PATIENT).expect("it is accepted");
+    manager.change(|limits| limits.minimum_interval = secs(2));
+    let asked = world.finish(&first).map(drop);
+    if asked == Err(Error::Replaced) {
+        world.reached("waited");
+    }
+    assert!(agv.lease_is_live("drive") && log.values().last() != Some(&1), "{asked:?}{}", world.story());
+    manager.release("agv", "drive").expect("it is connected");
+    world.wait("the safe hook runs", || !log.stops().is_empty(), secs(20));
+}
+
+/// A service that is replaced, one that is added, and one that is removed and added again.
+fn a_stop_of_all_outlasts_every_change_of_the_list(world: &mut dyn World) {
+    let leased = |name: &str| Service::numbered(name).lease(secs(60));
+    let (drive, halt) = (leased("drive"), Service::numbered("halt").priority(Priority::Emergency).stops_all());
+    let manager = world.add(Spec::manager("manager", 1));
+    let free = Service::numbered("free").resets_all();
+    let agv = world.add(Spec::agv("agv", 7).service(&drive).service(&halt).service(&free));
+    met(world, &manager, "agv", "free");
+    met(world, &manager, "agv", "drive");
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    assert_eq!(world.ask(&manager, "agv", "halt", &mut number("n", 1)), Ok(()));
+    let stopped = Err(Error::Inhibited { by: 1, reason: 0 });
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 2)), stopped);
+    let (drive, lift, tilt) = (leased("drive"), leased("lift"), leased("tilt"));
+    agv.add_service(&tilt).expect("there is room");
+    agv.remove_service("tilt").expect("it is there");
+    agv.replace_service(&drive).expect("it is there");
+    agv.add_service(&lift).expect("there is room");
+    agv.add_service(&tilt).expect("there is room");
+    agv.publish().expect("it can be published");
+    met(world, &manager, "agv", "lift");
+    met(world, &manager, "agv", "tilt");
+    world.run_for(secs(1));
+    for function in ["drive", "lift", "tilt"] {
+        assert_eq!(world.ask(&manager, "agv", function, &mut number("n", 3)), stopped, "{function}");
+    }
+    world.reached("stopped");
+    assert_eq!(world.ask(&manager, "agv", "free", &mut number("n", 1)), Ok(()));
+    for function in ["drive", "lift", "tilt"] {
+        assert_eq!(world.ask(&manager, "agv", function, &mut number("n", 4)), Ok(()), "{function}");
+    }
+    assert_eq!([&drive, &lift, &tilt].map(|service| service.log().runs()), [1; 3]);
+}
 
 /// Moves once a second while it is wanted. Its lease is longer than any wait here, so that time alone ends nothing.
 fn mover() -> Service {

@@ -66,8 +66,10 @@ impl UnitHandle {
         let peer = peer.into();
         let timeout = options.timeout.unwrap_or(self.constraints()?.request_timeout);
         let deadline = self.now() + timeout;
+        let index = self.link_to(&peer)?;
+        let made = self.machine(|machine, network| machine.links.with(network, index, |session, _| session.make()))?;
         loop {
-            let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..options };
+            let options = RequestOptions { timeout: Some(deadline.since(self.now())), made, ..options };
             match self.call(&peer, function, parameters, &options) {
                 Ok(call) => {
                     let results = call.results().await.map_err(|failed| failed.error)?;

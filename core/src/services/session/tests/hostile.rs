@@ -45,6 +45,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
                     remaining: Duration::from_millis(u64::from(one) * 100),
                     stamp,
                     since: Duration::from_micros(two.into()),
+                    number: one,
                 };
                 [&header.encode()[..], &block].concat()
             }

@@ -50,6 +50,7 @@ fn an_emergency_above_its_limit_is_refused() {
             remaining: Duration::from_secs(1),
             stamp: pair.agv.now.as_micros(),
             since: Duration::ZERO,
+            number: id,
         };
         let mut block = vec![b'x'; 8 + length];
         block[..8].copy_from_slice(&(length as u64).to_le_bytes());

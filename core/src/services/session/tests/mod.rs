@@ -19,6 +19,7 @@ mod gathering;
 mod hearts;
 mod hello;
 mod hostile;
+mod latches;
 mod leases;
 mod limits;
 mod lines;
@@ -26,10 +27,12 @@ mod lists;
 mod liveness;
 mod net;
 mod orders;
+mod overtaking;
 mod pair;
 mod requests;
 mod setup;
 mod side;
+mod stops;
 #[cfg(feature = "streams")]
 mod streams;
 

@@ -142,6 +142,7 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
         remaining: Duration::from_secs(1),
         stamp: pair.agv.now.as_micros(),
         since: Duration::ZERO,
+        number: 1,
     };
     // Too short, too long, a text that is no UTF-8.
     let no_text = [&[0; 8][..], &[3, 0, 0, 0, 0, 0, 0, 0], &[0xFF, 0xFE, 0xFD, 0, 0, 0, 0, 0]].concat();

@@ -22,6 +22,12 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
     let (unit, board) = (node.unit()?, node.board());
     let lease: &'static Lease = Box::leak(Box::new(Lease::new()));
     let mut options = ServiceOptions::new().priority(service.priority);
+    if service.stops_all {
+        options = options.stops_all();
+    }
+    if service.resets_all {
+        options = options.resets_all();
+    }
     if let Some(length) = service.lease {
         let log = service.log();
         options = options.lease(length, lease, Box::leak(Box::new(move || log.stop(now()))));

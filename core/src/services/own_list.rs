@@ -1,0 +1,76 @@
+//! Changes of a unit's own list of functions, and what they leave stopped: one rule for all ports.
+//!
+//! A latch is of what moves, and of the unit where all was stopped. It survives every change of the list: what is added starts
+//! latched where the unit is; what takes the place of a latched service is latched; what is removed leaves its latch to the unit.
+//! It ends by a reset alone.
+
+use super::lease::{Lease, Service};
+use crate::distribution::function::{Attributes, Definition, Signature};
+use crate::distribution::function_list::{FunctionList, Slot};
+use crate::error::Error;
+use crate::storage::Storage;
+
+impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
+    /// Adds a function; [`Error::NameTaken`] or [`Error::Full`] leave the list unchanged. What it moves is latched where all of the
+    /// unit is.
+    pub fn add_function(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
+        self.add_signature(definition.signature(), attributes, handler)
+    }
+
+    /// As [`add_function`](Self::add_function), by a signature.
+    pub fn add_signature(
+        &mut self,
+        signature: Signature<'_>,
+        attributes: Attributes,
+        handler: H,
+    ) -> Result<Slot, Error> {
+        let is_known = handler.lease().is_some_and(|lease| self.moves(lease));
+        let slot = self.insert(signature, attributes, handler)?;
+        let lease = self.function(slot).and_then(|function| function.handler.lease());
+        if let Some(lease) = lease.filter(|_| !is_known) {
+            lease.inherit(self.stopped());
+        }
+        Ok(slot)
+    }
+
+    /// Puts another function in the place of the one of its name; [`Error::UnknownFunction`] or [`Error::Full`] leave
+    /// the list unchanged. What it moves is latched where the one before it was.
+    pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
+        self.replace_signature(definition.signature(), attributes, handler)
+    }
+
+    /// As [`replace`](Self::replace), by a signature.
+    pub fn replace_signature(
+        &mut self,
+        signature: Signature<'_>,
+        attributes: Attributes,
+        handler: H,
+    ) -> Result<Slot, Error> {
+        let replaced = self.find(signature.name()).and_then(|slot| self.function(slot));
+        match (handler.lease(), replaced.and_then(|function| function.handler.lease())) {
+            (Some(lease), Some(replaced)) => lease.inherit(replaced.latch_word()),
+            (Some(lease), None) if !self.moves(lease) => lease.inherit(self.stopped()),
+            (None, Some(replaced)) => self.stopped().inherit(replaced.latch_word()),
+            _ => {}
+        }
+        self.swap(signature, attributes, handler)
+    }
+
+    /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`]. Where what it moved is latched and no
+    /// other function moves it, all that is added later is, until a reset of all.
+    pub fn remove(&mut self, name: &str) -> Result<(Slot, H), Error> {
+        let (slot, handler) = self.take(name)?;
+        if let Some(lease) = handler.lease().filter(|lease| !self.moves(lease)) {
+            self.stopped().inherit(lease.latch_word());
+        }
+        Ok((slot, handler))
+    }
+
+    /// Whether a function of the list has this lease.
+    fn moves(&self, lease: &Lease) -> bool {
+        self.iter().filter_map(|function| function.handler.lease()).any(|known| core::ptr::eq(known, lease))
+    }
+}
+
+#[cfg(test)]
+impl Service for u32 {}

@@ -1,0 +1,155 @@
+//! A latch ends by a reset alone: it survives each change of a vehicle's list of functions.
+
+use std::rc::Rc;
+
+use super::none;
+use super::pair::Pair;
+use super::setup::{Handler, Run};
+use crate::config::Priority;
+use crate::distribution::function::{Attributes, Definition};
+use crate::distribution::function_list::Slot;
+use crate::error::Error;
+use crate::services::lease::{Latch, Lease};
+use crate::time::Duration;
+
+const LEASE: Duration = Duration::from_millis(500);
+/// Longer than what is rounded away of the time of a latch.
+const MOMENT: Duration = Duration::from_millis(5);
+const STOP: Attributes =
+    Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::NORMAL };
+const RESET: Attributes = Attributes { priority: Priority::Normal, stop: false, reset: true, ..STOP };
+const MOVES: Attributes = Attributes { lease: Some(LEASE), ..Attributes::NORMAL };
+
+/// A vehicle whose `go()` moves the drive; `halt()` stops all, `free()` resets all, `free_drive()` the drive.
+fn vehicle() -> (Pair, Slot) {
+    let mut pair = Pair::live();
+    let go = pair.agv.offer_leased("go()", LEASE);
+    pair.agv.offer_control("halt()", STOP, None);
+    pair.agv.offer_control("free()", RESET, None);
+    pair.agv.offer_control("free_drive()", RESET, Some(go));
+    pair.publish();
+    (pair, go)
+}
+
+fn call(pair: &mut Pair, function: &str) -> Result<(), Error> {
+    pair.run(MOMENT);
+    let id = pair.manager.call(function, &none()).unwrap();
+    pair.settle();
+    if !pair.agv.held.is_empty() {
+        pair.agv.answer_held(Ok(&none()));
+        pair.settle();
+    }
+    pair.manager.outcome(id).unwrap().map(drop)
+}
+
+/// A handler of a drive of its own.
+fn fresh() -> (Handler, Rc<Lease>) {
+    let lease = Rc::<Lease>::default();
+    (Handler::new(Run::Now(|_| Ok(())), Some(Rc::clone(&lease))), lease)
+}
+
+fn stopped(by: u32) -> Result<(), Error> {
+    Err(Error::Inhibited { by, reason: 0 })
+}
+
+#[test]
+fn what_is_added_after_a_stop_of_all_is_stopped_until_a_reset_of_all() {
+    let (mut pair, _) = vehicle();
+    assert_eq!(call(&mut pair, "halt"), Ok(()));
+    pair.agv.offer_leased("lift()", LEASE);
+    pair.publish();
+    assert_eq!(call(&mut pair, "lift"), stopped(1));
+    assert_eq!(call(&mut pair, "free"), Ok(()));
+    pair.agv.offer_leased("tilt()", LEASE);
+    pair.publish();
+    for function in ["go", "lift", "tilt"] {
+        assert_eq!(call(&mut pair, function), Ok(()), "{function}");
+    }
+}
+
+#[test]
+fn a_stop_of_all_has_ended_when_each_thing_that_it_stopped_is_reset() {
+    let (mut pair, _) = vehicle();
+    assert_eq!(call(&mut pair, "halt"), Ok(()));
+    let lift = pair.agv.offer_leased("lift()", LEASE);
+    pair.agv.offer_control("free_lift()", RESET, Some(lift));
+    pair.publish();
+    assert_eq!(call(&mut pair, "free_drive"), Ok(()));
+    assert_eq!((call(&mut pair, "go"), call(&mut pair, "lift")), (Ok(()), stopped(1)));
+    pair.agv.offer_leased("tilt()", LEASE);
+    pair.publish();
+    assert_eq!(call(&mut pair, "tilt"), stopped(1), "not all is reset");
+    assert_eq!((call(&mut pair, "free_lift"), call(&mut pair, "free")), (Ok(()), Ok(())));
+    pair.agv.functions.remove("tilt").unwrap();
+    pair.agv.offer_leased("tilt()", LEASE);
+    pair.publish();
+    assert_eq!(call(&mut pair, "tilt"), Ok(()));
+}
+
+#[test]
+fn what_takes_the_place_of_a_stopped_service_is_stopped_and_only_that() {
+    for stops_all in [true, false] {
+        let (mut pair, go) = vehicle();
+        pair.agv.offer_leased("lift()", LEASE);
+        pair.publish();
+        if stops_all {
+            assert_eq!(call(&mut pair, "halt"), Ok(()));
+        } else {
+            let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+            word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+        }
+        let (handler, drive) = fresh();
+        pair.agv.functions.replace(&Definition::parse("go()").unwrap(), MOVES, handler).unwrap();
+        pair.publish();
+        let by = u32::from(stops_all);
+        assert_eq!(call(&mut pair, "go"), stopped(by));
+        assert_eq!(call(&mut pair, "lift"), if stops_all { stopped(by) } else { Ok(()) });
+        assert_eq!(call(&mut pair, "free"), Ok(()));
+        assert!(!drive.is_inhibited());
+        assert_eq!(call(&mut pair, "go"), Ok(()));
+    }
+}
+
+#[test]
+fn a_stopped_service_that_is_removed_and_added_again_is_stopped() {
+    let (mut pair, go) = vehicle();
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    pair.agv.functions.remove("free_drive").unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    pair.agv.functions.remove("go").unwrap();
+    pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    assert_eq!(call(&mut pair, "go"), stopped(0));
+    assert_eq!((call(&mut pair, "free"), call(&mut pair, "go")), (Ok(()), Ok(())));
+}
+
+#[test]
+fn a_drive_that_was_reset_by_itself_is_not_stopped_again_by_what_comes_to_move_it() {
+    let (mut pair, go) = vehicle();
+    assert_eq!((call(&mut pair, "halt"), call(&mut pair, "free_drive")), (Ok(()), Ok(())));
+    pair.agv.offer_sharing("dock()", LEASE, go);
+    pair.publish();
+    assert_eq!((call(&mut pair, "dock"), call(&mut pair, "go")), (Ok(()), Ok(())));
+}
+
+/// A vehicle that had been stopped when it lost power, and can keep a bit, or whose program says so.
+#[test]
+fn a_unit_that_starts_stopped_stops_all_that_it_adds() {
+    let mut pair = Pair::live();
+    pair.agv.functions.stopped().inhibit(pair.agv.now, Latch { by: 0, reason: 7 });
+    pair.agv.offer_leased("go()", LEASE);
+    pair.agv.offer_control("free()", RESET, None);
+    pair.publish();
+    assert_eq!(call(&mut pair, "go"), Err(Error::Inhibited { by: 0, reason: 7 }));
+    assert_eq!((call(&mut pair, "free"), call(&mut pair, "go")), (Ok(()), Ok(())));
+}
+
+/// A stop of all also stops what the caller does not see.
+#[test]
+fn a_stop_of_all_stops_what_is_shown_to_other_nodes() {
+    let (mut pair, _) = vehicle();
+    let (handler, drive) = fresh();
+    pair.agv.functions.add_function(&Definition::parse("hidden()").unwrap(), MOVES, handler).unwrap();
+    assert_eq!(call(&mut pair, "halt"), Ok(()));
+    assert!(drive.is_inhibited());
+}
