@@ -123,7 +123,7 @@ impl<T: Send + 'static> Engine<T> {
         self.accounts.hooks_late.clone()
     }
 
-    fn port_readings(&self, held: &Held) -> [Reading; 14] {
+    fn port_readings(&self, held: &Held) -> [Reading; 15] {
         // One that is stuck has not counted itself.
         let functions = self.functions();
         let actuators = functions.iter().filter_map(|function| function.handler.actuator.as_ref());
@@ -138,6 +138,11 @@ impl<T: Send + 'static> Engine<T> {
                 "ConnectionsRefused",
                 "Connections dropped because as many links were open as may be.",
                 load(&self.accounts.connections_refused),
+            ),
+            count(
+                "AuditLinesLost",
+                "Lines of the audit log that its disk did not take, or not in time.",
+                self.audit_lines_lost(),
             ),
             count("HooksLate", "Safe hooks that took longer than 100 ms.", load(&self.accounts.hooks_late)),
             count(

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, Question};
 use cara_web::{Arguments, Cancel, Connection, Unit};
@@ -61,7 +61,7 @@ struct Way {
 impl Connection for Way {
     fn ask(&mut self, question: &Question, each: &mut dyn FnMut(Answer) -> ControlFlow<()>) -> anyhow::Result<()> {
         let wanted = self.wanted.clone();
-        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire))
+        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire).then(Instant::now))
     }
 
     fn cancel(&self) -> anyhow::Result<Cancel> {

@@ -6,7 +6,7 @@ mod running;
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::CommunicationSystem;
 use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
@@ -210,16 +210,16 @@ impl Operator {
         }
     }
 
-    /// Asks, and passes on each answer, a failure too, until that says `Break`; of a unit of this process also until `wanted`
-    /// says `false`.
+    /// Asks, and passes on each answer, a failure too, until that says `Break`; of a unit of this process also until `lives`
+    /// says that the client has gone, or that its last sign of life is too old.
     pub(crate) fn pass_on(
         &mut self,
         question: &Question,
         each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
-        wanted: &dyn Fn() -> bool,
+        lives: &dyn Fn() -> Option<Instant>,
     ) -> anyhow::Result<()> {
         match &mut self.unit {
-            Unit::Own(system) => execute_while(system, question, each, wanted),
+            Unit::Own(system) => execute_while(system, question, each, lives),
             Unit::Running(client) => running::pass_on(client, question, each)?,
         }
         Ok(())

@@ -8,6 +8,7 @@ mod documents;
 mod failing;
 mod giving_up;
 mod holding;
+mod hung;
 mod managers;
 mod measuring;
 mod scanning;

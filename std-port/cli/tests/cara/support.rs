@@ -75,9 +75,13 @@ impl Stage {
 
     pub(crate) fn start_manager_with(&mut self, more: &[&str]) {
         let mut command = self.command(&["node", "--name", "manager", "--id", "1"]);
-        command.args(more);
-        let manager = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
-        self.manager = Some(manager);
+        command.args(more).stdout(Stdio::null()).stderr(Stdio::inherit());
+        self.adopt_manager(&mut command);
+    }
+
+    /// Starts a command that is `manager/1`, and waits until it answers.
+    pub(crate) fn adopt_manager(&mut self, command: &mut Command) {
+        self.manager = Some(command.stdin(Stdio::null()).spawn().unwrap());
         let start = Instant::now();
         while self.cara(&["scan", "--unit", "manager/1"]).code != 0 {
             assert!(start.elapsed() < PATIENCE, "the manager does not answer");
@@ -236,14 +240,16 @@ impl Ran {
 /// A command that runs on, read line by line.
 pub(crate) struct Running {
     child: Child,
+    /// Not the child's, which closes it when it waits.
+    typed: Option<std::process::ChildStdin>,
     lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
 }
 
 impl Running {
     pub(crate) fn start(mut command: Command) -> Self {
-        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        Self { child, lines }
+        Self { typed: child.stdin.take(), child, lines }
     }
 
     /// The next line that contains `text`; all before it are dropped.
