@@ -91,10 +91,11 @@ impl io::Write for LineQueue {
 fn write_all(queued: &Receiver<Line>, lost: &AtomicU64, mut write: impl FnMut(&[u8], u64) -> io::Result<()>) {
     for line in queued {
         match line {
-            Line::Text(text) if write(&text, lost.load(Ordering::Relaxed)).is_err() => {
-                drop(lost.fetch_add(1, Ordering::Relaxed))
+            Line::Text(text) => {
+                if write(&text, lost.load(Ordering::Relaxed)).is_err() {
+                    lost.fetch_add(1, Ordering::Relaxed);
+                }
             }
-            Line::Text(_) => {}
             // The flush may have given up.
             Line::Flushed(flushed) => drop(flushed.send(())),
         }

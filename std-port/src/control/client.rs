@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::lines::{Line, Lines};
-use super::place::{self, PlaceError, directory, own_uid, peer_uid};
+use super::place::{self, PlaceError, directories, own_uid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
 use super::server::{FULL, full};
 use crate::sys::epoll::wait_readable;
@@ -76,9 +76,9 @@ impl RunningUnit {
 #[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum ControlError {
-    /// No unit answers in the directory.
-    #[error("no manager runs here (looked in {0}): start one, or be the manager yourself with --as NAME/ID")]
-    NoneRunning(PathBuf),
+    /// No unit answers at the socket, or in the directories.
+    #[error("no manager runs here (looked in {}): start one, or be the manager yourself with --as NAME/ID", paths(.0))]
+    NoneRunning(Vec<PathBuf>),
     /// Units answer, and none of them is the one that is wanted.
     #[error("no manager '{wanted}' runs here; there are {}", list(running))]
     NotRunning {
@@ -137,6 +137,10 @@ fn list(units: &[RunningUnit]) -> String {
     names.join(", ")
 }
 
+fn paths(paths: &[PathBuf]) -> String {
+    paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
 impl From<PlaceError> for ControlError {
     fn from(error: PlaceError) -> Self {
         match error {
@@ -151,9 +155,26 @@ impl From<PlaceError> for ControlError {
     }
 }
 
-/// The units with a socket in the [directory] of control sockets; see [`running_in`].
+/// The units with a socket in the first of the [directories] of control sockets that has any; see [`running_in`].
 pub fn running() -> Result<Vec<RunningUnit>, ControlError> {
-    running_in(&directory())
+    first_of(&directories(), |directory| running_in(directory))
+}
+
+/// What the first directory has that has anything. An error of one, such as that others can enter it, counts where no
+/// other one has anything.
+pub fn first_of(
+    directories: &[PathBuf],
+    look: impl Fn(&Path) -> Result<Vec<RunningUnit>, ControlError>,
+) -> Result<Vec<RunningUnit>, ControlError> {
+    let mut nothing = Ok(Vec::new());
+    for directory in directories {
+        match look(directory) {
+            Ok(found) if found.is_empty() => {}
+            Ok(found) => return Ok(found),
+            error => nothing = nothing.and(error),
+        }
+    }
+    nothing
 }
 
 /// The units with a socket in a directory: those that answer, and those that run and cannot be asked now.
@@ -247,17 +268,21 @@ impl Client {
 
     /// Connects to the only unit that runs, or to the one that is meant by `NAME/ID` or `NAME`.
     pub fn find(unit: Option<&str>) -> Result<Self, ControlError> {
-        Self::find_in(&directory(), unit)
+        Self::find_among(&directories(), unit)
     }
 
     /// As [`find`](Self::find), with the sockets of a directory.
     pub fn find_in(directory: &Path, unit: Option<&str>) -> Result<Self, ControlError> {
-        let running = match unit {
-            Some(wanted) => running_called(directory, wanted)?,
-            None => running_in(directory)?,
-        };
+        Self::find_among(&[directory.to_owned()], unit)
+    }
+
+    fn find_among(directories: &[PathBuf], unit: Option<&str>) -> Result<Self, ControlError> {
+        let running = first_of(directories, |directory| match unit {
+            Some(wanted) => running_called(directory, wanted),
+            None => running_in(directory),
+        })?;
         match &running[..] {
-            [] => Err(none(running_in(directory)?, directory, unit)),
+            [] => Err(none(first_of(directories, running_in)?, directories, unit)),
             [only] => only.refusal().map_or_else(|| Self::connect(&only.path), Err),
             _ => Err(ControlError::Several(running)),
         }
@@ -334,10 +359,10 @@ impl Closer {
 }
 
 /// None of the units that run is meant.
-fn none(running: Vec<RunningUnit>, directory: &Path, wanted: Option<&str>) -> ControlError {
+fn none(running: Vec<RunningUnit>, directories: &[PathBuf], wanted: Option<&str>) -> ControlError {
     match wanted.filter(|_| !running.is_empty()) {
         Some(wanted) => ControlError::NotRunning { wanted: wanted.to_owned(), running },
-        None => ControlError::NoneRunning(directory.to_owned()),
+        None => ControlError::NoneRunning(directories.to_owned()),
     }
 }
 
@@ -350,7 +375,9 @@ fn dial(path: &Path) -> Result<UnixStream, ControlError> {
             Err(error) => error,
         };
         return Err(match error.kind() {
-            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => ControlError::NoneRunning(path.to_owned()),
+            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => {
+                ControlError::NoneRunning(vec![path.to_owned()])
+            }
             io::ErrorKind::PermissionDenied => {
                 ControlError::NotAllowed { path: path.to_owned(), reason: error.to_string() }
             }

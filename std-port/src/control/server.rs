@@ -6,9 +6,9 @@ use std::io::{self, Write};
 use std::net::Shutdown;
 use std::ops::ControlFlow;
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -48,6 +48,8 @@ const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
 const GIVES_WAY: Duration = Duration::from_secs(1);
 /// Samples are batched for at most this long, so that writing them disturbs the measurement less.
 const GATHER: Duration = Duration::from_millis(50);
+/// Between two looks whether the socket is still there.
+const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 /// How long a stop waits for all threads together.
 const PATIENCE: Duration = Duration::from_secs(1);
 const WAKER: u64 = 0;
@@ -55,7 +57,6 @@ const LISTENER: u64 = 1;
 
 /// The server of one unit. Dropping it ends nothing: [`Server::stop`] does.
 pub(crate) struct Server {
-    place: Place,
     shared: Arc<Shared>,
 }
 
@@ -65,6 +66,17 @@ struct Shared {
     idle_limit: Duration,
     audit: Option<Arc<Audit>>,
     connections: Mutex<Connections>,
+    socket: Mutex<Socket>,
+    /// Told when the unit stops.
+    stopped: Condvar,
+}
+
+/// Where clients find the unit.
+#[derive(Default)]
+struct Socket {
+    place: Option<Place>,
+    /// One that was made again, for the thread that accepts.
+    fresh: Option<UnixListener>,
 }
 
 #[derive(Default)]
@@ -91,31 +103,39 @@ impl Connections {
 }
 
 impl Server {
-    /// Answers questions about `system` at `path`. The handle must not be one that keeps the unit running.
+    /// Answers questions about `system` at the first of `paths`, and where that vanishes at the first that can be opened. The handle
+    /// must not be one that keeps the unit running.
     pub(super) fn open<T: Send + 'static>(
-        path: &Path,
+        paths: Vec<PathBuf>,
         audit: Option<Arc<Audit>>,
         system: CommunicationSystem<T>,
     ) -> Result<Self, PlaceError> {
-        let (place, listener) = Place::open(path)?;
-        let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| shared.accept_with(listener, system));
+        let path = paths.first().cloned().unwrap_or_default();
+        let (place, listener) = Place::open(&path)?;
+        let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| {
+            lock(&shared.socket).place = Some(place.clone());
+            shared.keep_socket(paths)?;
+            shared.accept_with(listener, system)
+        });
         match started {
-            Ok(shared) => Ok(Self { place, shared }),
+            Ok(shared) => Ok(Self { shared }),
             Err(error) => {
                 place.remove();
-                Err(PlaceError::System { path: path.to_owned(), error })
+                Err(PlaceError::System { path, error })
             }
         }
     }
 
-    pub(crate) fn path(&self) -> &Path {
-        self.place.path()
+    pub(crate) fn path(&self) -> Option<PathBuf> {
+        Some(lock(&self.shared.socket).place.as_ref()?.path().to_owned())
     }
 
     /// Ends all connections and threads except the calling one; waits only for a bounded time for a stuck one.
     pub(crate) fn stop(&self) {
-        self.place.remove();
         self.shared.stopping.store(true, Ordering::Release);
+        let place = lock(&self.shared.socket).place.take();
+        place.inspect(Place::remove);
+        self.shared.stopped.notify_all();
         self.shared.waker.wake();
         let threads = {
             let mut connections = lock(&self.shared.connections);
@@ -130,7 +150,58 @@ impl Server {
 impl Shared {
     fn new(idle_limit: Duration, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
         let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
-        Ok(Arc::new(Self { waker, stopping, idle_limit, audit, connections }))
+        let (socket, stopped) = (Mutex::default(), Condvar::new());
+        Ok(Arc::new(Self { waker, stopping, idle_limit, audit, connections, socket, stopped }))
+    }
+
+    /// Makes the socket again when it has vanished, in a thread that nothing waits for: its directory may be on a disk that
+    /// hangs.
+    fn keep_socket(self: &Arc<Self>, paths: Vec<PathBuf>) -> io::Result<()> {
+        let own = self.clone();
+        let thread = std::thread::Builder::new().name("cara-socket".into()).spawn(move || own.look_after(&paths))?;
+        lock(&self.connections).threads.push(thread.into());
+        Ok(())
+    }
+
+    fn look_after(&self, paths: &[PathBuf]) {
+        let mut is_told = false;
+        while let Some(place) = self.await_next_look() {
+            if place.is_there() {
+                continue;
+            }
+            // What stands above a folder of the system's is not ours to make.
+            let is_below = |path: &PathBuf| path.ancestors().nth(2).is_some_and(Path::is_dir);
+            let usable = paths.iter().enumerate().filter(|(number, path)| *number == 0 || is_below(path));
+            let opened = usable.map(|(_, path)| Place::open(path)).reduce(Result::or);
+            match opened {
+                Some(Ok((place, listener))) => {
+                    is_told = false;
+                    self.moved_to(place, listener);
+                }
+                Some(Err(error)) if !is_told => {
+                    is_told = true;
+                    tracing::warn!(%error, "the control socket has vanished and cannot be made again yet: `cara` does not find this unit");
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// The place after the next pause; `None` once the unit stops.
+    fn await_next_look(&self) -> Option<Place> {
+        let socket = lock(&self.socket);
+        let waited = self.stopped.wait_timeout_while(socket, BETWEEN_LOOKS, |_| !self.is_stopping());
+        waited.unwrap_or_else(PoisonError::into_inner).0.place.clone()
+    }
+
+    fn moved_to(&self, place: Place, listener: UnixListener) {
+        let mut socket = lock(&self.socket);
+        if self.is_stopping() {
+            return place.remove();
+        }
+        tracing::warn!(path = %place.path().display(), "the control socket had vanished and was made again");
+        *socket = Socket { place: Some(place), fresh: Some(listener) };
+        self.waker.wake();
     }
 
     fn accept_with<T: Send + 'static>(
@@ -143,7 +214,7 @@ impl Shared {
         epoll.add(&listener, LISTENER, Interest::READ_LEVEL)?;
         let own = self.clone();
         let thread = std::thread::Builder::new().name("cara-control".into());
-        let thread = thread.spawn(move || own.accept(&listener, &epoll, &system))?;
+        let thread = thread.spawn(move || own.accept(listener, &epoll, &system))?;
         lock(&self.connections).threads.push(thread.into());
         Ok(self)
     }
@@ -154,7 +225,7 @@ impl Shared {
 
     fn accept<T: Send + 'static>(
         self: &Arc<Self>,
-        listener: &UnixListener,
+        mut listener: UnixListener,
         epoll: &Epoll,
         system: &CommunicationSystem<T>,
     ) {
@@ -163,6 +234,16 @@ impl Shared {
             if let Err(error) = epoll.wait(&mut events, None) {
                 tracing::error!(%error, "waiting for control connections failed");
                 return;
+            }
+            if self.waker.reset()
+                && let Some(fresh) = lock(&self.socket).fresh.take()
+            {
+                // The set forgets the old one when it is closed.
+                if let Err(error) = epoll.add(&fresh, LISTENER, Interest::READ_LEVEL) {
+                    tracing::error!(%error, "the control socket that was made again cannot be watched");
+                }
+                listener = fresh;
+                continue;
             }
             if events.iter().all(|ready| ready.token == WAKER) {
                 continue;

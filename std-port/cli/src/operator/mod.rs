@@ -92,7 +92,7 @@ fn none_runs(ways: &str) -> anyhow::Error {
     if others.is_empty() && !of_others.is_empty() {
         return Ended::no_unit(of_others);
     }
-    Ended::no_unit(format!("no such m_unit runs on this host{others}. {ways}"))
+    Ended::no_unit(format!("no such m_unit runs on this host{others} (looked in {}). {ways}", running::looked_in()))
 }
 
 impl Operator {

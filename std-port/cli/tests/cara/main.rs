@@ -11,6 +11,7 @@ mod holding;
 mod hung;
 mod managers;
 mod measuring;
+mod places;
 mod scanning;
 mod screens;
 mod stopping;
