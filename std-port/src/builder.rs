@@ -174,8 +174,8 @@ impl<T: Send + 'static> Builder<T, MUnit> {
     }
 
     /// Notes what operators have it do, and what this program moves, stops and resets: one line of JSON at the end of this file
-    /// for each order, stop, reset and refusal, with who asked (`docs/cara.md`, "Audit log"). A line of the program's is written
-    /// by the thread that called, once the outcome is known. A file of 4 MiB is put aside under the name with `.1` behind it.
+    /// for each order, stop, reset and refusal, with who asked (`docs/cara.md`, "Audit log"). A thread of
+    /// its own writes them; what its disk does not take in time is dropped and counted (`AuditLinesLost`). A file of 4 MiB is put aside under the name with `.1` behind it.
     #[cfg(feature = "control")]
     pub fn audit(mut self, path: impl AsRef<std::path::Path>) -> std::io::Result<Self> {
         self.audit = Some(Arc::new(crate::control::Audit::open(path.as_ref())?));

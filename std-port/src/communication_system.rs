@@ -60,7 +60,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Where it answers its operator; `None` if nowhere.
     #[cfg(feature = "control")]
     pub fn control_path(&self) -> Option<PathBuf> {
-        lock(&self.owner.server).as_ref().map(|server| server.path().to_owned())
+        lock(&self.owner.server).as_ref()?.path()
     }
 
     #[cfg(feature = "control")]

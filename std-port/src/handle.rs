@@ -100,6 +100,9 @@ pub(crate) struct Owner<T: Send + 'static> {
     pub(crate) server: Mutex<Option<Server>>,
 }
 
+/// A unit that stops waits so long for the last lines of its audit log.
+#[cfg(feature = "control")]
+const LAST_LINES: std::time::Duration = std::time::Duration::from_secs(1);
 /// One that takes over waits so long for the control socket of one on this host that steps down.
 #[cfg(feature = "control")]
 const STEPPING_DOWN: std::time::Duration = std::time::Duration::from_secs(3);
@@ -137,6 +140,9 @@ impl<T: Send + 'static> Owner<T> {
             let server = lock(&self.server).take();
             if let Some(server) = server {
                 server.stop();
+            }
+            if let Some(audit) = &self.audit {
+                audit.flush(LAST_LINES);
             }
         }
     }

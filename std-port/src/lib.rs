@@ -45,6 +45,7 @@ mod interfaces;
 pub mod keys;
 mod latch;
 mod lease;
+mod line_queue;
 mod locks;
 #[cfg(feature = "metrics")]
 pub mod metrics;
@@ -104,6 +105,7 @@ pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{Call, IntoHandler, ServiceOptions};
 pub use heart::{Heart, Hold};
 pub use lease::{LeaseEnded, LeaseWatch};
+pub use line_queue::LineQueue;
 pub use my_function_list::MyFunctionList;
 pub use name_and_id::NameAndId;
 pub use peer::{Peer, TheirFunction, TheirFunctionList};

@@ -1,5 +1,6 @@
 //! The `cara` command: lists the nodes of a fleet, calls their functions, and finds out why a node is missing.
 
+mod attended;
 mod command_line;
 mod commands;
 mod node;

@@ -88,6 +88,14 @@ fn generations(ring: &KeyRing, peer: &str) -> Vec<u32> {
 }
 
 #[test]
+fn a_new_name_that_could_be_anothers_name_and_id_is_refused() {
+    let home = Home::new();
+    home.refused(&["new-fleet", "--fleet", "7", "depot/1@m_unit", "agv/17/12"], 2, "no slash");
+    home.done(&["new-fleet", "--fleet", "7", "depot/1@m_unit", "agv/17"]);
+    home.refused(&["derive", "--fleet", "7", "agv/17/12"], 2, "no slash");
+}
+
+#[test]
 fn nodes_of_a_new_fleet_have_each_others_keys() {
     let home = Home::with_fleet();
     let (depot, agv) = (home.ring("depot/1@m_unit"), home.ring("agv/1"));

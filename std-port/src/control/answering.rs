@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::ops::ControlFlow;
 use std::sync::mpsc::RecvTimeoutError;
+use std::time::Instant;
 
 use cara_core::config::Constraints;
 use cara_core::error::Error;
@@ -17,9 +18,8 @@ use crate::{CommunicationSystem, Finding, Identity, Peer};
 /// Where answers go; `Break` when the client is gone.
 pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
 
-/// Whether the client is still there; where a span is given, also whether it has sent a [`BEAT`](super::protocol::BEAT)
-/// within that span.
-pub(super) type Lives<'l> = &'l dyn Fn(Option<std::time::Duration>) -> bool;
+/// When the client last sent something, its question or a [`BEAT`](super::protocol::BEAT); `None` once it has gone.
+pub(super) type Lives<'l> = &'l dyn Fn() -> Option<Instant>;
 
 /// Events that wait to be written before some are lost.
 const EVENTS: usize = 1024;
@@ -58,18 +58,19 @@ pub fn execute<T: Send + 'static>(
     question: &Question,
     answer: &mut dyn FnMut(Answer) -> ControlFlow<()>,
 ) {
-    execute_for(system, question, answer, &|_| true);
+    execute_for(system, question, answer, &|| Some(Instant::now()));
 }
 
-/// As [`execute`], and what takes long ends as well once `wanted` says `false`: a watch, values of streams, a call, and what
-/// a [`Question::Hold`] keeps moving.
+/// As [`execute`], for a client elsewhere: `lives` says when it last sent something, or `None` once it has gone. What takes
+/// long ends then: a watch, values of streams, a call. What a [`Question::Hold`] keeps moving ends as well when that was
+/// longer ago than its lease: a gateway forwards its client's signs of life and makes none up.
 pub fn execute_while<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &Question,
     answer: &mut dyn FnMut(Answer) -> ControlFlow<()>,
-    wanted: &dyn Fn() -> bool,
+    lives: &dyn Fn() -> Option<Instant>,
 ) {
-    execute_for(system, question, answer, &|_| wanted());
+    execute_for(system, question, answer, lives);
 }
 
 /// As [`execute`]; a call or a watch ends as well when the client has gone.
@@ -93,7 +94,7 @@ fn attempt<T: Send + 'static>(
     sink: Sink<'_>,
     lives: Lives<'_>,
 ) -> Result<(), End> {
-    let wanted = &|| lives(None);
+    let wanted = &|| lives().is_some();
     match question {
         Question::Unit => send(sink, Answer::Unit(describe::unit(system))),
         Question::Nodes { offering } => nodes(system, offering.as_deref(), sink),

@@ -17,8 +17,8 @@ use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use cara_core::distribution::function::Attributes;
 use cara_core::error::Error;
@@ -28,42 +28,39 @@ use serde_json::{Value, json};
 
 use super::failure::name_of;
 use super::protocol::{Answer, CallQuestion, Question};
-use crate::locks::lock;
+use crate::LineQueue;
 use crate::seldom::warn_seldom;
 
 /// A longer file is put aside, and the one before it is dropped: twice as much is kept.
 const LONGEST: u64 = 4 * 1024 * 1024;
 
-/// The file, which only its owner can read.
+/// The log's end of the queue. Whoever notes something watches a client, moves or stops something: none of them waits for a
+/// disk.
 #[derive(Debug)]
 pub(crate) struct Audit {
-    path: PathBuf,
-    longest: u64,
+    lines: LineQueue,
     /// This process.
     own: Who,
-    file: Mutex<Option<File>>,
 }
 
-impl Audit {
-    pub(crate) fn open(path: &Path) -> io::Result<Self> {
-        let own = Who::own();
-        Ok(Self { path: path.to_owned(), longest: LONGEST, own, file: Mutex::new(Some(Self::append_to(path)?)) })
+/// The file, which only its owner can read.
+struct LogFile {
+    path: PathBuf,
+    longest: u64,
+    file: Option<File>,
+}
+
+impl LogFile {
+    fn open(path: &Path, longest: u64) -> io::Result<Self> {
+        Ok(Self { path: path.to_owned(), longest, file: Some(Self::append_to(path)?) })
     }
 
     fn append_to(path: &Path) -> io::Result<File> {
         OpenOptions::new().append(true).create(true).mode(0o600).open(path)
     }
 
-    fn write(&self, entry: &Value) {
-        if let Err(error) = self.try_write(entry) {
-            // What an operator wants does not wait for a disk: a stop least of all.
-            warn_seldom!(%error, path = %self.path.display(), "a line of the audit log is lost");
-        }
-    }
-
-    fn try_write(&self, entry: &Value) -> io::Result<()> {
-        let mut place = lock(&self.file);
-        let mut file = match place.take() {
+    fn write(&mut self, line: &[u8]) -> io::Result<()> {
+        let mut file = match self.file.take() {
             Some(file) if file.metadata()?.len() < self.longest => file,
             Some(_) => {
                 std::fs::rename(&self.path, self.path.with_added_extension("1"))?;
@@ -72,9 +69,45 @@ impl Audit {
             None => Self::append_to(&self.path)?,
         };
         // In one piece: a line of another process that has the file open as well comes before it or behind it.
-        let written = file.write_all(format!("{entry}\n").as_bytes());
-        *place = Some(file);
+        let written = file.write_all(line);
+        self.file = Some(file);
         written
+    }
+}
+
+impl Audit {
+    pub(crate) fn open(path: &Path) -> io::Result<Self> {
+        Self::open_up_to(path, LONGEST)
+    }
+
+    fn open_up_to(path: &Path, longest: u64) -> io::Result<Self> {
+        let mut file = LogFile::open(path, longest)?;
+        let lines = LineQueue::new("cara-audit", move |line, _| {
+            file.write(line).inspect_err(|error| {
+                warn_seldom!(%error, path = %file.path.display(), "a line of the audit log is lost");
+            })
+        });
+        Ok(Self { lines: lines?, own: Who::own() })
+    }
+
+    /// Lines that could not be written, or that came faster than the disk takes them.
+    pub(crate) fn lost(&self) -> u64 {
+        self.lines.lost()
+    }
+
+    /// Waits until all lines are written, at most for so long.
+    pub(crate) fn flush(&self, at_most: Duration) {
+        if !self.lines.flush(at_most) {
+            tracing::warn!("the audit log's disk does not answer: its last lines are lost");
+        }
+    }
+
+    fn write(&self, entry: &Value) {
+        let lost = self.lines.lost();
+        self.lines.write(format!("{entry}\n").as_bytes());
+        if self.lines.lost() > lost {
+            warn_seldom!("lines of the audit log are lost: its disk does not take them in time");
+        }
     }
 
     fn tell(&self, origin: &str, who: &Who, line: &Line<'_>) {
@@ -290,7 +323,11 @@ impl Drop for Entry<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
+
+    const LONG: Duration = Duration::from_secs(20);
 
     fn lines(path: &Path) -> Vec<Value> {
         let text = std::fs::read_to_string(path).unwrap();
@@ -319,6 +356,7 @@ mod tests {
         entry.note(&Answer::Done);
         drop(entry);
         drop(Entry::of(&audit, &who, &stop));
+        audit.flush(LONG);
         assert!(Entry::of(&audit, &who, &Question::Watch).is_none(), "it only looks");
         let told: Vec<_> = lines(&path).iter().map(|line| [line["node"].clone(), line["outcome"].clone()]).collect();
         let expected = [("agv/1", "ok"), ("agv/2", "NoStop")].map(|(node, outcome)| [json!(node), json!(outcome)]);
@@ -357,6 +395,7 @@ mod tests {
             end(&mut entry);
             entry.note(&Answer::Done);
         }
+        audit.flush(LONG);
         let told = lines(&path);
         assert!(told.iter().all(|line| line["node"] == "agv/1" && line["function"] == "go"), "{told:?}");
         let outcomes: Vec<_> = told.iter().map(|line| line["outcome"].as_str().unwrap()).collect();
@@ -368,25 +407,31 @@ mod tests {
     fn a_long_file_is_put_aside_once() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("audit");
-        let audit = Audit { longest: 100, ..Audit::open(&path).unwrap() };
+        let audit = Audit::open_up_to(&path, 100).unwrap();
         for number in 0..40 {
             audit.write(&json!({ "number": number, "text": "as long as half of the file that is kept" }));
         }
+        audit.flush(LONG);
         let [before, now] = [path.with_added_extension("1"), path.clone()].map(|path| lines(&path));
         assert_eq!(now.last().unwrap()["number"], 39);
         assert_eq!(now[0]["number"].as_u64().unwrap(), before.last().unwrap()["number"].as_u64().unwrap() + 1);
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+        let kept: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(Result::unwrap).collect();
+        let modes: Vec<u32> = kept.iter().map(|file| file.metadata().unwrap().permissions().mode() & 0o777).collect();
+        assert_eq!(modes, [0o600; 2], "its owner alone reads what is kept, also behind a change of the file");
     }
 
     #[test]
     fn what_cannot_be_written_is_no_end_and_is_tried_again() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("audit");
-        let audit = Audit { longest: 1, ..Audit::open(&path).unwrap() };
+        let audit = Audit::open_up_to(&path, 1).unwrap();
         audit.write(&json!(1));
+        audit.flush(LONG);
         std::fs::remove_file(&path).unwrap();
         audit.write(&json!(2));
         audit.write(&json!(3));
+        audit.flush(LONG);
         assert_eq!(lines(&path), [json!(3)]);
+        assert_eq!(audit.lost(), 1);
     }
 }

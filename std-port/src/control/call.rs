@@ -20,6 +20,8 @@ use crate::{CommunicationSystem, Delivery, Peer, RequestOptions, TheirFunction};
 /// Most bytes of parameters in flight when all nodes are called.
 const BYTES_AT_A_TIME: usize = 64 * 1024 * 1024;
 
+/// A call of all that has no answer for so long is [`News::Late`].
+const LATE: std::time::Duration = std::time::Duration::from_millis(500);
 /// How long a call waits for room at a time.
 const PAUSE: Duration = Duration::from_millis(20);
 
@@ -65,9 +67,9 @@ pub(super) struct Outcome {
 }
 
 /// A call that could be made.
-struct Prepared {
+pub(super) struct Prepared {
     function: TheirFunction,
-    parameters: GrowingParameters,
+    pub(super) parameters: GrowingParameters,
 }
 
 pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
@@ -157,7 +159,7 @@ fn begin<T: Send + 'static>(
     }
 }
 
-fn prepare<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion) -> Result<Prepared, Failure> {
+pub(super) fn prepare<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion) -> Result<Prepared, Failure> {
     if !peer.is_connected() {
         return Err(Error::NotConnected.into());
     }
@@ -234,9 +236,19 @@ fn call_all<T: Send + 'static>(
     }
     if !question.asynchronous {
         let calls: Vec<_> = peers.iter().map(|peer| (peer, question)).collect();
-        return block_all(&calls, options, wanted, &mut |_, answer| send(sink, answer));
+        return block_all(&calls, options, wanted, &mut |_, news| match news {
+            News::Late => Ok(()),
+            News::Answer(answer) => send(sink, answer),
+        });
     }
     peers.iter().try_for_each(|peer| tell(peer, question, options, sink))
+}
+
+/// What [`block_all`] tells of a call.
+pub(super) enum News {
+    /// It could not be made, or has no answer after [`LATE`]. Once for each call at most.
+    Late,
+    Answer(Answer),
 }
 
 /// All at the same time, as far as the memory for their parameters reaches; `tell` gets the answers in the order of the replies,
@@ -245,7 +257,7 @@ pub(super) fn block_all<T: Send + 'static>(
     calls: &[(&Peer<T>, &CallQuestion)],
     options: &RequestOptions,
     wanted: &dyn Fn() -> bool,
-    tell: &mut dyn FnMut(usize, Answer) -> Result<(), End>,
+    tell: &mut dyn FnMut(usize, News) -> Result<(), End>,
 ) -> Result<(), End> {
     let mut calls = calls.iter().enumerate();
     let mut under_way = Vec::new();
@@ -264,9 +276,12 @@ pub(super) fn block_all<T: Send + 'static>(
             match begun {
                 Ok((prepared, call)) => {
                     bytes += size_of_val(&*prepared.parameters);
-                    under_way.push((number, peer, started, prepared, call));
+                    under_way.push((number, peer, started, prepared, call, false));
                 }
-                Err(failure) => tell(number, called(peer, Err(failure), started))?,
+                Err(failure) => {
+                    tell(number, News::Late)?;
+                    tell(number, News::Answer(called(peer, Err(failure), started)))?;
+                }
             }
         }
         if under_way.is_empty() {
@@ -274,14 +289,18 @@ pub(super) fn block_all<T: Send + 'static>(
         }
         let before = under_way.len();
         let mut index = 0;
-        while let Some((number, peer, started, prepared, call)) = under_way.get_mut(index) {
+        while let Some((number, peer, started, prepared, call, is_late)) = under_way.get_mut(index) {
             if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
                 bytes -= size_of_val(&*prepared.parameters);
                 let outcome = prepared.outcome(outcome, call.take_failure().as_deref());
                 let (number, answer) = (*number, called(peer, outcome, *started));
                 drop(under_way.swap_remove(index));
-                tell(number, answer)?;
+                tell(number, News::Answer(answer))?;
             } else {
+                if !*is_late && started.elapsed() >= LATE {
+                    *is_late = true;
+                    tell(*number, News::Late)?;
+                }
                 index += 1;
             }
         }
@@ -315,10 +334,8 @@ pub(super) fn bench<T: Send + 'static>(
             pause(system, between)?;
         }
         permit(system, &question.function, Verb::Call)?;
-        if !lives(None) {
-            return Err(End::Gone);
-        }
-        if !lives(lease) {
+        let last = lives().ok_or(End::Gone)?;
+        if lease.is_some_and(|lease| last.elapsed() >= lease.into()) {
             return Err(unattended(&question.function).into());
         }
         parameters.copy_from(&prepared.parameters)?;

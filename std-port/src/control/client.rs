@@ -8,8 +8,10 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use rustix::net::{SendFlags, send};
+
 use super::lines::{Line, Lines};
-use super::place::{self, PlaceError, directory, own_uid, peer_uid};
+use super::place::{self, PlaceError, directories, own_uid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
 use super::server::{FULL, full};
 use crate::sys::epoll::wait_readable;
@@ -76,9 +78,9 @@ impl RunningUnit {
 #[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum ControlError {
-    /// No unit answers in the directory.
-    #[error("no manager runs here (looked in {0}): start one, or be the manager yourself with --as NAME/ID")]
-    NoneRunning(PathBuf),
+    /// No unit answers at the socket, or in the directories.
+    #[error("no manager runs here (looked in {}): start one, or be the manager yourself with --as NAME/ID", paths(.0))]
+    NoneRunning(Vec<PathBuf>),
     /// Units answer, and none of them is the one that is wanted.
     #[error("no manager '{wanted}' runs here; there are {}", list(running))]
     NotRunning {
@@ -137,6 +139,10 @@ fn list(units: &[RunningUnit]) -> String {
     names.join(", ")
 }
 
+fn paths(paths: &[PathBuf]) -> String {
+    paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
 impl From<PlaceError> for ControlError {
     fn from(error: PlaceError) -> Self {
         match error {
@@ -151,9 +157,26 @@ impl From<PlaceError> for ControlError {
     }
 }
 
-/// The units with a socket in the [directory] of control sockets; see [`running_in`].
+/// The units with a socket in the first of the [directories] of control sockets that has any; see [`running_in`].
 pub fn running() -> Result<Vec<RunningUnit>, ControlError> {
-    running_in(&directory())
+    first_of(&directories(), |directory| running_in(directory))
+}
+
+/// What the first directory has that has anything. An error of one, such as that others can enter it, counts where no
+/// other one has anything.
+pub fn first_of(
+    directories: &[PathBuf],
+    look: impl Fn(&Path) -> Result<Vec<RunningUnit>, ControlError>,
+) -> Result<Vec<RunningUnit>, ControlError> {
+    let mut nothing = Ok(Vec::new());
+    for directory in directories {
+        match look(directory) {
+            Ok(found) if found.is_empty() => {}
+            Ok(found) => return Ok(found),
+            error => nothing = nothing.and(error),
+        }
+    }
+    nothing
 }
 
 /// The units with a socket in a directory: those that answer, and those that run and cannot be asked now.
@@ -247,17 +270,21 @@ impl Client {
 
     /// Connects to the only unit that runs, or to the one that is meant by `NAME/ID` or `NAME`.
     pub fn find(unit: Option<&str>) -> Result<Self, ControlError> {
-        Self::find_in(&directory(), unit)
+        Self::find_among(&directories(), unit)
     }
 
     /// As [`find`](Self::find), with the sockets of a directory.
     pub fn find_in(directory: &Path, unit: Option<&str>) -> Result<Self, ControlError> {
-        let running = match unit {
-            Some(wanted) => running_called(directory, wanted)?,
-            None => running_in(directory)?,
-        };
+        Self::find_among(&[directory.to_owned()], unit)
+    }
+
+    fn find_among(directories: &[PathBuf], unit: Option<&str>) -> Result<Self, ControlError> {
+        let running = first_of(directories, |directory| match unit {
+            Some(wanted) => running_called(directory, wanted),
+            None => running_in(directory),
+        })?;
         match &running[..] {
-            [] => Err(none(running_in(directory)?, directory, unit)),
+            [] => Err(none(first_of(directories, running_in)?, directories, unit)),
             [only] => only.refusal().map_or_else(|| Self::connect(&only.path), Err),
             _ => Err(ControlError::Several(running)),
         }
@@ -279,6 +306,25 @@ impl Client {
     /// [`Question::Hold`] and [`Question::Bench`] need heartbeats, which the iterator sends while it waits for the next
     /// answer: a program that stops reading loses its lease.
     pub fn ask(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
+        self.send(question)?;
+        self.beaten = question.needs_beats().then(Instant::now);
+        Ok(Answers { client: self })
+    }
+
+    /// As [`ask`](Self::ask), for a client elsewhere: the only heartbeats are those that are forwarded with a
+    /// [`Beater`](Self::beater).
+    pub fn ask_for_another(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
+        self.send(question)?;
+        self.beaten = None;
+        Ok(Answers { client: self })
+    }
+
+    /// A handle with which another thread forwards heartbeats while answers are waited for.
+    pub fn beater(&self) -> io::Result<Beater> {
+        self.lines.source().try_clone().map(Beater)
+    }
+
+    fn send(&mut self, question: &Question) -> Result<(), ControlError> {
         while self.open {
             match self.next_answer() {
                 Ok(_) | Err(ControlError::Failed(_)) => {}
@@ -289,8 +335,7 @@ impl Client {
         line.push(b'\n');
         self.lines.source().write_all(&line)?;
         self.open = true;
-        self.beaten = question.needs_beats().then(Instant::now);
-        Ok(Answers { client: self })
+        Ok(())
     }
 
     /// Sends heartbeats until an answer arrives.
@@ -333,11 +378,22 @@ impl Closer {
     }
 }
 
+/// Forwards heartbeats over the connection of a [`Client`].
+#[derive(Debug)]
+pub struct Beater(UnixStream);
+
+impl Beater {
+    /// The client elsewhere has just shown that it is there. Never waits: a unit that does not read gets the next one.
+    pub fn beat(&self) {
+        let _ = send(&self.0, b"\n", SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+    }
+}
+
 /// None of the units that run is meant.
-fn none(running: Vec<RunningUnit>, directory: &Path, wanted: Option<&str>) -> ControlError {
+fn none(running: Vec<RunningUnit>, directories: &[PathBuf], wanted: Option<&str>) -> ControlError {
     match wanted.filter(|_| !running.is_empty()) {
         Some(wanted) => ControlError::NotRunning { wanted: wanted.to_owned(), running },
-        None => ControlError::NoneRunning(directory.to_owned()),
+        None => ControlError::NoneRunning(directories.to_owned()),
     }
 }
 
@@ -350,7 +406,9 @@ fn dial(path: &Path) -> Result<UnixStream, ControlError> {
             Err(error) => error,
         };
         return Err(match error.kind() {
-            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => ControlError::NoneRunning(path.to_owned()),
+            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => {
+                ControlError::NoneRunning(vec![path.to_owned()])
+            }
             io::ErrorKind::PermissionDenied => {
                 ControlError::NotAllowed { path: path.to_owned(), reason: error.to_string() }
             }

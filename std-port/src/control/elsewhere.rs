@@ -23,14 +23,23 @@ pub struct Elsewhere {
     pub owner: Option<u32>,
 }
 
-/// The units of other users of this host, as far as the names of their control sockets tell. Those of this user in another
-/// [directory](super::directory) are meant to be apart.
+/// The units of this host in directories where this command does not [look](super::directories), as far as the names of their
+/// control sockets tell. Where `CARA_CONTROL_DIR` is set, those of this user are meant to be apart, and left out.
 pub fn elsewhere() -> Vec<Elsewhere> {
-    let own = super::directory();
+    let own = super::directories();
     let listed = std::fs::read_to_string(SOCKETS).unwrap_or_default();
-    let paths = listening(&listed).filter(|path| path.parent() != Some(&own) && place::tells_name(path));
+    let is_own = |path: &Path| own.iter().any(|own| path.parent() == Some(own));
+    let paths = listening(&listed).filter(|path| !is_own(path) && place::tells_name(path));
     let this_user = rustix::process::getuid().as_raw();
-    paths.map(unit).filter(|unit| unit.owner != Some(this_user)).collect()
+    let all_users = !place::is_directory_set();
+    paths.map(unit).filter(|unit| all_users || unit.owner != Some(this_user)).collect()
+}
+
+/// The directories of what listens and is named as a control socket.
+pub(super) fn listening_in() -> Vec<PathBuf> {
+    let listed = std::fs::read_to_string(SOCKETS).unwrap_or_default();
+    let paths = listening(&listed).filter(|path| place::tells_name(path));
+    paths.filter_map(Path::parent).map(Path::to_owned).collect()
 }
 
 fn listening(listed: &str) -> impl Iterator<Item = &Path> {

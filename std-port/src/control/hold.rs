@@ -1,16 +1,18 @@
-//! A call whose lease is renewed for as long as the operator's client lives: the operator is the dead man's handle.
+//! A call whose lease is renewed as of the last sign of life of the operator's client: the operator is the dead man's handle.
+//! The thread that watches the client beats the heart, and only for what the client has sent: if this thread hangs, or the
+//! client does, nothing renews.
 
+use std::cell::{Cell, RefCell};
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use cara_core::error::CloseReason;
 use cara_core::services::access::Verb;
-use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 
 use super::answering::{End, LOOK, Lives, Sink, send};
 use super::call::{await_one, called, options};
-use super::protocol::{Answer, CallQuestion, Failure};
+use super::protocol::{Answer, BEAT, CallQuestion, Failure};
 use super::select;
 use crate::engine::CallFuture;
 use crate::{CommunicationSystem, Peer, RequestOptions, UnitEvent};
@@ -30,11 +32,26 @@ pub(super) fn hold<T: Send + 'static>(
 ) -> Result<(), End> {
     let peer = held_node(system, question)?;
     let lease = lease_of(&peer, &question.function);
-    let options = RequestOptions { renew: Renew::Process, ..options(question)? };
+    let heart = RefCell::new(system.heart(BEAT));
+    let options = RequestOptions { renew: heart.borrow().renew(), ..options(question)? };
+    let last_beat = Cell::new(None);
     // Before the call: it may be finished before it is answered.
     let events = system.events_with_losses(EVENTS).0;
-    let is_wanted = || lives(lease) && !system.is_stopped();
-    let gone = || if lives(None) && !system.is_stopped() { unattended(&question.function).into() } else { End::Gone };
+    let is_wanted = || {
+        let last = lives();
+        if last.is_some() && last_beat.replace(last) != last {
+            heart.borrow_mut().beat();
+        }
+        last.is_some_and(|last| lease.is_none_or(|lease| last.elapsed() < lease.into())) && !system.is_stopped()
+    };
+    let gone = || match lives() {
+        Some(_) if !system.is_stopped() => unattended(&question.function).into(),
+        _ => End::Gone,
+    };
+    // The question is a sign of life as well, and the call needs a heart that beats.
+    if !is_wanted() {
+        return Err(gone());
+    }
     let started = Instant::now();
     let mut held = match await_one(&peer, question, &options, sink, &is_wanted) {
         Err(End::Gone) => return Err(gone()),

@@ -34,9 +34,12 @@ use std::sync::Arc;
 
 pub use answering::{execute, execute_while};
 pub(crate) use audit::{Audit, ProgramCall};
-pub use client::{Answers, Client, Closer, ControlError, RunningUnit, UnitState, running, running_called, running_in};
+pub use client::{
+    Answers, Beater, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called,
+    running_in,
+};
 pub use elsewhere::{Elsewhere, elsewhere};
-pub use place::directory;
+pub use place::{directories, directory};
 pub(crate) use server::Server;
 
 use cara_core::distribution::identity::{Fleet, Identity};
@@ -50,7 +53,8 @@ use crate::CommunicationSystem;
 /// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Control {
-    /// In the [directory] of control sockets, under the unit's name, id and fleet.
+    /// In the [directory] of control sockets, under the unit's name, id and fleet. A socket that vanishes, as with the
+    /// directories that a system removes when its user logs out, is made again there or in the next of the [directories].
     #[default]
     Default,
     /// At this path. Its directory is made if it is not there, and must be the owner's alone.
@@ -64,9 +68,9 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
     let (path, is_its_own) = match control {
         Control::Off => return None,
         Control::Default => {
-            let path = directory().join(place::file_name(identity, fleet));
-            let is_held = place::is_held(&path);
-            (path, is_held)
+            let name = place::file_name(identity, fleet);
+            let path = directories().iter().map(|directory| directory.join(&name)).find(|path| place::is_held(path));
+            (path.clone().unwrap_or_default(), path.is_some())
         }
         // Any unit may have been told this path.
         Control::Path(path) => (
@@ -88,12 +92,15 @@ pub(crate) fn open<T: Send + 'static>(
     audit: Option<Arc<Audit>>,
     guest: CommunicationSystem<T>,
 ) -> Option<Server> {
-    let path = match control {
+    let paths = match control {
         Control::Off => return None,
-        Control::Path(path) => path.clone(),
-        Control::Default => directory().join(place::file_name(&guest.identity(), guest.fleet())),
+        Control::Path(path) => vec![path.clone()],
+        Control::Default => {
+            let name = place::file_name(&guest.identity(), guest.fleet());
+            place::defaults().iter().map(|directory| directory.join(&name)).collect()
+        }
     };
-    match Server::open(&path, audit, guest) {
+    match Server::open(paths, audit, guest) {
         Ok(server) => Some(server),
         Err(error) => {
             tracing::warn!(%error, "there is no control socket: the `cara` command will not find this unit");

@@ -1,5 +1,6 @@
 //! Control sockets: a directory that only its owner can enter, and one socket in it for each running unit.
 
+use std::collections::HashSet;
 use std::fs::{DirBuilder, Permissions, set_permissions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
@@ -54,10 +55,50 @@ impl PlaceError {
 /// The directory of control sockets: `$CARA_CONTROL_DIR`, else `$XDG_RUNTIME_DIR/cara`, else one of the user's in the
 /// directory for temporary files.
 pub fn directory() -> PathBuf {
-    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    set("CARA_CONTROL_DIR")
-        .or_else(|| set("XDG_RUNTIME_DIR").map(|runtime| runtime.join("cara")))
-        .unwrap_or_else(|| std::env::temp_dir().join(format!("cara-{}", own_uid())))
+    defaults().swap_remove(0)
+}
+
+/// Where a command looks for control sockets, in this order: `$CARA_CONTROL_DIR` alone if it is set; else each directory that a
+/// unit of this user may have chosen in another environment, such as that of a service or before a logout.
+pub fn directories() -> Vec<PathBuf> {
+    let mut all = defaults();
+    if !is_directory_set() {
+        let seen = super::elsewhere::listening_in();
+        all.extend(seen.into_iter().filter(|directory| is_default(directory)));
+    }
+    let mut known = HashSet::new();
+    all.retain(|directory| known.insert(directory.clone()));
+    all
+}
+
+/// Whether this command's environment says where.
+pub(super) fn is_directory_set() -> bool {
+    set("CARA_CONTROL_DIR").is_some()
+}
+
+fn set(name: &str) -> Option<PathBuf> {
+    std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
+}
+
+/// In which directories a unit opens its socket; the first one unless that is gone.
+pub(super) fn defaults() -> Vec<PathBuf> {
+    if let Some(only) = set("CARA_CONTROL_DIR") {
+        return vec![only];
+    }
+    let of_user = format!("cara-{}", own_uid());
+    let [temporary, tmp] = [std::env::temp_dir(), PathBuf::from("/tmp")].map(|folder| folder.join(&of_user));
+    let of_system = PathBuf::from(format!("/run/user/{}/cara", own_uid()));
+    match set("XDG_RUNTIME_DIR") {
+        Some(runtime) => vec![runtime.join("cara"), of_system, temporary, tmp],
+        // The first is where such a unit has always been.
+        None => vec![temporary, of_system, tmp],
+    }
+}
+
+/// Whether a directory is named as in [`defaults`] and is this user's, so that no unit was put apart there.
+fn is_default(directory: &Path) -> bool {
+    let name = directory.file_name().unwrap_or_default();
+    (name == "cara" || *name == *format!("cara-{}", own_uid())) && enter(directory).is_ok()
 }
 
 pub(super) fn own_uid() -> u32 {
@@ -136,7 +177,7 @@ pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
 }
 
 /// A listening socket and its file.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Place {
     path: PathBuf,
     /// Identifies the file, so that a later one at the same path is not removed.
@@ -169,6 +210,11 @@ impl Place {
         set_permissions(path, Permissions::from_mode(0o600)).map_err(|error| PlaceError::system(path, error))?;
         let file = mark(path).map_err(|error| PlaceError::system(path, error))?;
         Ok((Self { path: path.to_owned(), file }, listener))
+    }
+
+    /// Whether the file is still there, with whatever permissions.
+    pub(super) fn is_there(&self) -> bool {
+        mark(&self.path).is_ok_and(|file| (file.0, file.1) == (self.file.0, self.file.1))
     }
 
     /// Removes the file, unless it is another one by now.

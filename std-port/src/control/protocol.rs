@@ -137,6 +137,11 @@ impl Question {
         matches!(self, Self::Hold(_) | Self::Bench { .. })
     }
 
+    /// Whether the thread that answers it watches or stops something, so that it waits for no client that reads slowly.
+    pub(super) fn waits_for_no_reader(&self) -> bool {
+        matches!(self, Self::Hold(_) | Self::Bench { .. } | Self::Stop { .. } | Self::Reset { .. })
+    }
+
     /// Whether it is carried out only while its client is there: what moves something, or may let it move again, is not wanted
     /// any more by a client that has gone before its turn came, as where the unit's process was stopped meanwhile.
     pub(super) fn needs_its_client(&self) -> bool {

@@ -12,7 +12,9 @@ const LISTED: usize = 20;
 /// The node that `selector` means; a failure lists what there is.
 pub(super) fn node<T: Send + 'static>(system: &CommunicationSystem<T>, selector: &str) -> Result<Peer<T>, Failure> {
     let all = nodes(system);
-    let is_meant = |peer: &&Peer<T>| means(selector, peer.name(), peer.id(), peer.identity().role().as_str());
+    let reading = |peer: &Peer<T>| reading(selector, peer.name(), peer.id(), peer.identity().role().as_str());
+    let best = all.iter().filter_map(reading).min();
+    let is_meant = |peer: &&Peer<T>| best.is_some() && reading(peer) == best;
     let mut meant: Vec<Peer<T>> = all.iter().filter(is_meant).cloned().collect();
     // One that is absent may be the one that is meant, unless it was taken off the roster.
     if meant.len() > 1 {
@@ -44,14 +46,26 @@ pub(super) fn nodes<T: Send + 'static>(system: &CommunicationSystem<T>) -> Vec<P
     nodes
 }
 
-/// A name may hold `/`, `#` and `@` itself, so each reading counts.
-fn means(selector: &str, name: &str, id: u32, role: &str) -> bool {
-    let of_role = selector.rsplit_once('@').filter(|(_, wanted)| *wanted == role);
-    let is_it = |selector: &str| {
-        let by_both = selector.rsplit_once('/').is_some_and(|(wanted, number)| wanted == name && is(number, id));
-        selector == name || by_both || selector.strip_prefix('#').is_some_and(|number| is(number, id))
+/// How a selector can be read so that it means a node, the best first: a name may hold `/`, `#` and `@` itself, and must not
+/// hide the node whose whole NAME/ID is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Reading {
+    NameAndId,
+    Name,
+    Id,
+    WithRole,
+}
+
+fn reading(selector: &str, name: &str, id: u32, role: &str) -> Option<Reading> {
+    let of = |selector: &str| {
+        if selector.rsplit_once('/').is_some_and(|(wanted, number)| wanted == name && is(number, id)) {
+            return Some(Reading::NameAndId);
+        }
+        let is_number = selector.strip_prefix('#').is_some_and(|number| is(number, id));
+        (selector == name).then_some(Reading::Name).or(is_number.then_some(Reading::Id))
     };
-    is_it(selector) || of_role.is_some_and(|(selector, _)| is_it(selector))
+    let of_role = selector.rsplit_once('@').filter(|(_, wanted)| *wanted == role);
+    of(selector).or_else(|| of(of_role?.0).map(|_| Reading::WithRole))
 }
 
 fn is(number: &str, id: u32) -> bool {
@@ -74,8 +88,18 @@ fn list<T: Send + 'static>(peers: &[Peer<T>]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::{Reading, reading};
+
     fn means(selector: &str, name: &str, id: u32) -> bool {
-        super::means(selector, name, id, "s_unit")
+        reading(selector, name, id, "s_unit").is_some()
+    }
+
+    #[test]
+    fn a_name_hides_no_node_whose_name_and_id_are_written() {
+        let of = |name: &str, id: u32| reading("agv/17", name, id, "s_unit");
+        assert_eq!((of("agv", 17), of("agv/17", 12)), (Some(Reading::NameAndId), Some(Reading::Name)));
+        assert!(of("agv", 17) < of("agv/17", 12));
+        assert!(reading("#7", "#7", 1, "s_unit") < reading("#7", "agv", 7, "s_unit"));
     }
 
     #[test]

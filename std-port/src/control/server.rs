@@ -2,16 +2,18 @@
 
 use std::cell::RefCell;
 use std::collections::HashMap;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::net::Shutdown;
 use std::ops::ControlFlow;
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use rustix::net::{SendFlags, send};
 
 use super::answering::execute_for;
 use super::audit::{Audit, Entry, Who};
@@ -37,6 +39,8 @@ pub(super) fn full() -> Failure {
 }
 /// A client that takes nothing for so long is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
+/// What a client may leave unread of answers that do not wait for it.
+const MOST_UNREAD: usize = 2 * LONGEST_LINE;
 /// A client that asks nothing for this long is disconnected. One that waits for an answer, as of a watch or a hold, is
 /// not idle.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
@@ -44,6 +48,8 @@ const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
 const GIVES_WAY: Duration = Duration::from_secs(1);
 /// Samples are batched for at most this long, so that writing them disturbs the measurement less.
 const GATHER: Duration = Duration::from_millis(50);
+/// Between two looks whether the socket is still there.
+const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 /// How long a stop waits for all threads together.
 const PATIENCE: Duration = Duration::from_secs(1);
 const WAKER: u64 = 0;
@@ -51,7 +57,6 @@ const LISTENER: u64 = 1;
 
 /// The server of one unit. Dropping it ends nothing: [`Server::stop`] does.
 pub(crate) struct Server {
-    place: Place,
     shared: Arc<Shared>,
 }
 
@@ -61,6 +66,17 @@ struct Shared {
     idle_limit: Duration,
     audit: Option<Arc<Audit>>,
     connections: Mutex<Connections>,
+    socket: Mutex<Socket>,
+    /// Told when the unit stops.
+    stopped: Condvar,
+}
+
+/// Where clients find the unit.
+#[derive(Default)]
+struct Socket {
+    place: Option<Place>,
+    /// One that was made again, for the thread that accepts.
+    fresh: Option<UnixListener>,
 }
 
 #[derive(Default)]
@@ -87,31 +103,39 @@ impl Connections {
 }
 
 impl Server {
-    /// Answers questions about `system` at `path`. The handle must not be one that keeps the unit running.
+    /// Answers questions about `system` at the first of `paths`, and where that vanishes at the first that can be opened. The handle
+    /// must not be one that keeps the unit running.
     pub(super) fn open<T: Send + 'static>(
-        path: &Path,
+        paths: Vec<PathBuf>,
         audit: Option<Arc<Audit>>,
         system: CommunicationSystem<T>,
     ) -> Result<Self, PlaceError> {
-        let (place, listener) = Place::open(path)?;
-        let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| shared.accept_with(listener, system));
+        let path = paths.first().cloned().unwrap_or_default();
+        let (place, listener) = Place::open(&path)?;
+        let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| {
+            lock(&shared.socket).place = Some(place.clone());
+            shared.keep_socket(paths)?;
+            shared.accept_with(listener, system)
+        });
         match started {
-            Ok(shared) => Ok(Self { place, shared }),
+            Ok(shared) => Ok(Self { shared }),
             Err(error) => {
                 place.remove();
-                Err(PlaceError::System { path: path.to_owned(), error })
+                Err(PlaceError::System { path, error })
             }
         }
     }
 
-    pub(crate) fn path(&self) -> &Path {
-        self.place.path()
+    pub(crate) fn path(&self) -> Option<PathBuf> {
+        Some(lock(&self.shared.socket).place.as_ref()?.path().to_owned())
     }
 
     /// Ends all connections and threads except the calling one; waits only for a bounded time for a stuck one.
     pub(crate) fn stop(&self) {
-        self.place.remove();
         self.shared.stopping.store(true, Ordering::Release);
+        let place = lock(&self.shared.socket).place.take();
+        place.inspect(Place::remove);
+        self.shared.stopped.notify_all();
         self.shared.waker.wake();
         let threads = {
             let mut connections = lock(&self.shared.connections);
@@ -126,7 +150,58 @@ impl Server {
 impl Shared {
     fn new(idle_limit: Duration, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
         let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
-        Ok(Arc::new(Self { waker, stopping, idle_limit, audit, connections }))
+        let (socket, stopped) = (Mutex::default(), Condvar::new());
+        Ok(Arc::new(Self { waker, stopping, idle_limit, audit, connections, socket, stopped }))
+    }
+
+    /// Makes the socket again when it has vanished, in a thread that nothing waits for: its directory may be on a disk that
+    /// hangs.
+    fn keep_socket(self: &Arc<Self>, paths: Vec<PathBuf>) -> io::Result<()> {
+        let own = self.clone();
+        let thread = std::thread::Builder::new().name("cara-socket".into()).spawn(move || own.look_after(&paths))?;
+        lock(&self.connections).threads.push(thread.into());
+        Ok(())
+    }
+
+    fn look_after(&self, paths: &[PathBuf]) {
+        let mut is_told = false;
+        while let Some(place) = self.await_next_look() {
+            if place.is_there() {
+                continue;
+            }
+            // What stands above a folder of the system's is not ours to make.
+            let is_below = |path: &PathBuf| path.ancestors().nth(2).is_some_and(Path::is_dir);
+            let usable = paths.iter().enumerate().filter(|(number, path)| *number == 0 || is_below(path));
+            let opened = usable.map(|(_, path)| Place::open(path)).reduce(Result::or);
+            match opened {
+                Some(Ok((place, listener))) => {
+                    is_told = false;
+                    self.moved_to(place, listener);
+                }
+                Some(Err(error)) if !is_told => {
+                    is_told = true;
+                    tracing::warn!(%error, "the control socket has vanished and cannot be made again yet: `cara` does not find this unit");
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// The place after the next pause; `None` once the unit stops.
+    fn await_next_look(&self) -> Option<Place> {
+        let socket = lock(&self.socket);
+        let waited = self.stopped.wait_timeout_while(socket, BETWEEN_LOOKS, |_| !self.is_stopping());
+        waited.unwrap_or_else(PoisonError::into_inner).0.place.clone()
+    }
+
+    fn moved_to(&self, place: Place, listener: UnixListener) {
+        let mut socket = lock(&self.socket);
+        if self.is_stopping() {
+            return place.remove();
+        }
+        tracing::warn!(path = %place.path().display(), "the control socket had vanished and was made again");
+        *socket = Socket { place: Some(place), fresh: Some(listener) };
+        self.waker.wake();
     }
 
     fn accept_with<T: Send + 'static>(
@@ -139,7 +214,7 @@ impl Shared {
         epoll.add(&listener, LISTENER, Interest::READ_LEVEL)?;
         let own = self.clone();
         let thread = std::thread::Builder::new().name("cara-control".into());
-        let thread = thread.spawn(move || own.accept(&listener, &epoll, &system))?;
+        let thread = thread.spawn(move || own.accept(listener, &epoll, &system))?;
         lock(&self.connections).threads.push(thread.into());
         Ok(self)
     }
@@ -150,7 +225,7 @@ impl Shared {
 
     fn accept<T: Send + 'static>(
         self: &Arc<Self>,
-        listener: &UnixListener,
+        mut listener: UnixListener,
         epoll: &Epoll,
         system: &CommunicationSystem<T>,
     ) {
@@ -159,6 +234,16 @@ impl Shared {
             if let Err(error) = epoll.wait(&mut events, None) {
                 tracing::error!(%error, "waiting for control connections failed");
                 return;
+            }
+            if self.waker.reset()
+                && let Some(fresh) = lock(&self.socket).fresh.take()
+            {
+                // The set forgets the old one when it is closed.
+                if let Err(error) = epoll.add(&fresh, LISTENER, Interest::READ_LEVEL) {
+                    tracing::error!(%error, "the control socket that was made again cannot be watched");
+                }
+                listener = fresh;
+                continue;
             }
             if events.iter().all(|ready| ready.token == WAKER) {
                 continue;
@@ -253,9 +338,9 @@ impl Shared {
         system: &CommunicationSystem<T>,
     ) -> io::Result<()> {
         let stream = *lines.source();
-        let mut writer = Answers::new(stream);
+        let writer = RefCell::new(Answers::new(stream, Instant::now()));
         let unit = system.identity();
-        writer.give(&Answer::Hello {
+        writer.borrow_mut().give(&Answer::Hello {
             control_version: CONTROL_VERSION,
             unit: unit.to_string(),
             fleet: system.fleet().0,
@@ -272,23 +357,27 @@ impl Shared {
             match question(line) {
                 Ok(question) => {
                     let client = RefCell::new(Beats { stream, lines, last: Instant::now() });
-                    let lives = |within| !self.is_stopping() && client.borrow_mut().lives(within);
+                    let lives = || {
+                        writer.borrow_mut().send_what_fits();
+                        client.borrow_mut().lives().filter(|_| !self.is_stopping())
+                    };
+                    writer.borrow_mut().waits = !question.waits_for_no_reader();
                     let mut entry = audit.and_then(|(audit, who)| Entry::of(audit, who, &question));
                     let mut sink = |answer| {
                         entry.iter_mut().for_each(|entry| entry.note(&answer));
-                        writer.sink(&answer)
+                        writer.borrow_mut().sink(&answer)
                     };
                     if full_when_opened && !question.is_of_a_stop() {
                         let _ = sink(Answer::Failed(full()));
-                    } else if !question.needs_its_client() || lives(None) {
+                    } else if !question.needs_its_client() || lives().is_some() {
                         execute_for(system, &question, &mut sink, &lives);
                     }
                     let unit_stops = system.is_stopped() || self.is_stopping();
                     entry.iter_mut().for_each(|entry| entry.give_up(unit_stops));
                 }
-                Err(failure) => drop(writer.sink(&Answer::Failed(failure))),
+                Err(failure) => drop(writer.borrow_mut().sink(&Answer::Failed(failure))),
             }
-            writer.outcome()?;
+            writer.borrow_mut().outcome()?;
             *lock(idle) = Some(Instant::now());
         }
         Ok(())
@@ -316,21 +405,20 @@ struct Beats<'b, 's> {
 }
 
 impl Beats<'_, '_> {
-    /// Whether the client has not closed its end altogether, as opposed to: asks nothing more; and, if that is asked, has
-    /// sent an empty line within a span. Behind its next question none is seen.
-    fn lives(&mut self, within: Option<Duration>) -> bool {
+    /// When the client last sent an empty line, or asked; `None` once it has closed its end altogether, as opposed to: asks
+    /// nothing more. Behind its next question no empty line is seen.
+    fn lives(&mut self) -> Option<Instant> {
         let mut fds = [PollFd::new(self.stream, PollFlags::IN)];
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
         let came = if poll(&mut fds, Some(&now)).is_ok() { fds[0].revents() } else { PollFlags::empty() };
         if came.intersects(PollFlags::HUP | PollFlags::ERR) {
-            return false;
+            return None;
         }
-        let Some(within) = within else { return true };
         // Reading waits for nothing where something has come.
         if (self.lines.has_more() || came.contains(PollFlags::IN)) && self.lines.skip_empty().unwrap_or(false) {
             self.last = Instant::now();
         }
-        self.last.elapsed() < within
+        Some(self.last)
     }
 }
 
@@ -341,27 +429,54 @@ fn write(writer: &mut impl Write, answer: &Answer) -> io::Result<()> {
 
 /// Answers on their way to one client.
 struct Answers<'s> {
-    writer: BufWriter<&'s UnixStream>,
+    stream: &'s UnixStream,
+    unsent: Vec<u8>,
     flushed: Instant,
     error: Option<io::Error>,
+    /// Whether a full socket is waited for.
+    waits: bool,
 }
 
 impl<'s> Answers<'s> {
-    fn new(stream: &'s UnixStream) -> Self {
-        Self { writer: BufWriter::new(stream), flushed: Instant::now(), error: None }
+    const fn new(stream: &'s UnixStream, now: Instant) -> Self {
+        Self { stream, unsent: Vec::new(), flushed: now, error: None, waits: true }
     }
 
     fn give(&mut self, answer: &Answer) -> io::Result<()> {
-        write(&mut self.writer, answer)?;
+        write(&mut self.unsent, answer)?;
         if matches!(answer, Answer::Sample { .. }) && self.flushed.elapsed() < GATHER {
             return Ok(());
         }
         self.flushed = Instant::now();
-        self.writer.flush()
+        self.send()
+    }
+
+    fn send(&mut self) -> io::Result<()> {
+        if self.waits {
+            self.stream.write_all(&self.unsent)?;
+            self.unsent = Vec::new();
+            return Ok(());
+        }
+        while !self.unsent.is_empty() {
+            match send(self.stream, &self.unsent, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
+                Ok(count) => drop(self.unsent.drain(..count)),
+                Err(Errno::WOULDBLOCK) if self.unsent.len() <= MOST_UNREAD => break,
+                Err(errno) => return Err(errno.into()),
+            }
+        }
+        Ok(())
+    }
+
+    /// What a slow reader has made room for. An error shows at the next answer.
+    fn send_what_fits(&mut self) {
+        if !self.waits && self.error.is_none() {
+            self.error = self.send().err();
+        }
     }
 
     fn sink(&mut self, answer: &Answer) -> ControlFlow<()> {
-        match self.give(answer) {
+        let given = self.error.take().map_or_else(|| self.give(answer), Err);
+        match given {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
                 self.error = Some(error);
@@ -370,8 +485,10 @@ impl<'s> Answers<'s> {
         }
     }
 
+    /// Behind the last answer. Nothing is watched any more, so the rest may wait for the client.
     fn outcome(&mut self) -> io::Result<()> {
-        self.error.take().map_or(Ok(()), Err)
+        self.waits = true;
+        self.error.take().map_or_else(|| self.send(), Err)
     }
 }
 
@@ -385,6 +502,10 @@ mod tests {
     use crate::UnitEvent;
     use crate::testing::{fleet, manager};
 
+    fn written(shared: &Shared) {
+        shared.audit.iter().for_each(|audit| audit.flush(Duration::from_secs(20)));
+    }
+
     #[test]
     fn what_a_client_has_done_is_noted_with_who_asked() {
         let folder = tempfile::tempdir().unwrap();
@@ -395,6 +516,7 @@ mod tests {
         client.write_all(b"{\"ask\":\"retire\",\"node\":\"agv/1\"}\n{\"ask\":\"nodes\"}\n").unwrap();
         client.shutdown(Shutdown::Write).unwrap();
         let _ = shared.serve(served, &Mutex::default(), false, &system);
+        written(&shared);
         let line: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
         assert_eq!(
             (&line["ask"], &line["node"], &line["pid"]),
@@ -417,6 +539,7 @@ mod tests {
             r#"{"ask":"stop","node":"agv/2"}"#,
         ];
         let noted = |from: usize| {
+            written(&shared);
             let text = std::fs::read_to_string(&path).unwrap();
             let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
             let word = |value: &serde_json::Value| value.as_str().unwrap_or("-").to_owned();
@@ -442,6 +565,27 @@ mod tests {
             let _ = serving.join().unwrap();
         });
         assert_eq!(noted(3), ["reset agv/1 gone", "stop agv/2 UnknownNode"]);
+    }
+
+    #[test]
+    fn answers_that_wait_for_no_reader_are_kept_up_to_a_limit_and_sent_when_there_is_room() {
+        let (client, served) = UnixStream::pair().unwrap();
+        let mut answers = Answers { waits: false, ..Answers::new(&served, Instant::now()) };
+        let line = Answer::Metrics { text: "x".repeat(64 * 1024) };
+        let mut given = 0;
+        while answers.sink(&line).is_continue() {
+            given += 1;
+            assert!(given < MOST_UNREAD / 1024, "there is no limit");
+        }
+        assert!(answers.unsent.len() > MOST_UNREAD && answers.outcome().is_err());
+        answers.unsent.truncate(MOST_UNREAD);
+        std::thread::scope(|scope| {
+            let read = scope.spawn(|| BufReader::new(client).lines().map_while(Result::ok).count());
+            answers.outcome().unwrap();
+            assert!(answers.unsent.is_empty());
+            served.shutdown(Shutdown::Both).unwrap();
+            assert!(read.join().unwrap() > 0);
+        });
     }
 
     /// Each client has asked before it is served, so that its time to ask is no race.

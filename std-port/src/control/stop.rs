@@ -1,4 +1,6 @@
 //! A stop or a reset by an operator: each function with that attribute, of one node or of the whole roster, at the same time.
+//! A stop is carried out to its end whether or not its client is there and reads. Where its call cannot be made, or is not
+//! answered soon, it is sent one way as well, as a datagram and in the stream.
 
 use std::collections::{HashMap, HashSet};
 use std::time::Instant;
@@ -8,10 +10,10 @@ use cara_core::distribution::function::Attributes;
 use cara_core::services::access::Verb;
 
 use super::answering::{End, Sink, permit, send};
-use super::call::{block_all, called};
+use super::call::{News, block_all, called, prepare};
 use super::protocol::{Answer, CallQuestion, Failure};
 use super::select;
-use crate::{CommunicationSystem, Identity, Peer, RequestOptions};
+use crate::{CommunicationSystem, Delivery, Identity, Peer, RequestOptions};
 
 /// Which functions are called.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,6 +47,8 @@ struct Outcome<'p, T: Send + 'static> {
     /// Functions that have not answered.
     open: usize,
     error: Option<Failure>,
+    /// A call of it was sent one way as well.
+    is_one_way: bool,
 }
 
 /// An [`Answer::Called`] for each node, once all its functions that stop (or reset) have answered. What could not be called is
@@ -64,7 +68,7 @@ pub(super) fn call<T: Send + 'static>(
     let mut allowed = HashMap::new();
     let (mut questions, mut outcomes, mut missed) = (Vec::new(), Vec::new(), Vec::new());
     for peer in &peers {
-        let mut outcome = Outcome { peer, functions: Vec::new(), open: 0, error: None };
+        let mut outcome = Outcome { peer, functions: Vec::new(), open: 0, error: None, is_one_way: false };
         match functions(peer, which) {
             Err(failure) => outcome.error = Some(failure),
             Ok(functions) => {
@@ -85,14 +89,38 @@ pub(super) fn call<T: Send + 'static>(
     }
     let options = RequestOptions { priority: Some(Priority::Emergency), operator: true, ..RequestOptions::default() };
     let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
-    block_all(&calls, &options, wanted, &mut |number, answer| {
-        let Some(outcome) = questions.get(number).and_then(|(of, _)| outcomes.get_mut(*of)) else { return Ok(()) };
-        let Answer::Called { error, .. } = answer else { return Ok(()) };
-        outcome.open -= 1;
-        outcome.error = outcome.error.take().or(error);
-        if outcome.open == 0 { told(outcome, started, sink) } else { Ok(()) }
+    let is_stop = which == Which::Stop;
+    let mut tell = |outcome: &Outcome<'_, T>| match told(outcome, started, sink) {
+        Err(_) if is_stop => Ok(()),
+        told => told,
+    };
+    block_all(&calls, &options, &|| is_stop || wanted(), &mut |number, news| {
+        let Some((of, question)) = questions.get(number) else { return Ok(()) };
+        let Some(outcome) = outcomes.get_mut(*of) else { return Ok(()) };
+        match news {
+            News::Late if is_stop => outcome.is_one_way |= send_one_way(outcome.peer, question, &options),
+            News::Answer(Answer::Called { error, .. }) => {
+                outcome.open -= 1;
+                outcome.error = outcome.error.take().or(error);
+                if outcome.open == 0 {
+                    return tell(outcome);
+                }
+            }
+            News::Late | News::Answer(_) => {}
+        }
+        Ok(())
     })?;
-    missed.iter().try_for_each(|outcome| told(outcome, started, sink))
+    missed.iter().try_for_each(tell)
+}
+
+/// Whether it has left, one way or the other: nothing acknowledges it.
+fn send_one_way<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion, options: &RequestOptions) -> bool {
+    let Ok(prepared) = prepare(peer, question) else { return false };
+    let ways = [Delivery::BestEffort, Delivery::Reliable].map(|delivery| {
+        let options = RequestOptions { delivery, ..*options };
+        peer.request_with(&question.function, &prepared.parameters, &options).is_ok()
+    });
+    ways.contains(&true)
 }
 
 /// The whole roster, and any other node that can be stopped (or reset).
@@ -116,7 +144,8 @@ fn functions<T: Send + 'static>(peer: &Peer<T>, which: Which) -> Result<Vec<Stri
 }
 
 fn told<T: Send + 'static>(outcome: &Outcome<'_, T>, started: Instant, sink: Sink<'_>) -> Result<(), End> {
-    let error = outcome.error.clone();
+    let sent = "it was sent one way as well, which nothing acknowledges: look whether the node stands";
+    let error = outcome.error.clone().map(|error| if outcome.is_one_way { error.and(sent) } else { error });
     let mut answer = called(outcome.peer, error.map_or_else(|| Ok(Default::default()), Err), started);
     if let Answer::Called { functions, .. } = &mut answer {
         functions.clone_from(&outcome.functions);

@@ -139,6 +139,11 @@ impl<T: Send + 'static> Engine<T> {
                 "Connections dropped because as many links were open as may be.",
                 load(&self.accounts.connections_refused),
             ),
+            count(
+                "AuditLinesLost",
+                "Lines of the audit log that its disk did not take, or not in time.",
+                self.audit_lines_lost(),
+            ),
             count("HooksLate", "Safe hooks that took longer than 100 ms.", load(&self.accounts.hooks_late)),
             count("LatchesUnkept", "Times that a stop or its end could not be written.", self.latch.failed()),
             count(

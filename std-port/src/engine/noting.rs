@@ -35,4 +35,15 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn noted(&self, _: &LinkCell, _: &str, _: &RequestOptions) -> Option<Noted> {
         None
     }
+
+    /// Lines of the audit log that nothing has written.
+    #[cfg(feature = "control")]
+    pub(super) fn audit_lines_lost(&self) -> u64 {
+        self.audit.as_ref().map_or(0, |audit| audit.lost())
+    }
+
+    #[cfg(not(feature = "control"))]
+    pub(super) fn audit_lines_lost(&self) -> u64 {
+        0
+    }
 }

@@ -60,6 +60,12 @@ pub(super) fn read(path: &Path) -> Result<(Zeroizing<String>, Mark), KeyError> {
 /// What is in a file, if it is as it was written.
 pub(super) fn text_of(path: &Path, bytes: Vec<u8>) -> Result<Zeroizing<String>, KeyError> {
     match String::from_utf8(bytes).map(Zeroizing::new) {
+        Ok(text) if text.contains("\r\n") || text.starts_with('\u{feff}') => {
+            let what = "the lines end with CR LF, or a byte order mark stands before them, as a copy in text mode, git or an editor \
+                        on Windows leave them: copy the file as it was, or mend it with \
+                        `sed -i '1s/^\\xEF\\xBB\\xBF//;s/\\r$//' FILE`";
+            Err(form(path, FormError { line: 1, what }))
+        }
         Ok(text) if checksum(&text) == Checksum::Wrong => Err(KeyError::Damaged(path.to_owned())),
         Ok(text) => Ok(text),
         Err(error) => {
@@ -223,6 +229,18 @@ mod tests {
         let pipe = folder.join("pipe");
         rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RWXU, 0).unwrap();
         pipe
+    }
+
+    #[test]
+    fn a_file_that_went_through_windows_is_told_with_what_mends_it() {
+        let mut text = "form 2\nname agv\n".to_owned();
+        super::super::text::push_sum(&mut text);
+        let path = Path::new("agv.keys");
+        assert!(text_of(path, text.clone().into_bytes()).is_ok());
+        for wrong in [text.replace('\n', "\r\n"), format!("\u{feff}{text}")] {
+            let error = text_of(path, wrong.into_bytes()).unwrap_err().to_string();
+            assert!(error.contains("CR LF, or a byte order mark") && error.contains("`sed -i '1s/^"), "{error}");
+        }
     }
 
     #[test]

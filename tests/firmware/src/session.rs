@@ -131,7 +131,9 @@ impl Cara {
         if words.is_empty() {
             return Ok(());
         }
-        let output = self.command().args(words).output().context("cannot start cara")?;
+        // Open for as long as this session is: what `--hold` holds ends with it.
+        let (input, _open) = std::io::pipe()?;
+        let output = self.command().args(words).stdin(input).output().context("cannot start cara")?;
         let mut shown = std::io::stdout().lock();
         shown.write_all(&output.stdout)?;
         shown.write_all(&output.stderr)?;

@@ -88,7 +88,9 @@ impl<'s> Terminal<'s> {
         ensure!(self.running.is_none(), "something runs in this terminal already");
         println!("{}$ {text}", self.name);
         let start = Instant::now();
-        let finished = self.shell(text).output()?;
+        // As a terminal, it stays open and says nothing: what `--hold` holds goes on.
+        let (input, _open) = std::io::pipe()?;
+        let finished = self.shell(text).stdin(input).output()?;
         let output = String::from_utf8_lossy(&finished.stdout).into_owned();
         let errors = String::from_utf8_lossy(&finished.stderr).into_owned();
         ensure!(finished.status.success(), "`{text}` failed: {}\n{output}{errors}", finished.status);

@@ -150,15 +150,15 @@ fn clients(global: &Global) -> anyhow::Result<(Vec<Client>, Vec<RunningUnit>, Op
 
 /// The units of a name and id, of which one that cannot be asked is a finding; that none runs is an error.
 fn named(wanted: &str) -> Result<Vec<RunningUnit>, ControlError> {
-    let directory = control::directory();
-    let named = control::running_called(&directory, wanted)?;
+    let directories = control::directories();
+    let named = control::first_of(&directories, |directory| control::running_called(directory, wanted))?;
     if !named.is_empty() {
         return Ok(named);
     }
     let running = control::running()?;
     let wanted = wanted.to_owned();
     Err(if running.is_empty() {
-        ControlError::NoneRunning(directory)
+        ControlError::NoneRunning(directories)
     } else {
         ControlError::NotRunning { wanted, running }
     })

@@ -72,11 +72,20 @@ enum Action {
 #[derive(clap::Args)]
 struct Nodes {
     /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
-    #[arg(value_name = "NODE", value_parser = parse_node)]
+    #[arg(value_name = "NODE", value_parser = parse_new)]
     nodes: Vec<Identity>,
     /// The m_unit that these s_units belong to; may be repeated. Unless told, the only one of the fleet.
     #[arg(long, value_name = "NAME/ID")]
     manager: Vec<NameAndId>,
+}
+
+/// A name that looks like another node's NAME/ID would hide that one.
+fn parse_new(text: &str) -> Result<Identity, &'static str> {
+    let identity = parse_node(text)?;
+    match identity.name().contains('/') {
+        true => Err("a new node's name has no slash: NAME/ID of another node could be the same"),
+        false => Ok(identity),
+    }
 }
 
 /// Does what the command line asks, and prints it.

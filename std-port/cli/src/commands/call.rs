@@ -3,10 +3,12 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
+use cara_std::control::Closer;
 use cara_std::control::protocol::{Answer, Argument, CallQuestion, Failure, FunctionInfo, Question};
 use cara_std::{Definition, Priority, Shown};
 use serde_json::{Value, json};
 
+use crate::attended::Attended;
 use crate::nodes::{self, Chosen};
 use crate::operator::{Need, Operator, exit_of};
 use crate::text::{Mistake, Written, bind, read, show_call};
@@ -47,9 +49,14 @@ pub(crate) struct Arguments {
     /// Take over what another unit or this unit's program moves, instead of the error that names it.
     #[arg(long)]
     take_over: bool,
-    /// Keep the lease of what the call starts until it has finished, or until Ctrl-C: then it stops.
+    /// Keep the lease of what the call starts until it has finished, or until Ctrl-C, or until standard input or output ends or
+    /// hangs up: then it stops.
     #[arg(long, conflicts_with_all = ["all", "asynchronous"])]
     hold: bool,
+    /// With --hold: go on without standard input and output, as a background job of a script. Only the end of this command
+    /// stops it then.
+    #[arg(long, requires = "hold")]
+    detached: bool,
 }
 
 impl Arguments {
@@ -70,6 +77,10 @@ impl Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let (node, text) = arguments.node_and_call()?;
+    let is_attended = arguments.hold && !arguments.detached;
+    if is_attended {
+        Attended::check("--hold")?;
+    }
     let text = text.as_str();
     let written = read(text).map_err(|mistake| wrong(&mistake, text, None))?;
     let function = written.function.value;
@@ -103,8 +114,22 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         interrupt::end_at_signals()?;
     }
     let lease = published.attributes.lease.filter(|_| !arguments.hold).map(|lease| lease.as_micros());
-    let exit = call(&mut operator, question, arguments.hold, lease, global)?;
-    Ok(exit.into())
+    if !is_attended {
+        return Ok(call(&mut operator, question, arguments.hold, lease, global)?.into());
+    }
+    let (closer, way) = (operator.closer()?, operator.way());
+    let attended = Attended::watch(move || {
+        closer.inspect(Closer::close);
+        way.end();
+    })?;
+    let outcome = call(&mut operator, question, true, lease, global);
+    match attended.end().filter(|_| !matches!(outcome, Ok(Exit::Done))) {
+        Some(end) => {
+            let text = format!("{end}, and what this command held was released; with --detached it goes on without");
+            Err(Ended::failed("Unattended", text))
+        }
+        None => Ok(outcome?.into()),
+    }
 }
 
 fn call(
@@ -117,8 +142,10 @@ fn call(
     let (function, asynchronous, one) = (question.function.clone(), question.asynchronous, question.node.is_some());
     let mut worst = Exit::Done;
     let question = if hold { Question::Hold(question) } else { Question::Call(question) };
+    let mut has_ended = !hold;
     operator.ask(&question, |answer| {
         if let Answer::Ended { expired } = answer {
+            has_ended = true;
             worst = if expired { Exit::Failed } else { worst };
             return Ok(show_end(expired, global)?);
         }
@@ -131,6 +158,7 @@ fn call(
         let error = error.map(|failure| of_its_lease(failure, &function, ended));
         let node = format!("{node}/{id}");
         if let Some(failure) = &error {
+            has_ended = true;
             worst = if worst == Exit::Failed { worst } else { exit_of(failure) };
         }
         Ok(show_outcome(&node, &function, &results, call, error.as_ref(), (took_us, one), global)?)
@@ -138,7 +166,8 @@ fn call(
     if asynchronous {
         operator.deliver();
     }
-    Ok(worst)
+    // A unit of this process that was stopped meanwhile says nothing.
+    Ok(if has_ended { worst } else { Exit::Failed })
 }
 
 /// Why a service failed that went on for longer than a lease which nothing has kept.

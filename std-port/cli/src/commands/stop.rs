@@ -1,5 +1,6 @@
 //! `cara stop` and `cara reset`: the functions with that attribute, of one node or of all.
 
+use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use cara_std::Shown;
@@ -32,18 +33,29 @@ pub(crate) struct Reset {
 #[derive(clap::Args)]
 struct Of {
     /// The node: NAME, NAME/ID or #ID.
-    #[arg(required_unless_present = "all", conflicts_with = "all")]
+    #[arg(conflicts_with = "all")]
     node: Option<String>,
     /// Every s_unit of the roster, also those that are absent, and every m_unit that offers such a function.
     #[arg(long)]
     all: bool,
 }
 
+impl Of {
+    fn check(&self, verb: &str) -> anyhow::Result<()> {
+        if self.node.is_some() || self.all {
+            return Ok(());
+        }
+        Err(Ended::usage(format!("name a node, as in `cara {verb} agv-1`, or all of them: `cara {verb} --all`")))
+    }
+}
+
 pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCode> {
+    of.check("stop")?;
     run(of, Operator::open_to_stop, |node| Question::Stop { node }, global)
 }
 
 pub(crate) fn reset(Reset { of }: Reset, global: &Global) -> anyhow::Result<ExitCode> {
+    of.check("reset")?;
     run(of, Operator::open, |node| Question::Reset { node }, global)
 }
 
@@ -59,26 +71,74 @@ fn run(
         Some(node) => Some(nodes::known(&mut operator, &node)?.selector),
         None => None,
     };
-    let (mut nodes, mut acknowledged, mut last_us) = (0, 0, None);
-    operator.ask(&question(node), |answer| {
+    let mut sum = Sum::default();
+    let mut unshown = None;
+    let asked = operator.ask(&question(node), |answer| {
         let Answer::Called { node, id, error, took_us, .. } = answer else { return Ok(()) };
-        nodes += 1;
-        if error.is_none() {
-            acknowledged += 1;
-            last_us = last_us.max(Some(took_us));
-        }
-        Ok(show(&format!("{node}/{id}"), error.as_ref(), took_us, global)?)
-    })?;
-    if nodes == 0 {
+        let node = format!("{node}/{id}");
+        // An output that takes nothing ends no stop, and hides nothing of it.
+        unshown = unshown.take().or(show(&node, error.as_ref(), took_us, global).err());
+        sum.add(node, error.is_none().then_some(took_us));
+        Ok(())
+    });
+    if asked.is_ok() && sum.nodes == 0 {
         return Err(Ended::failed("NoNodes", format!("no s_unit is known{}: nothing was called", operator.waited())));
     }
-    if global.json {
-        output::object(&json!({ "nodes": nodes, "acknowledged": acknowledged, "last_us": last_us }))?;
-    } else {
-        let last = last_us.map(|last| format!(", the last after {}", show_micros(last as f64))).unwrap_or_default();
-        output::line(format_args!("{acknowledged} of {nodes} acknowledged{last}"))?;
+    // A reader that has gone is no error: the exit code says the same.
+    unshown = unshown.or(sum.show(global).err()).filter(|error| error.kind() != ErrorKind::BrokenPipe);
+    let unshown = unshown.map(|error| format!("standard output: {error}; {sum}"));
+    match (asked, unshown) {
+        (Ok(()), None) => Ok(if sum.missing.is_empty() { Exit::Done } else { Exit::Failed }.into()),
+        (Ok(()), Some(text)) => Err(Ended::failed("Output", text)),
+        (Err(error), None) if sum.nodes == 0 => Err(error),
+        (Err(error), text) => Err(error.context(text.unwrap_or_else(|| sum.to_string()))),
     }
-    Ok(if acknowledged == nodes { Exit::Done } else { Exit::Failed }.into())
+}
+
+/// What came of all nodes.
+#[derive(Default)]
+struct Sum {
+    nodes: usize,
+    /// Those that have not acknowledged.
+    missing: Vec<String>,
+    last_us: Option<u64>,
+}
+
+impl Sum {
+    fn add(&mut self, node: String, acknowledged_us: Option<u64>) {
+        self.nodes += 1;
+        match acknowledged_us {
+            Some(took_us) => self.last_us = self.last_us.max(Some(took_us)),
+            None => self.missing.push(node),
+        }
+    }
+
+    fn acknowledged(&self) -> usize {
+        self.nodes - self.missing.len()
+    }
+
+    fn show(&self, global: &Global) -> std::io::Result<()> {
+        let Self { nodes, missing, last_us } = self;
+        match global.json {
+            false => output::line(self),
+            true => output::object(&json!({
+                "nodes": nodes, "acknowledged": self.acknowledged(), "last_us": last_us, "missing": missing,
+            })),
+        }
+    }
+}
+
+impl std::fmt::Display for Sum {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} of {} acknowledged", self.acknowledged(), self.nodes)?;
+        if let Some(last) = self.last_us {
+            write!(f, ", the last after {}", show_micros(last as f64))?;
+        }
+        if !self.missing.is_empty() {
+            write!(f, "; not acknowledged: {}", Shown(&self.missing.join(", ")))?;
+        }
+        Ok(())
+    }
 }
 
 fn show(node: &str, error: Option<&Failure>, took_us: u64, global: &Global) -> std::io::Result<()> {

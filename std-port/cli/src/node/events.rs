@@ -1,22 +1,30 @@
 //! Events of the node as lines of its log. Lines about refused connections are rate-limited.
 
 use std::collections::HashMap;
+use std::net::SocketAddr;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use cara_std::{Claim, CloseReason, UnitEvent};
+use cara_std::{Claim, CloseReason, Identity, UnitEvent};
 
 /// Links that did not come about for one reason are one line in this time: a port scan has hundreds a second.
 const PERIOD: Duration = Duration::from_secs(1);
 
-/// Tells what happens to the node, in a thread that ends with the unit; `fenced` once another manager has taken over.
-pub(super) fn log(events: Receiver<UnitEvent>, fenced: impl Fn(Claim) + Send + 'static) -> anyhow::Result<()> {
-    std::thread::Builder::new().name("cara-log".into()).spawn(move || log_all(&events, &fenced))?;
+/// Tells what happens to the node, in a thread that ends with the unit; `fenced` once another manager has taken over. `address`
+/// tells where a connected peer is.
+pub(super) fn log(
+    events: Receiver<UnitEvent>,
+    address: impl Fn(&Identity) -> Option<SocketAddr> + Send + 'static,
+    fenced: impl Fn(Claim) + Send + 'static,
+) -> anyhow::Result<()> {
+    std::thread::Builder::new().name("cara-log".into()).spawn(move || log_all(&events, &address, &fenced))?;
     Ok(())
 }
 
-fn log_all(events: &Receiver<UnitEvent>, fenced: &dyn Fn(Claim)) {
+fn log_all(events: &Receiver<UnitEvent>, address: &dyn Fn(&Identity) -> Option<SocketAddr>, fenced: &dyn Fn(Claim)) {
     let mut sparing = Sparing::default();
+    // As many as there are peers.
+    let mut addresses = HashMap::new();
     loop {
         let event = match sparing.0.is_empty() {
             true => events.recv().map_err(|_| RecvTimeoutError::Disconnected),
@@ -25,6 +33,15 @@ fn log_all(events: &Receiver<UnitEvent>, fenced: &dyn Fn(Claim)) {
         match event {
             Ok(UnitEvent::NotJoined { reason, .. }) if !sparing.admits(reason, Instant::now()) => {}
             Ok(UnitEvent::Fenced { claim }) => fenced(claim),
+            Ok(UnitEvent::Joined { peer }) => {
+                let address = address(&peer);
+                tracing::info!(node = %peer, address = address.map(tracing::field::display), "joined");
+                addresses.insert(peer, address);
+            }
+            Ok(UnitEvent::Left { peer, reason }) => {
+                let address = addresses.remove(&peer).flatten();
+                tracing::warn!(node = %peer, address = address.map(tracing::field::display), "left: {reason}");
+            }
             Ok(event) => log_event(event),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return sparing.0.into_iter().for_each(left_out),
@@ -78,8 +95,6 @@ impl Sparing {
 
 fn log_event(event: UnitEvent) {
     match event {
-        UnitEvent::Joined { peer } => tracing::info!(node = %peer, "joined"),
-        UnitEvent::Left { peer, reason } => tracing::warn!(node = %peer, "left: {reason}"),
         UnitEvent::NotJoined { address, peer, reason } => {
             let node = peer.map(|peer| peer.to_string());
             tracing::warn!(%address, node, "not joined: {reason}");

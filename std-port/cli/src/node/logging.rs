@@ -1,7 +1,10 @@
-//! The node's log: lines on standard error, at a level that can change while it runs.
+//! The node's log: lines on standard error, at a level that can change while it runs. A queue stands before it: a terminal or
+//! pipe that takes nothing holds up no thread of the unit.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
+use std::time::Duration;
 
+use cara_std::LineQueue;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::{LevelFilter, ParseError};
 
@@ -9,12 +12,21 @@ use cara_tools::exit::Ended;
 
 /// The default log filter.
 const LEVEL: &str = "info";
+/// How long the node waits at its end for the last lines to be written.
+const LAST_LINES: Duration = Duration::from_secs(1);
 
 /// Changes what is logged.
 pub(super) struct Logging {
     change: Box<dyn Fn(EnvFilter)>,
     /// The environment's `RUST_LOG` stands above the file's level.
     fixed: bool,
+    lines: LineQueue,
+}
+
+impl Drop for Logging {
+    fn drop(&mut self) {
+        self.lines.flush(LAST_LINES);
+    }
 }
 
 /// Why a text is no level.
@@ -50,8 +62,18 @@ impl Logging {
             }
             (level, _) => filter(level.or(file).unwrap_or(LEVEL))?,
         };
+        let mut told = 0;
+        let lines = LineQueue::new("cara-stderr", move |line, lost| {
+            let mut stderr = std::io::stderr().lock();
+            if lost > told {
+                writeln!(stderr, "{} lines of the log were lost: they came faster than they were read", lost - told)?;
+                told = lost;
+            }
+            stderr.write_all(line)
+        })?;
+        let queue = lines.clone();
         let builder = tracing_subscriber::fmt()
-            .with_writer(std::io::stderr)
+            .with_writer(move || queue.clone())
             .with_ansi(std::io::stderr().is_terminal())
             .with_env_filter(filter);
         let builder = builder.with_filter_reloading();
@@ -62,7 +84,7 @@ impl Logging {
             // Fails only once the subscriber is gone.
             let _ = handle.reload(filter);
         });
-        Ok(Self { change, fixed })
+        Ok(Self { change, fixed, lines })
     }
 
     /// Takes the level of a file that has changed.

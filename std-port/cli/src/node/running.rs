@@ -39,7 +39,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     let (ending, fenced) = (signals.handle(), Arc::new(OnceLock::new()));
     let told = fenced.clone();
-    events::log(node.events(), move |term| {
+    events::log(node.events(), node.addresses(), move |term| {
         let _ = told.set(term);
         ending.close();
     })?;

@@ -1,6 +1,6 @@
 //! What a node runs with: the file's values, checked against each other, and the command line's above them.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::ops::Range;
 use std::path::PathBuf;
 
@@ -218,8 +218,23 @@ fn named_manager(table: &toml::Spanned<file::Manager>, mistakes: &mut Vec<Mistak
     Manager {
         name: name.as_ref().map(|name| name.get_ref().clone()).unwrap_or_default(),
         id: id.as_ref().map_or(0, |id| *id.get_ref()),
-        address: address_of(address, mistakes),
+        address: manager_address(address, mistakes),
     }
+}
+
+/// One that can be dialled: an IPv4 address of one host, and a port.
+fn manager_address(text: &Maybe<String>, mistakes: &mut Vec<Mistake>) -> Option<SocketAddr> {
+    let address = address_of(text, mistakes)?;
+    let is_of_a_host = match address.ip() {
+        IpAddr::V4(ip) => !ip.is_unspecified() && !ip.is_broadcast() && !ip.is_multicast(),
+        IpAddr::V6(_) => false,
+    };
+    if !is_of_a_host || address.port() == 0 {
+        let span = text.as_ref().map_or(0..0, toml::Spanned::span);
+        let help = "write the manager's own IPv4 address and its TCP port, as \"192.168.1.5:21971\"; IPv6 is not used";
+        mistakes.push(Mistake::new(span, "no manager can be reached at this address", help));
+    }
+    Some(address)
 }
 
 fn m_units(file: &File, role: Role, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Vec<NameAndId>> {

@@ -23,6 +23,26 @@ fn a_port_of_metrics_without_an_address_is_told_with_both() {
 }
 
 #[test]
+fn an_address_at_which_no_manager_can_be_is_a_mistake() {
+    let of = |address: &str| {
+        let manager = format!("[manager]\nname = \"depot\"\nid = 1\naddress = \"{address}\"\n");
+        settings(&format!("name = \"agv\"\nid = 7\nrole = \"s_unit\"\nfleet = 1\n{manager}"))
+    };
+    assert!(of("192.168.1.5:21971").is_ok() && of("127.0.0.1:17001").is_ok());
+    for wrong in [
+        "[::1]:17001",
+        "[::ffff:127.0.0.1]:17001",
+        "127.0.0.1:0",
+        "0.0.0.0:17001",
+        "255.255.255.255:17001",
+        "224.0.0.1:5",
+    ] {
+        let told = of(wrong).err().unwrap_or_else(|| panic!("{wrong} is taken"));
+        assert!(told.contains("no manager can be reached at this address"), "{told}");
+    }
+}
+
+#[test]
 fn the_example_shows_the_defaults() {
     let example = settings(EXAMPLE).unwrap();
     let least = settings("name = \"AGV_manager\"\nid = 1\n").unwrap();

@@ -1,12 +1,14 @@
 //! The node's unit, whichever role it has.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use cara_std::access::AccessError;
 use cara_std::{
-    BuildError, Builder, CommunicationSystem, Constraints, Error, Mode, MyFunctionList, StartError, Unit, UnitEvent,
+    BuildError, Builder, CommunicationSystem, Constraints, Error, Identity, Mode, MyFunctionList, StartError, Unit,
+    UnitEvent,
 };
 
 use super::http::Metrics;
@@ -135,6 +137,20 @@ impl Node {
         match self {
             Self::Manager(system) => system.control_path(),
             Self::Vehicle(_) => None,
+        }
+    }
+
+    /// Where a connected peer is; holds no unit alive.
+    pub(super) fn addresses(&self) -> Box<dyn Fn(&Identity) -> Option<SocketAddr> + Send> {
+        match self {
+            Self::Manager(system) => {
+                let system = system.downgrade();
+                Box::new(move |peer| system.upgrade()?.node(peer)?.address())
+            }
+            Self::Vehicle(unit) => {
+                let unit = unit.downgrade();
+                Box::new(move |_| unit.upgrade()?.manager()?.address())
+            }
         }
     }
 

@@ -6,11 +6,11 @@ mod running;
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::CommunicationSystem;
 use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
-use cara_std::control::{Client, Closer, execute, execute_while};
+use cara_std::control::{Beater, Client, Closer, execute, execute_while};
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
@@ -92,7 +92,7 @@ fn none_runs(ways: &str) -> anyhow::Error {
     if others.is_empty() && !of_others.is_empty() {
         return Ended::no_unit(of_others);
     }
-    Ended::no_unit(format!("no such m_unit runs on this host{others}. {ways}"))
+    Ended::no_unit(format!("no such m_unit runs on this host{others} (looked in {}). {ways}", running::looked_in()))
 }
 
 impl Operator {
@@ -210,19 +210,27 @@ impl Operator {
         }
     }
 
-    /// Asks, and passes on each answer, a failure too, until that says `Break`; of a unit of this process also until `wanted`
-    /// says `false`.
+    /// Asks, and passes on each answer, a failure too, until that says `Break`; of a unit of this process also until `lives`
+    /// says that the client has gone, or that its last sign of life is too old.
     pub(crate) fn pass_on(
         &mut self,
         question: &Question,
         each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
-        wanted: &dyn Fn() -> bool,
+        lives: &dyn Fn() -> Option<Instant>,
     ) -> anyhow::Result<()> {
         match &mut self.unit {
-            Unit::Own(system) => execute_while(system, question, each, wanted),
+            Unit::Own(system) => execute_while(system, question, each, lives),
             Unit::Running(client) => running::pass_on(client, question, each)?,
         }
         Ok(())
+    }
+
+    /// What forwards heartbeats to a unit of another process, while it is asked by [`pass_on`](Self::pass_on).
+    pub(crate) fn beater(&self) -> anyhow::Result<Option<Beater>> {
+        match &self.unit {
+            Unit::Own(_) => Ok(None),
+            Unit::Running(client) => Ok(Some(client.beater()?)),
+        }
     }
 
     /// What closes the connection to a unit of another process, from another thread.

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use cara_std::control::protocol::{Answer, Question};
 use cara_std::control::{
-    Client, ControlError, Elsewhere, RunningUnit, UnitState, directory, elsewhere, running, running_called,
+    Client, ControlError, Elsewhere, RunningUnit, UnitState, directories, elsewhere, first_of, running, running_called,
+    running_in,
 };
 
 use super::error_of;
@@ -22,20 +23,24 @@ pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option
         return connect(path).map(Some).map_err(error);
     }
     let wanted = global.unit.as_ref().map(NameAndId::to_string);
-    let all = match &wanted {
-        Some(wanted) => running_called(&directory(), wanted),
-        None => running(),
-    };
-    let all = all.map_err(error)?;
-    let is_meant = |unit: &&RunningUnit| {
+    let is_meant = |unit: &RunningUnit| {
         global.fleet.is_none_or(|fleet| fleet == unit.fleet)
             && wanted.as_ref().is_none_or(|wanted| *wanted == unit.unit)
     };
-    let meant: Vec<_> = all.iter().filter(is_meant).collect();
+    let all = first_of(&directories(), |directory| {
+        let mut all = match &wanted {
+            Some(wanted) => running_called(directory, wanted)?,
+            None => running_in(directory)?,
+        };
+        all.retain(is_meant);
+        Ok(all)
+    });
+    let all = all.map_err(error)?;
+    let meant: Vec<_> = all.iter().collect();
     match (meant.as_slice(), wanted) {
         ([], None) => Ok(None),
         ([], Some(wanted)) => Err(Ended::no_unit(match of_others(Some(&wanted)).as_str() {
-            "" => format!("{wanted} does not run on this host{}", not_meant()),
+            "" => format!("{wanted} does not run on this host{} (looked in {})", not_meant(), looked_in()),
             others => others.to_owned(),
         })),
         ([only], _) => match (&only.state, only.refusal()) {
@@ -56,6 +61,7 @@ pub(super) fn of_others(wanted: Option<&str>) -> String {
     let told = all.take(SHOWN).map(|Elsewhere { unit, fleet, path, owner }| {
         let folder = path.parent().unwrap_or(&path).display().to_string();
         let (user, sudo) = match owner {
+            Some(owner) if owner == rustix::process::getuid().as_raw() => ("this user".to_owned(), String::new()),
             Some(owner) => (format!("user {owner}"), format!("sudo -u '#{owner}' ")),
             None => ("another user".to_owned(), String::new()),
         };
@@ -65,6 +71,11 @@ pub(super) fn of_others(wanted: Option<&str>) -> String {
         )
     });
     told.collect::<Vec<_>>().join("; ")
+}
+
+/// Every place where a running unit was looked for.
+pub(super) fn looked_in() -> String {
+    directories().iter().map(|directory| directory.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
 /// Units of others that an error lists.
@@ -108,14 +119,14 @@ pub(super) fn ask(
     Ok(())
 }
 
-/// As [`ask`], with the end as an answer: what the unit failed is none of this function's errors.
+/// As [`ask`] for a client elsewhere, with the end as an answer: what the unit failed is none of this function's errors.
 pub(super) fn pass_on(
     client: &mut Client,
     question: &Question,
     each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
 ) -> anyhow::Result<()> {
     let mut end = Answer::Done;
-    for answer in client.ask(question).map_err(error)? {
+    for answer in client.ask_for_another(question).map_err(error)? {
         match answer {
             Ok(answer) => {
                 if each(answer).is_break() {
@@ -134,9 +145,11 @@ pub(super) fn pass_on(
 fn error(error: ControlError) -> anyhow::Error {
     let (exit, name) = match error {
         ControlError::Failed(failure) => return error_of(failure),
-        ControlError::NoneRunning(path) => {
-            let text = format!("no unit answers at {}: start it, or be the manager with --as NAME/ID", path.display());
-            return Ended::no_unit(text);
+        ControlError::NoneRunning(paths) => {
+            let paths = paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ");
+            return Ended::no_unit(format!(
+                "no unit answers at {paths}: start it, or be the manager with --as NAME/ID"
+            ));
         }
         ControlError::NotRunning { .. } | ControlError::NotAllowed { .. } | ControlError::Version { .. } => {
             (Exit::NoUnit, "NoUnit")

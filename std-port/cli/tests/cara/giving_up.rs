@@ -10,7 +10,7 @@ use crate::support::{PATIENCE, Running, Stage, until};
 
 /// What only its lease's own end would stop goes on beyond all patience.
 const LEASE: Duration = PATIENCE.saturating_mul(4);
-const WAYS: [&[&str]; 2] = [&["call", "lifter", "lift"], &["call", "lifter", "--hold", "lift"]];
+const WAYS: [&[&str]; 2] = [&["call", "lifter", "lift"], &["call", "lifter", "--hold", "--detached", "lift"]];
 
 /// What a vehicle has done so far.
 #[derive(Default)]

@@ -156,8 +156,9 @@ fn a_lost_vehicle_ends_the_holding() {
 fn without_a_lease_there_is_nothing_to_hold() {
     let stage = Stage::with(&[]);
     let _driver = Driver::join(&stage);
-    stage.ends(2, &["call", "driver", "--hold", "look"]).says("has no lease");
+    stage.ends(2, &["call", "driver", "--hold", "--detached", "look"]).says("has no lease");
     stage.ends(2, &["call", "driver", "--hold", "--async", "drive"]);
+    stage.ends(2, &["call", "driver", "--detached", "drive"]).says("--hold");
 }
 
 #[test]
@@ -191,7 +192,7 @@ fn what_the_program_of_a_manager_moves_is_held_unless_it_is_taken_over() {
     let program = || peer.block_request_with("drive", &mut Parameters::new(), &wanted);
     assert_eq!(program(), Ok(()));
     stage.ends(1, &["call", "driver", "drive"]).says("driver/99: Held: ").says("is held by unit 1:");
-    stage.ends(1, &["call", "driver", "--hold", "drive"]).says("is held by unit 1:");
+    stage.ends(1, &["call", "driver", "--hold", "--detached", "drive"]).says("is held by unit 1:");
     assert_eq!(stage.ends(1, &["call", "driver", "drive", "--json"]).json()["error"]["error"], "Held");
     assert_eq!(driver.made_safe(), 0);
     let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--take-over", "drive"]));
@@ -216,5 +217,70 @@ fn ctrl_c_ends_it_also_where_the_shell_ignores_it() {
     held.expect("drive()");
     held.interrupt();
     assert_eq!(held.end(), 130);
+    until(|| driver.made_safe() == 1);
+}
+
+#[test]
+fn what_is_held_ends_with_standard_input() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let mut held = driver.held(&stage);
+    held.type_in("anything\n");
+    std::thread::sleep(LEASE);
+    assert!(driver.lease.is_live(), "what is typed ends nothing");
+    held.type_no_more();
+    until(|| driver.made_safe() == 1);
+    assert_eq!(held.end(), 1);
+    // Nothing begins where it has ended before.
+    stage.ends(2, &["call", "driver", "--hold", "drive"]).says("--detached");
+    let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
+    let a_file = std::fs::File::open(env!("CARGO_BIN_EXE_cara")).unwrap();
+    assert_eq!(command.stdin(a_file).output().unwrap().status.code(), Some(2));
+    assert_eq!(driver.made_safe(), 1);
+}
+
+#[test]
+fn what_is_held_ends_when_what_reads_its_output_has_gone() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let mut held = driver.held(&stage);
+    held.read_no_more();
+    until(|| driver.made_safe() == 1);
+    assert_eq!(held.end(), 1);
+}
+
+/// A terminal that hangs up without a signal, as where a shell has ended before or ignores it.
+#[test]
+fn what_is_held_ends_when_its_terminal_hangs_up() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let (ours, theirs) = crate::terminal::pair();
+    let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
+    let end = || std::process::Stdio::from(theirs.try_clone().unwrap());
+    let mut held = command.stdin(end()).stdout(end()).stderr(end()).spawn().unwrap();
+    drop((command, theirs));
+    until(|| driver.lease.is_live());
+    std::thread::sleep(LEASE);
+    assert!(driver.lease.is_live());
+    drop(ours);
+    until(|| driver.made_safe() == 1);
+    assert_eq!(held.wait().unwrap().code(), Some(1));
+}
+
+#[test]
+fn what_is_held_detached_goes_on_until_its_command_ends() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--detached", "drive"]));
+    held.expect("drive()");
+    held.type_no_more();
+    held.read_no_more();
+    let start = Instant::now();
+    while start.elapsed() < 2 * LEASE {
+        assert!(driver.lease.is_live() || start.elapsed() > PATIENCE, "it has ended");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert_eq!(driver.made_safe(), 0);
+    held.kill();
     until(|| driver.made_safe() == 1);
 }

@@ -1,11 +1,12 @@
 //! `cara stop` and `cara reset`: by attribute, whatever the functions are called, with an outcome for each s_unit.
 
+use std::process::Stdio;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use cara_std::{Call, Constraints, Definition, ParametersView, Priority, ServiceError, ServiceOptions, Unit};
 
-use crate::support::{Stage, until};
+use crate::support::{Ran, Stage, until};
 
 /// A vehicle that moves by `go()`, and whose reset is refused while it is not safe.
 struct Vehicle {
@@ -97,7 +98,8 @@ fn all_are_stopped_whatever_their_functions_are_called_until_they_are_reset() {
 fn who_was_not_reached_and_who_cannot_be_stopped_is_told_by_name() {
     let mut stage = Stage::with(&[]);
     stage.ends(1, &["stop", "--all"]).says("no s_unit is known");
-    stage.ends(2, &["stop"]);
+    stage.ends(2, &["stop"]).says("cara stop --all");
+    stage.ends(2, &["reset"]).says("cara reset --all");
     stage.ends(2, &["stop", "agv", "--all"]);
     let vehicle = Vehicle::start(&stage, "agv", 21, &["halt"]);
     stage.start_agv("depot", 30);
@@ -107,7 +109,7 @@ fn who_was_not_reached_and_who_cannot_be_stopped_is_told_by_name() {
     until("the key file was read", || stage.cara(&["scan"]).out.contains("gone"));
     let shown = stage.ends(1, &["stop", "--all"]);
     shown.says("agv/21  acknowledged").says("gone/31: not reached: it was not connected").says("depot/30: NoStop: ");
-    shown.says("1 of 3 acknowledged");
+    shown.says("1 of 3 acknowledged, the last after ").says("; not acknowledged: depot/30, gone/31");
     is_stopped(&stage, "agv", 1);
     let told = stage.ends(1, &["reset", "--all", "--json"]).lines();
     let error = |node: &str| told.iter().find(|line| line["node"] == node).map(|line| line["error"]["error"].clone());
@@ -205,4 +207,83 @@ fn who_moves_what_is_shown_with_what_inhibits_it() {
     reset(&stage, "agv");
     until("it is free", || row() == "agv/21 go stopped 1 - -");
     stage.ends(1, &["orders", "lift"]);
+}
+
+/// Its handler answers nothing, as where the way back is cut or the handler hangs.
+#[test]
+fn a_stop_that_is_not_answered_is_sent_one_way_as_well_and_says_so() {
+    let mut stage = Stage::with(&[]);
+    stage.know("agv", 21);
+    let unit = stage.vehicle("agv", 21).build().unwrap();
+    let count = Arc::<AtomicU32>::default();
+    let (counted, hangs) = (count.clone(), Arc::<AtomicBool>::new(true.into()));
+    let goes_on = hangs.clone();
+    let halt = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        counted.fetch_add(1, Ordering::SeqCst);
+        while goes_on.load(Ordering::SeqCst) {
+            std::thread::sleep(std::time::Duration::from_millis(10));
+        }
+        Ok(())
+    };
+    let wheels = unit.my_function_list().actuator(|| ()).unwrap();
+    let stops = ServiceOptions::new().stops(&wheels).priority(Priority::Emergency);
+    unit.my_function_list().add_service(&Definition::parse("halt()").unwrap(), stops, halt).unwrap();
+    unit.publish_my_function_list().unwrap();
+    unit.start().unwrap();
+    stage.start_agv("depot", 30);
+    until("it has published", || stage.cara(&["functions", "agv"]).out.contains("halt()"));
+    stage.ends(0, &["set", ".", "request_timeout", "2s"]);
+    let shown = stage.ends(1, &["stop", "agv"]);
+    shown.says("agv/21: TimedOut: ").says("sent one way as well").says("0 of 1 acknowledged; not acknowledged: agv/21");
+    hangs.store(false, Ordering::SeqCst);
+    until("what was sent one way runs when the handler is free", || count.load(Ordering::SeqCst) > 1);
+    unit.stop();
+}
+
+#[test]
+fn a_stop_whose_output_has_no_room_is_carried_out_and_told() {
+    let mut stage = Stage::with(&[]);
+    let _vehicles = [Vehicle::start(&stage, "agv", 21, &["halt"]), Vehicle::start(&stage, "lift", 22, &["stand"])];
+    known(&stage, &["agv", "lift"]);
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let stop = |stage: &Stage| {
+        let child = stage.command(&["stop", "--all"]).stdout(full()).stderr(Stdio::piped()).spawn().unwrap();
+        Ran::of(child.wait_with_output().unwrap())
+    };
+    let ran = stop(&stage);
+    assert_eq!(ran.code, 1, "{}", ran.everything());
+    ran.says("No space left").says("2 of 2 acknowledged, the last after ");
+    is_stopped(&stage, "agv", 1);
+    is_stopped(&stage, "lift", 1);
+    stage.know("gone", 31);
+    until("the key file was read", || stage.cara(&["scan"]).out.contains("gone"));
+    stop(&stage).says("2 of 3 acknowledged").says("not acknowledged: gone/31");
+    // A reader that has gone hides no failure.
+    let (reader, unread) = std::io::pipe().unwrap();
+    drop(reader);
+    assert_eq!(stage.command(&["stop", "--all"]).stdout(unread).status().unwrap().code(), Some(1));
+    stage.stop_agvs();
+}
+
+/// A door is an m_unit, and no m_unit is on the roster.
+#[test]
+fn all_are_stopped_also_those_that_are_not_on_the_roster() {
+    let mut stage = Stage::empty();
+    stage.start_manager_with(&["--m-unit", "other/2"]);
+    let door = stage.m_unit("other", 2).m_units([("manager", 1)]).unwrap().build().unwrap();
+    let count = Arc::<AtomicU32>::default();
+    let counted = count.clone();
+    let halt = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        counted.fetch_add(1, Ordering::SeqCst);
+        Ok(())
+    };
+    let wings = door.my_function_list().actuator(|| ()).unwrap();
+    let stops = ServiceOptions::new().stops(&wings).priority(Priority::Emergency);
+    door.my_function_list().add_service(&Definition::parse("halt()").unwrap(), stops, halt).unwrap();
+    door.publish_my_function_list().unwrap();
+    door.start().unwrap();
+    until("it has published", || stage.cara(&["functions", "other"]).out.contains("halt()"));
+    stage.ends(0, &["stop", "--all"]).says("other/2  acknowledged").says("1 of 1 acknowledged");
+    assert!(count.load(Ordering::SeqCst) > 0);
+    door.stop();
 }

@@ -1,7 +1,7 @@
 //! A manager, AGVs, and what a user types.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -75,9 +75,13 @@ impl Stage {
 
     pub(crate) fn start_manager_with(&mut self, more: &[&str]) {
         let mut command = self.command(&["node", "--name", "manager", "--id", "1"]);
-        command.args(more);
-        let manager = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
-        self.manager = Some(manager);
+        command.args(more).stdout(Stdio::null()).stderr(Stdio::inherit());
+        self.adopt_manager(&mut command);
+    }
+
+    /// Starts a command that is `manager/1`, and waits until it answers.
+    pub(crate) fn adopt_manager(&mut self, command: &mut Command) {
+        self.manager = Some(command.stdin(Stdio::null()).spawn().unwrap());
         let start = Instant::now();
         while self.cara(&["scan", "--unit", "manager/1"]).code != 0 {
             assert!(start.elapsed() < PATIENCE, "the manager does not answer");
@@ -85,6 +89,13 @@ impl Stage {
         }
         // Other tests run at the same time.
         self.ends(0, &["set", ".", "request_timeout", "20s"]);
+    }
+
+    /// The builder of another m_unit, which has keys.
+    pub(crate) fn m_unit(&self, name: &str, id: u32) -> Builder<(), MUnit> {
+        let file = self.keys.file(&Identity::m_unit(name, id).unwrap()).unwrap();
+        let builder = CommunicationSystem::builder(name, id).unwrap().fleet(self.fleet).key_file(file);
+        builder.interfaces(Interfaces::Loopback).control(Control::Off)
     }
 
     /// The builder of `manager/1` as a program, with its control socket at the place where `cara` looks.
@@ -236,20 +247,37 @@ impl Ran {
 /// A command that runs on, read line by line.
 pub(crate) struct Running {
     child: Child,
-    lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
+    /// Not the child's, which closes it when it waits.
+    typed: Option<std::process::ChildStdin>,
+    lines: Option<std::io::Lines<BufReader<std::process::ChildStdout>>>,
 }
 
 impl Running {
     pub(crate) fn start(mut command: Command) -> Self {
-        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
-        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        Self { child, lines }
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        let lines = Some(BufReader::new(child.stdout.take().unwrap()).lines());
+        Self { typed: child.stdin.take(), child, lines }
     }
 
     /// The next line that contains `text`; all before it are dropped.
     pub(crate) fn expect(&mut self, text: &str) -> String {
-        let found = self.lines.by_ref().map_while(Result::ok).find(|line| line.contains(text));
+        let lines = self.lines.as_mut().expect("it is read");
+        let found = lines.map_while(Result::ok).find(|line| line.contains(text));
         found.unwrap_or_else(|| panic!("it ended without a line with `{text}`"))
+    }
+
+    pub(crate) fn type_in(&mut self, text: &str) {
+        self.typed.as_mut().expect("it is open").write_all(text.as_bytes()).unwrap();
+    }
+
+    /// Its standard input ends.
+    pub(crate) fn type_no_more(&mut self) {
+        self.typed = None;
+    }
+
+    /// Its standard output has no reader any more.
+    pub(crate) fn read_no_more(&mut self) {
+        self.lines = None;
     }
 
     /// Ctrl-C.

@@ -19,6 +19,18 @@ const LOOK: Duration = Duration::from_millis(20);
 const SIZE: (u16, u16) = (80, 24);
 const OF_A_SHELL: LocalModes = LocalModes::ICANON.union(LocalModes::ECHO).union(LocalModes::ISIG);
 
+/// A new terminal: our end, and that of a command. No child of another test keeps an end of it open.
+pub(crate) fn pair() -> (OwnedFd, OwnedFd) {
+    let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+    let master = openpt(flags).unwrap();
+    grantpt(&master).unwrap();
+    unlockpt(&master).unwrap();
+    let path = ptsname(&master, Vec::new()).unwrap();
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let slave = rustix::fs::open(&path, flags, Mode::empty()).unwrap();
+    (master, slave)
+}
+
 /// A command and its terminal.
 pub(crate) struct OnTerminal {
     child: Child,
@@ -31,16 +43,8 @@ pub(crate) struct OnTerminal {
 impl OnTerminal {
     /// Starts the command, with 80 columns and 24 rows.
     pub(crate) fn start(command: &Command) -> Self {
-        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
-        let master = openpt(flags).unwrap();
-        grantpt(&master).unwrap();
-        unlockpt(&master).unwrap();
+        let (master, slave) = pair();
         rustix::io::ioctl_fionbio(&master, true).unwrap();
-        let path = ptsname(&master, Vec::new()).unwrap();
-        // No child of another test keeps an end of it open.
-        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
-        let open = || rustix::fs::open(&path, flags, Mode::empty()).unwrap();
-        let slave = open();
         tcsetwinsize(&master, size(SIZE)).unwrap();
         // The terminal is its controlling one, so that a hang-up is told.
         let mut leader = Command::new("setsid");
@@ -51,7 +55,7 @@ impl OnTerminal {
                 None => leader.env_remove(name),
             };
         }
-        let stdio = || Stdio::from(open());
+        let stdio = || Stdio::from(slave.try_clone().unwrap());
         let child = leader.stdin(stdio()).stdout(stdio()).stderr(stdio()).spawn().unwrap();
         let screen = vt100::Parser::new(cells(SIZE.1), cells(SIZE.0), 0);
         Self { child, terminal: Some(File::from(master)), slave, screen }

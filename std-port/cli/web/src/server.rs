@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
 
 use axum::extract::State;
 use axum::http::header;
@@ -27,8 +26,7 @@ pub(crate) struct Shared {
     pub(crate) limits: Arc<Limits>,
     pub(crate) picture: Mutex<Picture>,
     pub(crate) map: Option<Map>,
-    /// When the page last said that it is there, for each hold.
-    pub(crate) holds: Mutex<HashMap<u64, Instant>>,
+    pub(crate) holds: Mutex<HashMap<u64, asking::Held>>,
     pub(crate) next_hold: AtomicU64,
     /// One question about functions at a time, and one doctor.
     pub(crate) functions: Semaphore,

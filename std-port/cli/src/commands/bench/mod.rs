@@ -12,8 +12,10 @@ mod subject;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use cara_std::control::Closer;
 use clap::ArgAction;
 
+use crate::attended::Attended;
 use crate::nodes;
 use crate::operator::{Need, Operator};
 use cara_tools::exit::Exit;
@@ -51,6 +53,9 @@ pub(crate) struct Arguments {
     /// Asynchronous requests per group.
     #[arg(long, value_name = "NUMBER", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     group: u32,
+    /// Go on without standard input and output, which a function with a lease otherwise needs: as a background job of a script.
+    #[arg(long)]
+    detached: bool,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
@@ -61,6 +66,15 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let mut operator = Operator::open(global, &need)?;
     let node = nodes::connected(&mut operator, &arguments.node)?.selector;
     let subject = subject::choose(&mut operator, &node, arguments.function.as_deref())?;
+    if subject.is_leased && !arguments.detached {
+        Attended::check("a bench of a function with a lease")?;
+        let (closer, way) = (operator.closer()?, operator.way());
+        Attended::watch(move || {
+            closer.inspect(Closer::close);
+            way.end();
+            std::process::exit(Exit::Failed as i32);
+        })?;
+    }
     let (sizes, left_out): (Vec<_>, Vec<_>) = arguments.sizes.iter().partition(|size| **size <= subject.longest());
     let shown = !global.json;
     if shown {

@@ -15,6 +15,8 @@ pub(crate) struct Subject {
     pub(crate) signature: String,
     argument: String,
     size: u32,
+    /// Its calls move something, each for the length of a lease.
+    pub(crate) is_leased: bool,
 }
 
 impl Subject {
@@ -32,6 +34,7 @@ impl Subject {
             signature: info.signature.clone(),
             argument: only.name.to_owned(),
             size: only.size,
+            is_leased: info.attributes.lease.is_some(),
         })
     }
 

@@ -1,0 +1,96 @@
+//! A disk, a terminal or a pipe that takes nothing more holds up neither the end of what an operator holds nor a stop.
+
+use std::fs::File;
+use std::io::{ErrorKind, Write};
+use std::path::Path;
+use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
+
+use crate::support::{Running, Stage, until};
+
+const LEASE: std::time::Duration = std::time::Duration::from_millis(1_200);
+
+/// A vehicle that is moved by `go()` and stopped by `halt()`.
+struct Vehicle {
+    unit: Unit,
+    lease: LeaseWatch,
+    made_safe: Arc<AtomicU32>,
+}
+
+impl Vehicle {
+    fn join(stage: &Stage) -> Self {
+        stage.know("agv", 21);
+        let unit = stage.vehicle("agv", 21).build().unwrap();
+        let made_safe = Arc::<AtomicU32>::default();
+        let counted = made_safe.clone();
+        let safe = move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+        };
+        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let functions = unit.my_function_list();
+        let wheels = functions.actuator(safe).unwrap();
+        let moves = ServiceOptions::new().moves(&wheels, LEASE);
+        let lease = functions.add_service(&Definition::parse("go()").unwrap(), moves, nothing).unwrap();
+        let stops = ServiceOptions::new().stops(&wheels);
+        functions.add_service(&Definition::parse("halt()").unwrap(), stops, nothing).unwrap();
+        unit.publish_my_function_list().unwrap();
+        unit.start().unwrap();
+        until("it is known", || stage.cara(&["functions", "agv"]).out.contains("halt()"));
+        Self { unit, lease, made_safe }
+    }
+
+    /// A hold whose command is killed ends, and the vehicle is stopped, though what the manager writes to hangs.
+    fn is_let_go_and_stopped(&self, stage: &Stage) {
+        let mut held = Running::start(stage.command(&["call", "agv", "--hold", "go"]));
+        until("it moves", || self.lease.is_live());
+        held.kill();
+        until("the hold ends", || self.made_safe.load(Ordering::SeqCst) == 1);
+        assert!(!self.lease.is_live() && self.unit.is_connected());
+        stage.ends(0, &["stop", "--all"]).says("1 of 1 acknowledged");
+    }
+}
+
+/// Fills a pipe, so that the next one that writes to it waits.
+fn fill(mut pipe: &File) {
+    rustix::io::ioctl_fionbio(pipe, true).unwrap();
+    while pipe.write(&[b'\n'; 4096]).is_ok() {}
+    assert_eq!(pipe.write(b"\n").unwrap_err().kind(), ErrorKind::WouldBlock);
+    rustix::io::ioctl_fionbio(pipe, false).unwrap();
+}
+
+/// A file that can be opened and takes nothing, as one on a disk that hangs.
+fn hung_file(path: &Path) -> File {
+    mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+    let pipe = File::from(rustix::fs::open(path, OFlags::RDWR | OFlags::CLOEXEC, Mode::empty()).unwrap());
+    fill(&pipe);
+    pipe
+}
+
+#[test]
+fn an_audit_log_on_a_disk_that_hangs_holds_nothing_up() {
+    let mut stage = Stage::empty();
+    let audit = stage.control().join("audit");
+    let _hung = hung_file(&audit);
+    let file = stage.control().join("manager.toml");
+    let text = format!("name = \"manager\"\nid = 1\nfleet = {}\n[control]\naudit = {audit:?}\n", stage.fleet);
+    std::fs::write(&file, text).unwrap();
+    stage.start_manager_with(&[file.to_str().unwrap()]);
+    Vehicle::join(&stage).is_let_go_and_stopped(&stage);
+}
+
+#[test]
+fn a_log_that_nobody_reads_holds_nothing_up() {
+    let mut stage = Stage::empty();
+    let (unread, stderr) = std::io::pipe().unwrap();
+    let stderr = File::from(std::os::fd::OwnedFd::from(stderr));
+    fill(&stderr);
+    let mut command = stage.command(&["node", "--name", "manager", "--id", "1", "--log", "trace"]);
+    command.stdout(Stdio::null()).stderr(stderr);
+    stage.adopt_manager(&mut command);
+    Vehicle::join(&stage).is_let_go_and_stopped(&stage);
+    drop(unread);
+}
