@@ -8,8 +8,6 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use rustix::net::{SendFlags, send};
-
 use super::lines::{Line, Lines};
 use super::place::{self, PlaceError, directories, own_uid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
@@ -306,25 +304,6 @@ impl Client {
     /// [`Question::Hold`] and [`Question::Bench`] need heartbeats, which the iterator sends while it waits for the next
     /// answer: a program that stops reading loses its lease.
     pub fn ask(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
-        self.send(question)?;
-        self.beaten = question.needs_beats().then(Instant::now);
-        Ok(Answers { client: self })
-    }
-
-    /// As [`ask`](Self::ask), for a client elsewhere: the only heartbeats are those that are forwarded with a
-    /// [`Beater`](Self::beater).
-    pub fn ask_for_another(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
-        self.send(question)?;
-        self.beaten = None;
-        Ok(Answers { client: self })
-    }
-
-    /// A handle with which another thread forwards heartbeats while answers are waited for.
-    pub fn beater(&self) -> io::Result<Beater> {
-        self.lines.source().try_clone().map(Beater)
-    }
-
-    fn send(&mut self, question: &Question) -> Result<(), ControlError> {
         while self.open {
             match self.next_answer() {
                 Ok(_) | Err(ControlError::Failed(_)) => {}
@@ -335,7 +314,8 @@ impl Client {
         line.push(b'\n');
         self.lines.source().write_all(&line)?;
         self.open = true;
-        Ok(())
+        self.beaten = question.needs_beats().then(Instant::now);
+        Ok(Answers { client: self })
     }
 
     /// Sends heartbeats until an answer arrives.
@@ -375,17 +355,6 @@ impl Closer {
     pub fn close(&self) {
         // One that has ended cannot be closed, which is what is wanted.
         let _ = self.0.shutdown(Shutdown::Both);
-    }
-}
-
-/// Forwards heartbeats over the connection of a [`Client`].
-#[derive(Debug)]
-pub struct Beater(UnixStream);
-
-impl Beater {
-    /// The client elsewhere has just shown that it is there. Never waits: a unit that does not read gets the next one.
-    pub fn beat(&self) {
-        let _ = send(&self.0, b"\n", SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
     }
 }
 

@@ -35,8 +35,7 @@ use std::sync::Arc;
 pub use answering::{execute, execute_while};
 pub(crate) use audit::{Audit, ProgramCall};
 pub use client::{
-    Answers, Beater, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called,
-    running_in,
+    Answers, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called, running_in,
 };
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use place::{directories, directory};

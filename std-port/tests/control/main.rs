@@ -5,7 +5,6 @@ mod audit;
 mod calling;
 mod clients;
 mod frozen;
-mod hearts;
 #[path = "../keyed/mod.rs"]
 mod keyed;
 mod operator;

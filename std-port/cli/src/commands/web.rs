@@ -2,12 +2,12 @@
 
 use std::ops::ControlFlow;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, Question};
-use cara_web::{Arguments, Beat, Cancel, Connection, Unit};
+use cara_web::{Arguments, Cancel, Connection, Unit};
 use serde_json::Value;
 
 use crate::operator::{Need, Operator};
@@ -40,11 +40,7 @@ impl Unit for Chosen {
             None if for_a_stop => Operator::open_to_stop(&self.global, &Need::Nothing)?,
             None => Operator::open(&self.global, &Need::Nothing)?,
         };
-        Ok(Box::new(Way {
-            operator,
-            wanted: Arc::new(AtomicBool::new(true)),
-            beaten: Arc::new(Mutex::new(Instant::now())),
-        }))
+        Ok(Box::new(Way { operator, wanted: Arc::new(AtomicBool::new(true)) }))
     }
 
     fn findings(&self, listen: Duration) -> anyhow::Result<Value> {
@@ -60,19 +56,12 @@ impl Unit for Chosen {
 struct Way {
     operator: Operator,
     wanted: Arc<AtomicBool>,
-    /// When the page last showed that it is there.
-    beaten: Arc<Mutex<Instant>>,
-}
-
-fn lock(beaten: &Mutex<Instant>) -> MutexGuard<'_, Instant> {
-    beaten.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Connection for Way {
     fn ask(&mut self, question: &Question, each: &mut dyn FnMut(Answer) -> ControlFlow<()>) -> anyhow::Result<()> {
-        let (wanted, beaten) = (self.wanted.clone(), self.beaten.clone());
-        *lock(&beaten) = Instant::now();
-        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire).then(|| *lock(&beaten)))
+        let wanted = self.wanted.clone();
+        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire).then(Instant::now))
     }
 
     fn cancel(&self) -> anyhow::Result<Cancel> {
@@ -80,14 +69,6 @@ impl Connection for Way {
         Ok(Box::new(move || {
             wanted.store(false, Ordering::Release);
             closer.iter().for_each(cara_std::control::Closer::close);
-        }))
-    }
-
-    fn beat(&self) -> anyhow::Result<Beat> {
-        let (beaten, beater) = (self.beaten.clone(), self.operator.beater()?);
-        Ok(Box::new(move || {
-            *lock(&beaten) = Instant::now();
-            beater.iter().for_each(cara_std::control::Beater::beat);
         }))
     }
 }

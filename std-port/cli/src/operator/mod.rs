@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use cara_std::CommunicationSystem;
 use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
-use cara_std::control::{Beater, Client, Closer, execute, execute_while};
+use cara_std::control::{Client, Closer, execute, execute_while};
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
@@ -223,14 +223,6 @@ impl Operator {
             Unit::Running(client) => running::pass_on(client, question, each)?,
         }
         Ok(())
-    }
-
-    /// What forwards heartbeats to a unit of another process, while it is asked by [`pass_on`](Self::pass_on).
-    pub(crate) fn beater(&self) -> anyhow::Result<Option<Beater>> {
-        match &self.unit {
-            Unit::Own(_) => Ok(None),
-            Unit::Running(client) => Ok(Some(client.beater()?)),
-        }
     }
 
     /// What closes the connection to a unit of another process, from another thread.

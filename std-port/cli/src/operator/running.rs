@@ -119,14 +119,14 @@ pub(super) fn ask(
     Ok(())
 }
 
-/// As [`ask`] for a client elsewhere, with the end as an answer: what the unit failed is none of this function's errors.
+/// As [`ask`], with the end as an answer: what the unit failed is none of this function's errors.
 pub(super) fn pass_on(
     client: &mut Client,
     question: &Question,
     each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
 ) -> anyhow::Result<()> {
     let mut end = Answer::Done;
-    for answer in client.ask_for_another(question).map_err(error)? {
+    for answer in client.ask(question).map_err(error)? {
         match answer {
             Ok(answer) => {
                 if each(answer).is_break() {

@@ -37,14 +37,6 @@ const LISTEN: Duration = Duration::from_secs(6);
 
 type Asked = State<Arc<Shared>>;
 
-/// What a page holds.
-pub(crate) struct Held {
-    /// When the page last said that it is there.
-    last: Instant,
-    /// Forwards that to the m_unit, once it has been asked.
-    beat: Option<crate::Beat>,
-}
-
 /// The functions of a node: `{"node": …}`.
 pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
     let node = match read(&shared, body).await {
@@ -96,12 +88,8 @@ fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mp
         return;
     }
     let opened = shared.unit.connect(false).and_then(|way| Ok((way.cancel()?, way)));
-    let opened = opened.and_then(|(cancel, way)| Ok((cancel, way.beat()?, way)));
     let (cancel, mut way) = match opened {
-        Ok((cancel, beat, way)) => {
-            hold.and_then(|hold| shared.holds().get_mut(&hold).map(|held| held.beat = Some(beat)));
-            (cancel, way)
-        }
+        Ok(opened) => opened,
         Err(error) => {
             told(&failed(&failure(&error)));
             return;
@@ -140,7 +128,7 @@ async fn attend(
             () = to.closed() => true,
             () = sleep(LOOK) => false,
         };
-        let last = hold.and_then(|hold| shared.holds().get(&hold).map(|held| held.last));
+        let last = hold.and_then(|hold| shared.holds().get(&hold).copied());
         let is_left = last.is_some_and(|last| last.elapsed() >= ATTENDED);
         if is_gone || is_left {
             unattended.store(is_left, Ordering::Release);
@@ -157,9 +145,8 @@ pub(crate) async fn beat(State(shared): Asked, body: Body) -> Response {
     };
     let mut holds = shared.holds();
     match asked["hold"].as_u64().and_then(|hold| holds.get_mut(&hold)) {
-        Some(held) => {
-            held.last = Instant::now();
-            held.beat.iter().for_each(|beat| beat());
+        Some(last) => {
+            *last = Instant::now();
             StatusCode::NO_CONTENT.into_response()
         }
         None => StatusCode::GONE.into_response(),
@@ -288,11 +275,11 @@ fn streamed(answers: mpsc::Receiver<Bytes>) -> Response {
 impl Shared {
     fn begin_hold(&self) -> u64 {
         let hold = self.next_hold.fetch_add(1, Ordering::Relaxed);
-        self.holds().insert(hold, Held { last: Instant::now(), beat: None });
+        self.holds().insert(hold, Instant::now());
         hold
     }
 
-    fn holds(&self) -> MutexGuard<'_, HashMap<u64, Held>> {
+    fn holds(&self) -> MutexGuard<'_, HashMap<u64, Instant>> {
         self.holds.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -72,9 +72,6 @@ pub trait Unit: Send + Sync + 'static {
 /// Ends what is asked over a connection, from another thread.
 pub type Cancel = Box<dyn Fn() + Send + Sync>;
 
-/// Forwards a sign of life of a page to the m_unit, from another thread.
-pub type Beat = Box<dyn Fn() + Send + Sync>;
-
 /// A way to an m_unit, for one question at a time.
 pub trait Connection: Send {
     /// Asks, and passes on each answer until that says `Break`. An [`Answer::Failed`] is passed on like the others.
@@ -82,9 +79,6 @@ pub trait Connection: Send {
 
     /// What ends it, whatever is asked.
     fn cancel(&self) -> anyhow::Result<Cancel>;
-
-    /// What renews a [`Question::Hold`] that is asked: nothing else does.
-    fn beat(&self) -> anyhow::Result<Beat>;
 }
 
 /// Serves the page until the process ends.

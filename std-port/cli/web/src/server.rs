@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
 use axum::extract::State;
 use axum::http::header;
@@ -26,7 +27,8 @@ pub(crate) struct Shared {
     pub(crate) limits: Arc<Limits>,
     pub(crate) picture: Mutex<Picture>,
     pub(crate) map: Option<Map>,
-    pub(crate) holds: Mutex<HashMap<u64, asking::Held>>,
+    /// When the page last said that it is there, for each hold.
+    pub(crate) holds: Mutex<HashMap<u64, Instant>>,
     pub(crate) next_hold: AtomicU64,
     /// One question about functions at a time, and one doctor.
     pub(crate) functions: Semaphore,
