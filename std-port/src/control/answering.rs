@@ -62,14 +62,15 @@ pub fn execute<T: Send + 'static>(
 }
 
 /// As [`execute`], and what takes long ends as well once `wanted` says `false`: a watch, values of streams, a call, and what
-/// a [`Question::Hold`] keeps moving.
+/// a [`Question::Hold`] keeps moving. Of the last it is asked with the length of the lease: whether who holds it has given a sign
+/// of life within that.
 pub fn execute_while<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &Question,
     answer: &mut dyn FnMut(Answer) -> ControlFlow<()>,
-    wanted: &dyn Fn() -> bool,
+    wanted: &dyn Fn(Option<std::time::Duration>) -> bool,
 ) {
-    execute_for(system, question, answer, &|_| wanted());
+    execute_for(system, question, answer, wanted);
 }
 
 /// As [`execute`]; a call or a watch ends as well when the client has gone.

@@ -211,12 +211,12 @@ impl Operator {
     }
 
     /// Asks, and passes on each answer, a failure too, until that says `Break`; of a unit of this process also until `wanted`
-    /// says `false`.
+    /// says `false`, which is asked as [`execute_while`] asks it.
     pub(crate) fn pass_on(
         &mut self,
         question: &Question,
         each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
-        wanted: &dyn Fn() -> bool,
+        wanted: &dyn Fn(Option<Duration>) -> bool,
     ) -> anyhow::Result<()> {
         match &mut self.unit {
             Unit::Own(system) => execute_while(system, question, each, wanted),
@@ -231,6 +231,14 @@ impl Operator {
             Unit::Own(_) => Ok(None),
             Unit::Running(client) => Ok(Some(client.closer()?)),
         }
+    }
+
+    /// What alone keeps a hold of a unit of another process from here on.
+    pub(crate) fn beater(&mut self) -> anyhow::Result<Option<Closer>> {
+        if let Unit::Running(client) = &mut self.unit {
+            client.leave_beats();
+        }
+        self.closer()
     }
 
     /// Requests that were accepted leave this process before it ends.
