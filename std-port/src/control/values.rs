@@ -138,7 +138,7 @@ mod tests {
             argument("b", 2, ArgumentValue::Bool(vec![true, false])),
             argument("y", 8, ArgumentValue::Bytes("00ff7f".into())),
             argument("l", 3, ArgumentValue::List(serde_json::json!([{ "a": 1 }, { "a": -2 }]))),
-            argument("r", 1, ArgumentValue::Record(serde_json::json!({ "z": i64::MAX, "a": true, "k": 0.5 }))),
+            argument("r", 3, ArgumentValue::Record(serde_json::json!({ "z": i64::MAX, "a": true, "k": 0.5 }))),
         ]
     }
 
