@@ -8,6 +8,8 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use rustix::net::SendFlags;
+
 use super::lines::{Line, Lines};
 use super::place::{self, PlaceError, directories, own_uid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
@@ -230,6 +232,8 @@ pub struct Client {
     open: bool,
     /// When the last sign of life was sent, for a question that needs them.
     beaten: Option<Instant>,
+    /// Heartbeats are those of [`Closer::beat`] alone.
+    leaves_beats: bool,
 }
 
 impl fmt::Debug for Client {
@@ -263,7 +267,7 @@ impl Client {
         let (unit, fleet, state) = hello(&mut lines).map_err(|error| refused(path, error))?;
         lines.source().set_read_timeout(None)?;
         let unit = RunningUnit { unit, fleet, path: path.to_owned(), state };
-        Ok(Self { lines, unit, open: false, beaten: None })
+        Ok(Self { lines, unit, open: false, beaten: None, leaves_beats: false })
     }
 
     /// Connects to the only unit that runs, or to the one that is meant by `NAME/ID` or `NAME`.
@@ -298,6 +302,12 @@ impl Client {
         self.lines.source().try_clone().map(Closer)
     }
 
+    /// Sends no heartbeat by itself from here on: the program passes on those of the client it asks for, with
+    /// [`Closer::beat`]. One that made them up would hold for a client that is gone.
+    pub fn leave_beats(&mut self) {
+        self.leaves_beats = true;
+    }
+
     /// Asks. Unread answers to the previous question are skipped, which for [`Question::Watch`] never ends: drop the
     /// client instead.
     ///
@@ -314,7 +324,7 @@ impl Client {
         line.push(b'\n');
         self.lines.source().write_all(&line)?;
         self.open = true;
-        self.beaten = question.needs_beats().then(Instant::now);
+        self.beaten = (question.needs_beats() && !self.leaves_beats).then(Instant::now);
         Ok(Answers { client: self })
     }
 
@@ -355,6 +365,12 @@ impl Closer {
     pub fn close(&self) {
         // One that has ended cannot be closed, which is what is wanted.
         let _ = self.0.shutdown(Shutdown::Both);
+    }
+
+    /// Sends the heartbeat of a client whose call this connection holds. It waits for nothing: a unit that does not read loses
+    /// it, as the connection's end.
+    pub fn beat(&self) {
+        let _ = rustix::net::send(&self.0, b"\n", SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
     }
 }
 

@@ -138,6 +138,7 @@ mod tests {
             argument("b", 2, ArgumentValue::Bool(vec![true, false])),
             argument("y", 8, ArgumentValue::Bytes("00ff7f".into())),
             argument("l", 3, ArgumentValue::List(serde_json::json!([{ "a": 1 }, { "a": -2 }]))),
+            argument("r", 3, ArgumentValue::Record(serde_json::json!({ "z": i64::MAX, "a": true, "k": 0.5 }))),
         ]
     }
 
@@ -146,13 +147,16 @@ mod tests {
         let text = serde_json::to_string(&every_type()).unwrap();
         let read_back: Vec<Argument> = serde_json::from_str(&text).unwrap();
         let signature = Definition::parse(
-            "f(l: {a: int}[..3]) -> (i: int[2], f: float[4], s: string[20], b: bool[2], y: bytes[8], l: {a: int}[..3])",
+            "f(l: {a: int}[..3], r: {z: int, a: bool, k: float}) -> (i: int[2], f: float[4], s: string[20], b: bool[2], y: bytes[8],
+             l: {a: int}[..3], r: {z: int, a: bool, k: float})",
         );
         let signature = signature.unwrap();
         let parameters = parameters(&read_back, signature.signature().arguments()).unwrap();
         let results = arguments(signature.signature().results(), &parameters);
         assert_eq!(results, every_type());
         assert_eq!(serde_json::to_string(&results).unwrap(), text);
+        let in_order = r#"{"z":9223372036854775807,"a":true,"k":0.5}"#;
+        assert!(text.contains(in_order), "members stand as in the signature: {text}");
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, ArgumentValue, LONGEST_LINE, Question};
 use cara_std::control::{Client, Control, ControlError, RunningUnit, UnitState, running_in};
@@ -98,6 +98,36 @@ fn what_a_client_holds_ends_without_its_signs_of_life() {
         assert_eq!(ended.error, "Unattended", "{ended}");
         silent.goes_on();
     }
+}
+
+/// A hop passes on the signs of life of its own client, and makes none up.
+#[test]
+fn what_is_held_for_another_client_takes_that_ones_signs_of_life() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut client = depot.client();
+    client.leave_beats();
+    let (beater, closer) = (client.closer().unwrap(), client.closer().unwrap());
+    std::thread::spawn(move || {
+        std::thread::sleep(PATIENCE);
+        closer.close();
+    });
+    let beats = std::thread::spawn(move || {
+        let (begun, mut last, mut gap) = (Instant::now(), Instant::now(), Duration::ZERO);
+        while begun.elapsed() < Duration::from_secs(3) {
+            beater.beat();
+            gap = gap.max(last.elapsed());
+            last = Instant::now();
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        (last, gap)
+    });
+    let position = crate::support::argument("position", 2, ArgumentValue::Int(vec![1, 2]));
+    let hold = Question::Hold(call(Some("agv"), "go_to", vec![position]));
+    let answers: Vec<_> = client.ask(&hold).unwrap().collect();
+    let ended = Instant::now();
+    assert!(matches!(answers.last(), Some(Err(ControlError::Failed(why))) if why.error == "Unattended"), "{answers:?}");
+    let (last, gap) = beats.join().unwrap();
+    assert!(ended >= last || gap >= Duration::from_secs(1), "it ended while they came, {gap:?} apart");
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use cara_processes::Process;
 use fantoccini::actions::{InputSource, KeyAction, KeyActions};
+use fantoccini::wd::WindowHandle;
 use fantoccini::{Client, ClientBuilder, Locator};
 use hyper_util::client::legacy::connect::HttpConnector;
 use serde_json::{Value, json};
@@ -48,7 +49,9 @@ impl Browser {
         arguments.push(format!("--user-data-dir={}", profile.path().display()));
         arguments.push(format!("--window-size={},{}", DESKTOP.0, DESKTOP.1));
         let options = json!({ "args": arguments });
-        let wanted = [("browserName".to_owned(), json!("chrome")), ("goog:chromeOptions".to_owned(), options)];
+        let wanted =
+            [("browserName", json!("chrome")), ("goog:chromeOptions", options), ("acceptInsecureCerts", json!(true))];
+        let wanted = wanted.map(|(name, value)| (name.to_owned(), value));
         let client = ClientBuilder::new(HttpConnector::new())
             .capabilities(wanted.into_iter().collect())
             .connect(&format!("http://127.0.0.1:{port}"))
@@ -65,6 +68,38 @@ impl Browser {
             addEventListener('unhandledrejection', (event) => faults.push(String(event.reason)));
             document.addEventListener('securitypolicyviolation', (event) => faults.push('policy: ' + event.blockedURI));";
         self.run(note).await.map(drop)
+    }
+
+    /// Opens a page whose server may still be starting.
+    pub(crate) async fn open_soon(&self, url: &str) -> Result<()> {
+        let begun = Instant::now();
+        loop {
+            match self.open(url).await {
+                Err(_) if begun.elapsed() < PATIENCE => tokio::time::sleep(LOOK).await,
+                outcome => return outcome,
+            }
+        }
+    }
+
+    pub(crate) async fn window(&self) -> Result<WindowHandle> {
+        Ok(self.client.window().await?)
+    }
+
+    /// Opens a page in a tab of its own, which commands go to then.
+    pub(crate) async fn open_beside(&self, url: &str) -> Result<WindowHandle> {
+        let window = self.client.new_window(true).await?.handle;
+        self.switch(&window).await?;
+        self.open(url).await?;
+        Ok(window)
+    }
+
+    pub(crate) async fn switch(&self, window: &WindowHandle) -> Result<()> {
+        Ok(self.client.switch_to_window(window.clone()).await?)
+    }
+
+    /// Closes the tab that commands go to.
+    pub(crate) async fn shut(&self) -> Result<()> {
+        Ok(self.client.close_window().await?)
     }
 
     /// What went wrong in the page is a fault of it.

@@ -3,6 +3,7 @@
 //! it with an error.
 
 mod browser;
+mod proxy;
 mod stage;
 mod warehouse;
 
@@ -33,6 +34,9 @@ struct Options {
     vehicles: u32,
 }
 
+/// Pages beside the first one, which have all other connections that Chromium makes to a server.
+const PAGES: usize = 5;
+
 fn main() -> Result<()> {
     let options = Options::parse();
     let own = std::env::current_exe()?.parent().context("a program is in a folder")?.to_owned();
@@ -51,8 +55,14 @@ fn main() -> Result<()> {
         pictures(&browser).await?;
         tablet(&browser).await?;
         stop(&browser).await?;
+        crowd(&browser, &url).await?;
+        let (_, key) = url.split_once('#').context("the address has a key")?;
+        proxy::stop(&browser, &stage, key).await?;
+        browser.open("about:blank").await?;
+        browser.open(&url).await?;
         lose(&browser, &mut stage).await?;
         browser.check_faults().await?;
+        values(&browser, &mut stage).await?;
         drop(stage);
         warehouse::look(&browser, &programs).await?;
         browser.close().await
@@ -220,6 +230,14 @@ async fn tablet(browser: &Browser) -> Result<()> {
     browser.press('t').await?;
     browser.resize(TABLET).await?;
     browser.wait("nothing is wider than a tablet", "document.documentElement.scrollWidth <= innerWidth").await?;
+    browser.run("document.querySelector('#limits-title').parentElement.open = true").await?;
+    browser.says("#limits", "connections of browsers").await?;
+    browser.wait("limits are not wider either", "document.documentElement.scrollWidth <= innerWidth").await?;
+    browser.resize(DESKTOP).await?;
+    let fits = "document.documentElement.scrollWidth <= innerWidth";
+    browser.wait("nor on a desktop", fits).await?;
+    browser.run("document.querySelector('#limits-title').parentElement.open = false").await?;
+    browser.resize(TABLET).await?;
     let in_view = "const box = document.querySelector('#stop-all').getBoundingClientRect(); scrollTo(0, 1e6);
         const then = document.querySelector('#stop-all').getBoundingClientRect();
         return [box, then].every(({ top, bottom, left, right }) => top >= 0 && left >= 0 && bottom <= innerHeight && right <= innerWidth)";
@@ -257,6 +275,48 @@ async fn stop(browser: &Browser) -> Result<()> {
     browser.wait("the doctor's findings are shown", "document.querySelector('#findings li')").await
 }
 
+/// Whole numbers in a record keep their digits, and members their order, to the node and back.
+async fn values(browser: &Browser, stage: &mut Stage) -> Result<()> {
+    stage.start_box()?;
+    browser.open("about:blank").await?;
+    browser.open(&stage.start_web()?).await?;
+    browser.wait("the box has joined", "[...document.querySelectorAll('#nodes tr')].some((row) => row.innerText.startsWith('box/20') && row.innerText.includes('connected'))").await?;
+    browser.fill("#filter", "box").await?;
+    browser.wait("one node is left", "document.querySelectorAll('#nodes tr').length === 1").await?;
+    browser.click("#nodes tr:first-child button").await?;
+    browser.says("#functions summary", "load").await?;
+    let form = open(browser, "load").await?;
+    let load = r#"{"stamp":1460549358372198212,"at":[{"x":-9223372036854775808},{"x":9007199254740993}],"kg":1.0}"#;
+    browser.fill(&format!("{form} textarea"), load).await?;
+    browser.click(&format!("{form} button.primary")).await?;
+    let shown = format!("document.querySelector('{form} .outcome').innerText.replace(/\\s/g, '')");
+    browser.wait("the box has got each digit", &format!("{shown}.startsWith('l={load}')")).await?;
+    browser.check_faults().await
+}
+
+/// More pages of one browser than it has connections to a server: a stop gets its own.
+async fn crowd(browser: &Browser, url: &str) -> Result<()> {
+    let count = AGVS.len();
+    let first = browser.window().await?;
+    browser.click("#reset-all").await?;
+    browser.click("#confirm-yes").await?;
+    browser.says("#stop-summary", &format!("{count} of {count} acknowledged")).await?;
+    let mut others = Vec::new();
+    for _ in 0..PAGES {
+        others.push(browser.open_beside(url).await?);
+        browser.says("#link", "live").await?;
+    }
+    browser.switch(&first).await?;
+    browser.click("#stop-all").await?;
+    browser.says("#stop-title", "Stop of all").await?;
+    browser.says("#stop-summary", &format!("{count} of {count} acknowledged")).await?;
+    for window in others {
+        browser.switch(&window).await?;
+        browser.shut().await?;
+    }
+    browser.switch(&first).await
+}
+
 /// A vehicle that dies, a manager that hangs, dies and comes back, a server that dies.
 async fn lose(browser: &Browser, stage: &mut Stage) -> Result<()> {
     browser.run("scrollTo(0, 0)").await?;
@@ -288,6 +348,7 @@ async fn lose(browser: &Browser, stage: &mut Stage) -> Result<()> {
     browser.says("#count", "4 of").await?;
     stage.kill_web()?;
     browser.says("#banner", "No connection to cara web. What is shown is old.").await?;
+    browser.says("#stop-note", "no connection").await?;
     browser.click("#stop-all").await?;
     browser.says("#stop-summary.bad", "THE STOP FAILED: the server of this page was not reached").await
 }

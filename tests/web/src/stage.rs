@@ -6,10 +6,12 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result, anyhow, ensure};
 use cara_processes::Process;
 use cara_test_keys::KeyFolder;
 use tempfile::TempDir;
+
+use crate::proxy::Ports;
 
 /// Longest wait for anything that is to happen.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(40);
@@ -18,6 +20,15 @@ pub(crate) const AGVS: [&str; 5] = ["agv-1", "agv-2", "agv-3", "agv-4", "agv-5"]
 /// Where those drive that do not wait for the page: along x first, then along y, through the aisles of the [map].
 /// Each command has one of the few connections to the manager.
 const TARGETS: [(&str, [u32; 2]); 2] = [("agv-2", [24, 13]), ("agv-3", [12, 13])];
+
+const BOX: &str = "name = 'box'
+id = 20
+role = 's_unit'
+manager = { name = 'depot', id = 1 }
+[[functions]]
+signature = 'load(l: {stamp: int, at: {x: int}[..2], kg: float}) -> (l: {stamp: int, at: {x: int}[..2], kg: float})'
+answer = 'echo'
+";
 
 /// All processes but the browser.
 pub(crate) struct Stage {
@@ -28,6 +39,7 @@ pub(crate) struct Stage {
     manager: Option<Process>,
     agvs: Vec<Process>,
     web: Option<Process>,
+    pub(crate) ports: Ports,
     /// Calls that are held from outside of the page.
     held: Vec<Process>,
 }
@@ -44,8 +56,17 @@ impl Stage {
         all.extend(nodes.iter().map(String::as_str));
         let keys = KeyFolder::draw(fleet, &all)?;
         let programs = programs.to_owned();
-        let mut stage =
-            Self { programs, fleet, folder, keys, manager: None, agvs: Vec::new(), web: None, held: Vec::new() };
+        let mut stage = Self {
+            programs,
+            fleet,
+            folder,
+            keys,
+            manager: None,
+            agvs: Vec::new(),
+            web: None,
+            ports: Ports::choose()?,
+            held: Vec::new(),
+        };
         stage.start_manager()?;
         for (name, id) in AGVS.iter().zip(11..) {
             let id = id.to_string();
@@ -82,13 +103,29 @@ impl Stage {
         Ok(())
     }
 
-    /// The page's server; its address with the key.
+    /// The page's server; its address with the key. It was told of the proxies, and is reached without them as well.
     pub(crate) fn start_web(&mut self) -> Result<String> {
         let map = self.folder.path().join("hall.map").display().to_string();
-        let mut web = self.process("web", "cara", &["web", "--listen", "127.0.0.1:0", "--background", &map])?;
+        let (listen, origins) = (format!("127.0.0.1:{}", self.ports.web), self.ports.origins());
+        let mut arguments = vec!["web", "--listen", &listen, "--background", &map];
+        arguments.extend(origins.iter().map(String::as_str));
+        let mut web = self.process("web", "cara", &arguments)?;
         let line = web.expect("the page is at ", PATIENCE)?.text;
         self.web = Some(web);
-        Ok(line.rsplit(' ').next().context("it names an address")?.to_owned())
+        let (url, key) = line.rsplit_once('#').context("it names an address with a key")?;
+        let first = origins[0].trim_start_matches("--origin=");
+        ensure!(url.ends_with(first), "it is at {first} for browsers, and says {url}");
+        Ok(format!("http://{listen}/#{key}"))
+    }
+
+    /// A node with a record in its signature, which it echoes.
+    pub(crate) fn start_box(&mut self) -> Result<()> {
+        self.keys.add(&["box/20"])?;
+        let file = self.folder.path().join("box.toml");
+        std::fs::write(&file, BOX)?;
+        let node = self.process("box", "cara", &["node", "--loopback", &file.display().to_string()])?;
+        self.agvs.push(node);
+        Ok(())
     }
 
     pub(crate) fn kill_manager(&mut self) -> Result<()> {

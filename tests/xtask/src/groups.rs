@@ -233,7 +233,7 @@ pub(crate) const GROUPS: [Group; 27] = [
     },
     Group {
         name: "web",
-        what: "the page of cara web, clicked through in a browser: vehicles move, are called, stopped and lost; the warehouse",
+        what: "the page of cara web, clicked through in a browser: vehicles move, are called, stopped and lost, behind nginx as well; the warehouse",
         budget: 75,
         quick: None,
         by_default: true,
@@ -386,7 +386,8 @@ fn guide() -> Result<()> {
 fn web() -> Outcome {
     let browser = install::program("chromium", "chromium");
     let driver = browser.and_then(|()| install::program("chromedriver", "chromium-driver"));
-    needing(driver, || {
+    let proxy = driver.and_then(|()| install::program("nginx", "nginx"));
+    needing(proxy, || {
         binaries::build(&["cara", "agv", "warehouse", "cara-web-clicks"])?;
         Run::new(&workspace::target().join("debug/cara-web-clicks").to_string_lossy()).stream()
     })

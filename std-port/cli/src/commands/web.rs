@@ -2,12 +2,12 @@
 
 use std::ops::ControlFlow;
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, Question};
-use cara_web::{Arguments, Cancel, Connection, Unit};
+use cara_web::{Arguments, Beat, Cancel, Connection, Unit};
 use serde_json::Value;
 
 use crate::operator::{Need, Operator};
@@ -40,7 +40,7 @@ impl Unit for Chosen {
             None if for_a_stop => Operator::open_to_stop(&self.global, &Need::Nothing)?,
             None => Operator::open(&self.global, &Need::Nothing)?,
         };
-        Ok(Box::new(Way { operator, wanted: Arc::new(AtomicBool::new(true)) }))
+        Ok(Box::new(Way { operator, wanted: Arc::new(AtomicBool::new(true)), beaten: Arc::default() }))
     }
 
     fn findings(&self, listen: Duration) -> anyhow::Result<Value> {
@@ -56,12 +56,30 @@ impl Unit for Chosen {
 struct Way {
     operator: Operator,
     wanted: Arc<AtomicBool>,
+    /// When a page last said that it is there, for a hold of the unit in this process.
+    beaten: Arc<Mutex<Option<Instant>>>,
+}
+
+impl Way {
+    fn beaten(beaten: &Mutex<Option<Instant>>) -> MutexGuard<'_, Option<Instant>> {
+        beaten.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl Connection for Way {
     fn ask(&mut self, question: &Question, each: &mut dyn FnMut(Answer) -> ControlFlow<()>) -> anyhow::Result<()> {
-        let wanted = self.wanted.clone();
-        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire).then(Instant::now))
+        let (wanted, beaten) = (&self.wanted, &self.beaten);
+        let last = || Self::beaten(beaten).unwrap_or_else(Instant::now);
+        self.operator.pass_on(question, each, &|| wanted.load(Ordering::Acquire).then(last))
+    }
+
+    fn beats(&mut self) -> anyhow::Result<Beat> {
+        let (beater, beaten) = (self.operator.beater()?, self.beaten.clone());
+        *Self::beaten(&beaten) = Some(Instant::now());
+        Ok(Box::new(move || {
+            *Self::beaten(&beaten) = Some(Instant::now());
+            beater.iter().for_each(cara_std::control::Closer::beat);
+        }))
     }
 
     fn cancel(&self) -> anyhow::Result<Cancel> {

@@ -233,6 +233,14 @@ impl Operator {
         }
     }
 
+    /// What alone keeps a hold of a unit of another process from here on.
+    pub(crate) fn beater(&mut self) -> anyhow::Result<Option<Closer>> {
+        if let Unit::Running(client) = &mut self.unit {
+            client.leave_beats();
+        }
+        self.closer()
+    }
+
     /// Requests that were accepted leave this process before it ends.
     pub(crate) fn deliver(&self) {
         if let Unit::Own(system) = &self.unit {

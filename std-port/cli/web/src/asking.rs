@@ -18,11 +18,11 @@ use tokio::sync::mpsc;
 use tokio::task::spawn_blocking;
 use tokio::time::sleep;
 
-use crate::form;
-use crate::limits::{BODY, CALLS, Place, STOPS};
+use crate::limits::{BODY, CALLS, Place, RESETS};
 use crate::picture::Section;
-use crate::push::Pieces;
+use crate::push::piecewise;
 use crate::server::Shared;
+use crate::{Beat, form};
 
 /// A hold ends when its page has not said for so long that it is there.
 pub(crate) const ATTENDED: Duration = Duration::from_millis(1500);
@@ -32,14 +32,24 @@ const LOOK: Duration = Duration::from_millis(100);
 const ANSWERS: usize = 64;
 /// Likewise of a stop, which waits for no page: all nodes that a unit may have, and the end.
 const STOP_ANSWERS: usize = 2048;
+/// A line that says nothing, so often: a proxy takes a long silence for the end of an answer.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 /// How long the doctor listens.
 const LISTEN: Duration = Duration::from_secs(6);
 
 type Asked = State<Arc<Shared>>;
 
+/// A hold of a page.
+pub(crate) struct Hold {
+    /// When the page last said that it is there.
+    last: Instant,
+    /// Passes that on to the manager, once it is asked.
+    beat: Option<Beat>,
+}
+
 /// The functions of a node: `{"node": …}`.
 pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
-    let node = match read(&shared, body).await {
+    let node = match read(body).await {
         Ok(asked) => asked["node"].as_str().unwrap_or_default().to_owned(),
         Err(refusal) => return refusal,
     };
@@ -59,7 +69,7 @@ pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
 
 /// A call, or with `"hold": true` one that is kept: until its end, or until the page is gone or says nothing more.
 pub(crate) async fn call(State(shared): Asked, body: Body) -> Response {
-    let mut asked = match read(&shared, body).await {
+    let mut asked = match read(body).await {
         Ok(asked) => asked,
         Err(refusal) => return refusal,
     };
@@ -87,7 +97,13 @@ fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mp
     if !hold.is_none_or(|hold| told(&json!({ "answer": "held", "hold": hold }))) {
         return;
     }
-    let opened = shared.unit.connect(false).and_then(|way| Ok((way.cancel()?, way)));
+    let opened = shared.unit.connect(false).and_then(|mut way| {
+        if let Some(hold) = hold {
+            let beat = way.beats()?;
+            shared.holds().entry(hold).and_modify(|hold| hold.beat = Some(beat));
+        }
+        Ok((way.cancel()?, way))
+    });
     let (cancel, mut way) = match opened {
         Ok(opened) => opened,
         Err(error) => {
@@ -123,12 +139,17 @@ async fn attend(
     cancel: crate::Cancel,
     unattended: Arc<AtomicBool>,
 ) {
+    let mut said = Instant::now();
     loop {
         let is_gone = tokio::select! {
             () = to.closed() => true,
             () = sleep(LOOK) => false,
         };
-        let last = hold.and_then(|hold| shared.holds().get(&hold).copied());
+        if said.elapsed() >= SIGN_OF_LIFE {
+            said = Instant::now();
+            let _ = to.try_send(Bytes::from_static(b"\n"));
+        }
+        let last = hold.and_then(|hold| Some(shared.holds().get(&hold)?.last));
         let is_left = last.is_some_and(|last| last.elapsed() >= ATTENDED);
         if is_gone || is_left {
             unattended.store(is_left, Ordering::Release);
@@ -137,59 +158,90 @@ async fn attend(
     }
 }
 
-/// `{"hold": …}`: its page is there.
+/// `{"hold": …}`: its page is there. This alone renews what it holds.
 pub(crate) async fn beat(State(shared): Asked, body: Body) -> Response {
-    let asked = match read(&shared, body).await {
+    let asked = match read(body).await {
         Ok(asked) => asked,
         Err(refusal) => return refusal,
     };
     let mut holds = shared.holds();
     match asked["hold"].as_u64().and_then(|hold| holds.get_mut(&hold)) {
-        Some(last) => {
-            *last = Instant::now();
+        Some(hold) => {
+            hold.last = Instant::now();
+            hold.beat.iter().for_each(|beat| beat());
             StatusCode::NO_CONTENT.into_response()
         }
         None => StatusCode::GONE.into_response(),
     }
 }
 
+/// Does nothing: a page that comes to here could stop.
+pub(crate) async fn ready(body: Body) -> Response {
+    read(body).await.map_or_else(|refusal| refusal, |_| StatusCode::NO_CONTENT.into_response())
+}
+
 /// `{"node": …}`, or null for all. It is carried out to its end, also where the page is gone.
 pub(crate) async fn stop(State(shared): Asked, body: Body) -> Response {
-    emergency(shared, body, |node| Question::Stop { node }).await
-}
-
-/// Likewise.
-pub(crate) async fn reset(State(shared): Asked, body: Body) -> Response {
-    emergency(shared, body, |node| Question::Reset { node }).await
-}
-
-async fn emergency(shared: Arc<Shared>, body: Body, question: fn(Option<String>) -> Question) -> Response {
-    let node = match read(&shared, body).await {
-        Ok(Value::Object(asked)) if asked.get("node").is_some_and(|node| node.is_null() || node.is_string()) => {
-            asked["node"].as_str().map(str::to_owned)
-        }
-        Ok(_) => {
-            let text = "that names no node, and null for all neither";
-            return lines(&[failed(&Failure::configuration("BadQuestion", text))]);
-        }
+    let node = match named(body).await {
+        Ok(node) => node,
         Err(refusal) => return refusal,
     };
-    let Some(place) = Place::take(&shared.limits, |limits| &limits.stops) else { return busy("stops", STOPS) };
+    let turns = if node.is_none() { shared.stops_of_all.clone() } else { shared.stops_of_one.clone() };
     let (to, answers) = mpsc::channel(STOP_ANSWERS);
-    spawn_blocking(move || {
-        let _place = place;
-        ask(&shared, true, &question(node), |line| {
-            // The page may be gone, or read nothing: what it asked for goes on.
-            let _ = to.try_send(piece(&line));
-            true
+    tokio::spawn(async move {
+        let mut turn = turns.clone().try_acquire_owned().ok();
+        if turn.is_none() {
+            shared.limits.stops.refuse();
+            // The semaphore is never closed.
+            turn = turns.acquire_owned().await.ok();
+        }
+        spawn_blocking(move || {
+            let _place = (turn, Place::take(&shared.limits, |limits| &limits.stops));
+            carry_out(&shared, &Question::Stop { node }, &to);
         });
     });
     streamed(answers)
 }
 
+/// Likewise, but for the turn.
+pub(crate) async fn reset(State(shared): Asked, body: Body) -> Response {
+    let node = match named(body).await {
+        Ok(node) => node,
+        Err(refusal) => return refusal,
+    };
+    let Some(place) = Place::take(&shared.limits, |limits| &limits.resets) else { return busy("resets", RESETS) };
+    let (to, answers) = mpsc::channel(STOP_ANSWERS);
+    spawn_blocking(move || {
+        let _place = place;
+        carry_out(&shared, &Question::Reset { node }, &to);
+    });
+    streamed(answers)
+}
+
+/// The page may be gone, or read nothing: what it asked for goes on.
+fn carry_out(shared: &Shared, question: &Question, to: &mpsc::Sender<Bytes>) {
+    ask(shared, true, question, |line| {
+        let _ = to.try_send(piece(&line));
+        true
+    });
+}
+
+/// The node that is stopped or reset, or `None` for all.
+async fn named(body: Body) -> Result<Option<String>, Response> {
+    match read(body).await? {
+        Value::Object(asked) if asked.get("node").is_some_and(|node| node.is_null() || node.is_string()) => {
+            Ok(asked["node"].as_str().map(str::to_owned))
+        }
+        _ => {
+            let text = "that names no node, and null for all neither";
+            Err(lines(&[failed(&Failure::configuration("BadQuestion", text))]))
+        }
+    }
+}
+
 /// Has the doctor look, and tells all pages what it found.
 pub(crate) async fn doctor(State(shared): Asked, body: Body) -> Response {
-    if let Err(refusal) = read(&shared, body).await {
+    if let Err(refusal) = read(body).await {
         return refusal;
     }
     let Ok(_turn) = shared.doctor.try_acquire() else { return busy("doctors", 1) };
@@ -244,12 +296,9 @@ fn failure(error: &anyhow::Error) -> Failure {
     Failure { cause, error, kind: None, code: None, said: None, text }
 }
 
-/// The JSON of a request.
-async fn read(shared: &Shared, body: Body) -> Result<Value, Response> {
-    let Ok(bytes) = to_bytes(body, BODY).await else {
-        shared.limits.bodies.refuse();
-        return Err((StatusCode::PAYLOAD_TOO_LARGE, format!("a request has at most {BODY} bytes")).into_response());
-    };
+/// The JSON of a request, whose content has come.
+async fn read(body: Body) -> Result<Value, Response> {
+    let bytes = to_bytes(body, BODY).await.unwrap_or_default();
     serde_json::from_slice(&bytes)
         .map_err(|error| (StatusCode::BAD_REQUEST, format!("that is no JSON: {error}")).into_response())
 }
@@ -269,17 +318,17 @@ fn lines(lines: &[Value]) -> Response {
 }
 
 fn streamed(answers: mpsc::Receiver<Bytes>) -> Response {
-    ([(header::CONTENT_TYPE, "application/x-ndjson")], Body::from_stream(Pieces(answers))).into_response()
+    piecewise("application/x-ndjson", answers)
 }
 
 impl Shared {
     fn begin_hold(&self) -> u64 {
         let hold = self.next_hold.fetch_add(1, Ordering::Relaxed);
-        self.holds().insert(hold, Instant::now());
+        self.holds().insert(hold, Hold { last: Instant::now(), beat: None });
         hold
     }
 
-    fn holds(&self) -> MutexGuard<'_, HashMap<u64, Instant>> {
+    fn holds(&self) -> MutexGuard<'_, HashMap<u64, Hold>> {
         self.holds.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,25 +1,28 @@
-//! Connections of browsers: so many at a time, with TLS where that is asked for, closed when nothing travels on them.
+//! Connections of browsers, with TLS where that is asked for. Each phase of a request has a deadline, which no byte extends.
 
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
+use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use axum::serve::Listener;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::mpsc;
 use tokio::time::{Instant, Sleep, sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 
-use crate::limits::{CONNECTIONS, Limits, Place};
+use crate::limits::Limits;
+use crate::lines::{Entry, HEAD, Line, Lines};
 
-/// A connection on which nothing travels for so long is closed.
-const IDLE: Duration = Duration::from_secs(60);
 /// How long TLS may take to begin.
 const HANDSHAKE: Duration = Duration::from_secs(5);
+/// A browser that takes nothing of what waits for it is given up after so long.
+const TAKES: Duration = Duration::from_secs(10);
+/// Before the next attempt, where the system has no file for another connection.
+const RETRY: Duration = Duration::from_millis(20);
 
 /// A listener whose connections are ready for HTTP.
 pub(crate) struct Door {
@@ -32,42 +35,49 @@ impl Door {
     pub(crate) fn open(listener: TcpListener, tls: Option<TlsAcceptor>, limits: Arc<Limits>) -> io::Result<Self> {
         let address = listener.local_addr()?;
         let (to, ready) = mpsc::channel(1);
-        tokio::spawn(take(listener, tls, limits, to));
+        tokio::spawn(take(listener, tls, Lines::new(limits), to));
         Ok(Self { ready, address })
     }
 }
 
-/// One that is slow with its handshake keeps no other one out.
+/// Takes whatever comes, and waits for nobody's handshake or place: the next one may be a stop.
 async fn take(
-    mut listener: TcpListener,
+    listener: TcpListener,
     tls: Option<TlsAcceptor>,
-    limits: Arc<Limits>,
+    lines: Arc<Lines>,
     to: mpsc::Sender<(Connection, SocketAddr)>,
 ) {
-    let free = Arc::new(Semaphore::new(CONNECTIONS));
-    // The semaphore is never closed.
-    while let Ok(place) = free.clone().acquire_owned().await {
-        let (stream, address) = Listener::accept(&mut listener).await;
-        let shown = Place::take(&limits, |limits| &limits.connections);
-        let (tls, limits, to) = (tls.clone(), limits.clone(), to.clone());
+    loop {
+        let Ok((stream, address)) = listener.accept().await else {
+            lines.one_gives_way();
+            sleep(RETRY).await;
+            continue;
+        };
+        let Some(entry) = lines.enter(address.ip()) else { continue };
+        let (tls, to) = (tls.clone(), to.clone());
         tokio::spawn(async move {
             let stream: Box<dyn Duplex> = match tls {
                 None => Box::new(stream),
-                Some(tls) => match secured(&tls, stream).await {
+                Some(tls) => match secured(&tls, stream, &entry.line).await {
                     Some(stream) => stream,
-                    None => return limits.connections.refuse(),
+                    None => return entry.limits().handshakes.refuse(),
                 },
             };
-            let idle = Box::pin(sleep(IDLE));
+            entry.line.begins();
+            let timer = || Box::pin(sleep(HEAD));
+            let connection = Connection { stream, entry, reads: timer(), writes: timer(), is_blocked: false };
             // Fails once nothing is served any more.
-            let _ = to.send((Connection { stream, idle, _shown: shown, _place: place }, address)).await;
+            let _ = to.send((connection, address)).await;
         });
     }
 }
 
-async fn secured(tls: &TlsAcceptor, stream: TcpStream) -> Option<Box<dyn Duplex>> {
-    let stream = timeout(HANDSHAKE, tls.accept(stream)).await.ok()?.ok()?;
-    Some(Box::new(stream))
+async fn secured(tls: &TlsAcceptor, stream: TcpStream, line: &Line) -> Option<Box<dyn Duplex>> {
+    let gives_way = std::future::poll_fn(|cx| if line.gives_way(cx) { Poll::Ready(()) } else { Poll::Pending });
+    tokio::select! {
+        stream = timeout(HANDSHAKE, tls.accept(stream)) => Some(Box::new(stream.ok()?.ok()?)),
+        () = gives_way => None,
+    }
 }
 
 impl Listener for Door {
@@ -95,43 +105,80 @@ impl<S: AsyncRead + AsyncWrite + Send + Unpin> Duplex for S {}
 /// A connection that has a place.
 pub(crate) struct Connection {
     stream: Box<dyn Duplex>,
-    idle: Pin<Box<Sleep>>,
-    /// As the page shows it; given back before the place is.
-    _shown: Option<Place>,
-    _place: OwnedSemaphorePermit,
+    entry: Entry,
+    reads: Pin<Box<Sleep>>,
+    writes: Pin<Box<Sleep>>,
+    /// What is to be written waits for the browser, until `writes` at most.
+    is_blocked: bool,
 }
 
 impl Connection {
-    fn travelled(&mut self) {
-        self.idle.as_mut().reset(Instant::now() + IDLE);
+    pub(crate) fn line(&self) -> Arc<Line> {
+        self.entry.line.clone()
+    }
+
+    /// An error once it has to end: for another connection, or since its phase has taken too long.
+    fn goes_on(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
+        if self.entry.line.gives_way(cx) {
+            return Err(io::ErrorKind::ConnectionAborted.into());
+        }
+        let Some((deadline, counted)) = self.entry.line.deadline() else { return Ok(()) };
+        // An answer that waits for its browser is no idle connection: `writes` has the time of that.
+        if counted.is_none() && self.is_blocked {
+            return Ok(());
+        }
+        if self.reads.deadline() != deadline {
+            self.reads.as_mut().reset(deadline);
+        }
+        if self.reads.as_mut().poll(cx).is_pending() {
+            return Ok(());
+        }
+        counted.into_iter().for_each(|counted| counted(self.entry.limits()).refuse());
+        Err(io::ErrorKind::TimedOut.into())
+    }
+
+    /// Passes on what became of writing, and gives up where the browser takes nothing for too long.
+    fn taken<T>(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
+        self.goes_on(cx)?;
+        if written.is_ready() {
+            self.is_blocked = false;
+            return written;
+        }
+        if !self.is_blocked {
+            self.is_blocked = true;
+            self.writes.as_mut().reset(Instant::now() + TAKES);
+        }
+        ready!(self.writes.as_mut().poll(cx));
+        self.entry.limits().takes.refuse();
+        Poll::Ready(Err(io::ErrorKind::TimedOut.into()))
     }
 }
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        self.goes_on(cx)?;
+        let before = buffer.filled().len();
         let read = Pin::new(&mut self.stream).poll_read(cx, buffer);
-        if read.is_ready() {
-            self.travelled();
-            return read;
+        if buffer.filled().len() > before {
+            self.entry.line.heard();
         }
-        self.idle.as_mut().poll(cx).map(|()| Err(io::ErrorKind::TimedOut.into()))
+        read
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.stream).poll_write(cx, bytes);
-        if written.is_ready() {
-            self.travelled();
-        }
-        written
+        self.taken(cx, written)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
+        let flushed = Pin::new(&mut self.stream).poll_flush(cx);
+        self.taken(cx, flushed)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
+        let closed = Pin::new(&mut self.stream).poll_shutdown(cx);
+        self.taken(cx, closed)
     }
 }

@@ -1,7 +1,8 @@
-//! Functions and values in the form of the page. Whole numbers are text there: a page's numbers are exact to 53 bits only.
-//! Every other type has the form of the control socket, so that a type that comes later passes through as it is.
+//! Functions and values in the form of the page. Whole numbers are text there, since a page's numbers are exact to 53 bits only,
+//! and lists and records are the text of their JSON as a whole, members in the order of the signature. Every other type has the
+//! form of the control socket, so that a type that comes later passes through as it is.
 
-use cara_std::control::protocol::{Argument, CallQuestion, FunctionInfo};
+use cara_std::control::protocol::{Argument, ArgumentValue, CallQuestion, FunctionInfo};
 use cara_std::{Definition, Shown};
 use serde_json::{Value, json};
 
@@ -35,25 +36,50 @@ pub(crate) fn function(info: &FunctionInfo) -> Value {
 /// A variable as the page shows it.
 pub(crate) fn shown(argument: &Argument) -> Value {
     let mut told = json!(argument);
-    if told["type"] == "int" {
-        let numbers = told["value"].as_array().map(Vec::as_slice).unwrap_or_default();
-        told["value"] = numbers.iter().map(ToString::to_string).collect();
+    match &argument.value {
+        ArgumentValue::Int(numbers) => told["value"] = numbers.iter().map(ToString::to_string).collect(),
+        ArgumentValue::List(value) | ArgumentValue::Record(value) => told["value"] = format!("{value:#}").into(),
+        _ => {}
     }
     told
 }
 
-/// A call as a page asks for it: as on the control socket, with whole numbers as text.
+/// The value of a stream's variable: its name, the value, and whether that is JSON as text.
+pub(crate) fn streamed(argument: &Argument) -> Value {
+    let value = shown(argument)["value"].take();
+    match &argument.value {
+        ArgumentValue::List(_) | ArgumentValue::Record(_) => json!([argument.name, value, true]),
+        _ => json!([argument.name, value]),
+    }
+}
+
+/// A call as a page asks for it: as on the control socket, with values in the page's form.
 pub(crate) fn call(mut asked: Value) -> Result<CallQuestion, String> {
-    let arguments = asked.get_mut("arguments").and_then(Value::as_array_mut);
-    for argument in arguments.into_iter().flatten().filter(|argument| argument["type"] == "int") {
+    // Of a signature that the page cannot read.
+    if let Some(text) = asked["arguments"].as_str() {
+        asked["arguments"] =
+            serde_json::from_str(text).map_err(|error| format!("the arguments are no JSON: {error}"))?;
+    }
+    for argument in asked.get_mut("arguments").and_then(Value::as_array_mut).into_iter().flatten() {
         let name = argument["name"].to_string();
-        for number in argument.get_mut("value").and_then(Value::as_array_mut).into_iter().flatten() {
-            if let Some(text) = number.as_str() {
-                let whole: i64 = text.trim().parse().map_err(|_| {
-                    format!("{name}: `{text}` is no whole number between {} and {}", i64::MIN, i64::MAX)
-                })?;
-                *number = whole.into();
+        let is_int = argument["type"] == "int";
+        let is_json = argument["type"] == "list" || argument["type"] == "record";
+        match argument.get_mut("value") {
+            Some(Value::Array(numbers)) if is_int => {
+                for number in numbers {
+                    if let Some(text) = number.as_str() {
+                        let whole: i64 = text.trim().parse().map_err(|_| {
+                            format!("{name}: `{text}` is no whole number between {} and {}", i64::MIN, i64::MAX)
+                        })?;
+                        *number = whole.into();
+                    }
+                }
             }
+            Some(value) if is_json && value.is_string() => {
+                let text = value.as_str().unwrap_or_default();
+                *value = serde_json::from_str(text).map_err(|error| format!("{name}: no JSON: {error}"))?;
+            }
+            _ => {}
         }
     }
     serde_json::from_value(asked).map_err(|error| format!("that is no call: {error}"))
@@ -61,8 +87,6 @@ pub(crate) fn call(mut asked: Value) -> Result<CallQuestion, String> {
 
 #[cfg(test)]
 mod tests {
-    use cara_std::control::protocol::ArgumentValue;
-
     use super::*;
 
     fn asked(value: Value) -> Value {
@@ -80,11 +104,35 @@ mod tests {
     }
 
     #[test]
+    fn lists_and_records_keep_all_digits_and_the_order_of_their_members() {
+        let text = r#"{"stamp": 1460549358372198212, "at": [{"x": -9223372036854775808, "kg": 1.0}], "a": "7"}"#;
+        let argument = json!({ "name": "l", "size": 1, "type": "record", "value": text });
+        let mut asked = asked(json!(["1", "2"]));
+        asked["arguments"] = json!([argument]);
+        let call = call(asked).unwrap();
+        let shown = shown(&call.arguments[0])["value"].as_str().unwrap().split_whitespace().collect::<String>();
+        assert_eq!(shown, text.split_whitespace().collect::<String>());
+        let streamed = streamed(&call.arguments[0]);
+        assert!(
+            streamed[0] == "l" && streamed[1].as_str().unwrap().contains("198212") && streamed[2] == true,
+            "{streamed}"
+        );
+        let list = json!([{ "name": "n", "size": 2, "type": "list", "value": "[[9007199254740993]]" }]);
+        let mut asked = super::tests::asked(json!([]));
+        asked["arguments"] = list.to_string().into();
+        let exact = Value::Array(vec![json!([9_007_199_254_740_993_i64])]);
+        assert_eq!(super::call(asked).unwrap().arguments[0].value, ArgumentValue::List(exact));
+    }
+
+    #[test]
     fn what_is_no_call_is_told() {
         let told = call(asked(json!(["1.5", "2"]))).unwrap_err();
         assert!(told.contains("position") && told.contains("`1.5`"), "{told}");
         assert!(call(asked(json!("x"))).unwrap_err().starts_with("that is no call"));
         assert!(call(json!([])).is_err() && call(json!({ "arguments": 1 })).is_err());
+        assert!(call(json!({ "arguments": "[" })).unwrap_err().contains("no JSON"));
+        let list = json!([{ "name": "l", "size": 1, "type": "list", "value": "[" }]);
+        assert!(call(json!({ "arguments": list })).unwrap_err().starts_with("\"l\": no JSON"));
     }
 
     #[test]

@@ -10,6 +10,7 @@ mod door;
 mod form;
 mod guard;
 mod limits;
+mod lines;
 mod map;
 mod page;
 mod picture;
@@ -55,6 +56,9 @@ pub struct Arguments {
     /// A name under which browsers reach this host, besides `localhost` and addresses. Can be repeated.
     #[arg(long, value_name = "NAME")]
     host_name: Vec<String>,
+    /// Where browsers see the page if a proxy stands before it, as https://fleet.example/hall/. Can be repeated.
+    #[arg(long, value_name = "URL")]
+    origin: Vec<guard::Outside>,
     /// A MovingAI map (`.map`) to draw below the vehicles: cell (x, y) is column x of row y, both from 0.
     #[arg(long, value_name = "MAP")]
     background: Option<PathBuf>,
@@ -72,10 +76,16 @@ pub trait Unit: Send + Sync + 'static {
 /// Ends what is asked over a connection, from another thread.
 pub type Cancel = Box<dyn Fn() + Send + Sync>;
 
+/// Passes on to a held call that its page is there. It waits for nothing.
+pub type Beat = Box<dyn Fn() + Send + Sync>;
+
 /// A way to an m_unit, for one question at a time.
 pub trait Connection: Send {
     /// Asks, and passes on each answer until that says `Break`. An [`Answer::Failed`] is passed on like the others.
     fn ask(&mut self, question: &Question, each: &mut dyn FnMut(Answer) -> ControlFlow<()>) -> anyhow::Result<()>;
+
+    /// From here on a [`Question::Hold`] is kept by what this passes on alone.
+    fn beats(&mut self) -> anyhow::Result<Beat>;
 
     /// What ends it, whatever is asked.
     fn cancel(&self) -> anyhow::Result<Cancel>;
@@ -87,7 +97,13 @@ pub fn run(arguments: Arguments, unit: Arc<dyn Unit>, global: &Global) -> anyhow
     let url = prepared.url();
     match global.json {
         true => output::object(&json!({ "url": url }))?,
-        false => output::line(format_args!("the page is at {url}\nCtrl-C ends it"))?,
+        false => {
+            output::line(format_args!("the page is at {url}"))?;
+            if let Some(own) = prepared.for_a_proxy() {
+                output::line(format_args!("the proxy there finds it at {own}"))?;
+            }
+            output::line("Ctrl-C ends it")?;
+        }
     }
     server::serve(prepared, unit)?;
     Ok(Exit::Done.into())

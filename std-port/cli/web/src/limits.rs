@@ -5,14 +5,21 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use serde_json::{Value, json};
 
-/// Open connections of browsers. The next one waits.
+/// Open connections of browsers. For the next one another one gives way.
 pub(crate) const CONNECTIONS: usize = 64;
+/// Of these so many are for connections that have not shown the token, also where all others have.
+pub(crate) const NEWCOMERS: usize = CONNECTIONS / 4;
+/// Requests with the token that are carried out at a time, besides stops.
+pub(crate) const REQUESTS: usize = CONNECTIONS - NEWCOMERS;
 /// Pages that are told what changes.
 pub(crate) const PAGES: usize = 16;
 /// Calls and holds that run at a time. Each has a connection to the manager, which has few.
 pub(crate) const CALLS: usize = 2;
-/// Stops and resets that run at a time.
-pub(crate) const STOPS: usize = 3;
+/// Stops of all that run at a time, and those of one node. The next one waits for its turn, and no other question takes it.
+pub(crate) const STOPS_OF_ALL: usize = 2;
+pub(crate) const STOPS_OF_ONE: usize = 1;
+/// Resets that run at a time.
+pub(crate) const RESETS: usize = 1;
 /// Bytes of a request's body.
 pub(crate) const BODY: usize = 1024 * 1024;
 /// Streams that are shown.
@@ -65,27 +72,41 @@ pub(crate) struct Limits {
     pub(crate) pages: Limit,
     pub(crate) calls: Limit,
     pub(crate) stops: Limit,
+    pub(crate) resets: Limit,
     pub(crate) bodies: Limit,
     pub(crate) streams: Limit,
     pub(crate) events: Limit,
     pub(crate) hosts: Limit,
     pub(crate) origins: Limit,
     pub(crate) tokens: Limit,
+    pub(crate) requests: Limit,
+    pub(crate) gave_way: Limit,
+    pub(crate) handshakes: Limit,
+    pub(crate) heads: Limit,
+    pub(crate) slow_bodies: Limit,
+    pub(crate) takes: Limit,
 }
 
 impl Limits {
     pub(crate) const fn new() -> Self {
         Self {
-            connections: Limit::new("connections of browsers; refused: TLS failed", Some(CONNECTIONS)),
+            connections: Limit::new("connections of browsers; refused: all were at work", Some(CONNECTIONS)),
             pages: Limit::new("pages", Some(PAGES)),
             calls: Limit::new("calls at a time", Some(CALLS)),
-            stops: Limit::new("stops and resets at a time", Some(STOPS)),
+            stops: Limit::new("stops at a time; refused: had to wait", Some(STOPS_OF_ALL + STOPS_OF_ONE)),
+            resets: Limit::new("resets at a time", Some(RESETS)),
             bodies: Limit::new("bytes of a request; refused: longer ones", Some(BODY)),
             streams: Limit::new("streams", Some(STREAMS)),
             events: Limit::new("events kept; refused: passed over by a page", Some(EVENTS)),
             hosts: Limit::new("requests for another host name", None),
             origins: Limit::new("requests from another site", None),
             tokens: Limit::new("requests without the token", None),
+            requests: Limit::new("requests at a time, besides stops", Some(REQUESTS)),
+            gave_way: Limit::new("connections that gave way to others", None),
+            handshakes: Limit::new("connections whose TLS failed", None),
+            heads: Limit::new("requests that did not come within 5 s", None),
+            slow_bodies: Limit::new("requests whose content did not come within 5 s", None),
+            takes: Limit::new("browsers that took nothing for 10 s", None),
         }
     }
 
@@ -95,12 +116,19 @@ impl Limits {
             &self.pages,
             &self.calls,
             &self.stops,
+            &self.resets,
             &self.bodies,
             &self.streams,
             &self.events,
             &self.hosts,
             &self.origins,
             &self.tokens,
+            &self.requests,
+            &self.gave_way,
+            &self.handshakes,
+            &self.heads,
+            &self.slow_bodies,
+            &self.takes,
         ];
         all.map(Limit::json).into_iter().collect()
     }

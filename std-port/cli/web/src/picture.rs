@@ -269,7 +269,7 @@ mod tests {
     fn streams_have_a_limit_and_those_of_forgotten_nodes_go() {
         let (mut picture, limits) = (Picture::new(), Limits::new());
         (0..=STREAMS).for_each(|id| picture.value(&format!("a/{id}"), "s()", &json!([]), 0, &limits));
-        let streams = |limits: &Limits| limits.json().as_array().unwrap()[5].clone();
+        let streams = |limits: &Limits| limits.json().as_array().unwrap()[6].clone();
         assert_eq!((&streams(&limits)["used"], &streams(&limits)["refused"]), (&json!(STREAMS), &json!(1)));
         picture.only_streams_of(|node| node == "a/7");
         let told = news(&picture, &mut Seen::default());
@@ -286,7 +286,7 @@ mod tests {
         (1..=EVENTS + 5).for_each(|number| assert!(picture.event(&json!(number)) <= EVENTS));
         let told: Value = serde_json::from_str(&picture.news(&mut seen, &limits)).unwrap();
         assert_eq!(told["events"].as_array().unwrap().len(), EVENTS);
-        assert_eq!(limits.json().as_array().unwrap()[6]["refused"], 5);
+        assert_eq!(limits.json().as_array().unwrap()[7]["refused"], 5);
     }
 
     #[test]

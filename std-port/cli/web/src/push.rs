@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use futures_core::Stream;
 use tokio::sync::mpsc;
@@ -32,7 +32,13 @@ pub(crate) async fn stream(State(shared): State<Arc<Shared>>) -> Response {
     // One message waits at most: the next is made when that has been taken, of what is the newest then.
     let (to, messages) = mpsc::channel(1);
     tokio::spawn(tell(shared, to, place));
-    ([(header::CONTENT_TYPE, "text/event-stream")], Body::from_stream(Pieces(messages))).into_response()
+    piecewise("text/event-stream", messages)
+}
+
+/// An answer whose pieces are passed on as they come, by a proxy too.
+pub(crate) fn piecewise(kind: &'static str, pieces: mpsc::Receiver<Bytes>) -> Response {
+    let headers = [(header::CONTENT_TYPE, kind), (HeaderName::from_static("x-accel-buffering"), "no")];
+    (headers, Body::from_stream(Pieces(pieces))).into_response()
 }
 
 async fn tell(shared: Arc<Shared>, to: mpsc::Sender<Bytes>, _place: Place) {
@@ -59,7 +65,7 @@ async fn tell(shared: Arc<Shared>, to: mpsc::Sender<Bytes>, _place: Place) {
 }
 
 /// A body that comes in pieces.
-pub(crate) struct Pieces(pub(crate) mpsc::Receiver<Bytes>);
+struct Pieces(mpsc::Receiver<Bytes>);
 
 impl Stream for Pieces {
     type Item = Result<Bytes, std::convert::Infallible>;

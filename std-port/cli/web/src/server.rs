@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
 
 use axum::extract::State;
 use axum::http::header;
@@ -12,9 +11,11 @@ use axum::routing::{get, post};
 use axum::{Router, middleware};
 use tokio::sync::Semaphore;
 
+use crate::asking::Hold;
 use crate::door::Door;
 use crate::guard::{self, Guard};
-use crate::limits::Limits;
+use crate::limits::{Limits, STOPS_OF_ALL, STOPS_OF_ONE};
+use crate::lines::Caller;
 use crate::map::Map;
 use crate::picture::Picture;
 use crate::start::Prepared;
@@ -27,9 +28,10 @@ pub(crate) struct Shared {
     pub(crate) limits: Arc<Limits>,
     pub(crate) picture: Mutex<Picture>,
     pub(crate) map: Option<Map>,
-    /// When the page last said that it is there, for each hold.
-    pub(crate) holds: Mutex<HashMap<u64, Instant>>,
+    pub(crate) holds: Mutex<HashMap<u64, Hold>>,
     pub(crate) next_hold: AtomicU64,
+    pub(crate) stops_of_all: Arc<Semaphore>,
+    pub(crate) stops_of_one: Arc<Semaphore>,
     /// One question about functions at a time, and one doctor.
     pub(crate) functions: Semaphore,
     pub(crate) doctor: Semaphore,
@@ -45,6 +47,8 @@ impl Shared {
             map,
             holds: Mutex::default(),
             next_hold: AtomicU64::new(1),
+            stops_of_all: Arc::new(Semaphore::new(STOPS_OF_ALL)),
+            stops_of_one: Arc::new(Semaphore::new(STOPS_OF_ONE)),
             functions: Semaphore::new(1),
             doctor: Semaphore::new(1),
         })
@@ -60,7 +64,7 @@ pub(crate) fn serve(prepared: Prepared, unit: Arc<dyn Unit>) -> anyhow::Result<(
     runtime.block_on(async {
         let listener = tokio::net::TcpListener::from_std(listener)?;
         let door = Door::open(listener, tls, shared.limits.clone())?;
-        axum::serve(door, router(shared)).await?;
+        axum::serve(door, router(shared).into_make_service_with_connect_info::<Caller>()).await?;
         Ok(())
     })
 }
@@ -74,6 +78,7 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
         .route("/api/functions", post(asking::functions))
         .route("/api/call", post(asking::call))
         .route("/api/beat", post(asking::beat))
+        .route("/api/ready", post(asking::ready))
         .route("/api/stop", post(asking::stop))
         .route("/api/reset", post(asking::reset))
         .route("/api/doctor", post(asking::doctor))

@@ -15,7 +15,7 @@ use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 
 use crate::Arguments;
-use crate::guard::Guard;
+use crate::guard::{Guard, Outside};
 use crate::map::{self, Map};
 
 /// Fewest characters of a token: fewer could be found by trying.
@@ -33,20 +33,31 @@ pub(crate) struct Prepared {
     pub(crate) map: Option<Map>,
     address: SocketAddr,
     drawn: Option<String>,
+    outside: Option<Outside>,
 }
 
 impl Prepared {
-    /// Where the page is. A key that was drawn stands behind `#`, which browsers keep to themselves.
+    /// Where the page is; behind a proxy, at the first address of that. A key that was drawn stands behind `#`, which browsers
+    /// keep to themselves.
     pub(crate) fn url(&self) -> String {
-        let scheme = if self.tls.is_some() { "https" } else { "http" };
         let key = self.drawn.as_ref().map(|key| format!("#{key}")).unwrap_or_default();
-        format!("{scheme}://{}/{key}", self.address)
+        self.outside.as_ref().map_or_else(|| self.own(), Outside::url) + &key
+    }
+
+    /// Where a proxy finds it, if there is one.
+    pub(crate) fn for_a_proxy(&self) -> Option<String> {
+        self.outside.is_some().then(|| self.own())
+    }
+
+    fn own(&self) -> String {
+        let scheme = if self.tls.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}/", self.address)
     }
 }
 
 /// Reads the files, checks what belongs together, and opens the port.
 pub(crate) fn prepare(arguments: Arguments) -> anyhow::Result<Prepared> {
-    let Arguments { listen, token_file, cert, key, host_name, background } = arguments;
+    let Arguments { listen, token_file, cert, key, host_name, origin, background } = arguments;
     if !listen.ip().is_loopback() && (token_file.is_none() || cert.is_none()) {
         return Err(Ended::usage(format!(
             "{listen} can be reached from other hosts, and who reaches it commands the fleet: give it a token and TLS. Write a \
@@ -76,8 +87,8 @@ pub(crate) fn prepare(arguments: Arguments) -> anyhow::Result<Prepared> {
     })?;
     listener.set_nonblocking(true)?;
     let address = listener.local_addr()?;
-    let guard = Guard::new(token, tls.is_some(), host_name);
-    Ok(Prepared { listener, tls, guard, map, address, drawn })
+    let guard = Guard::new(token, tls.is_some(), &host_name, &origin);
+    Ok(Prepared { listener, tls, guard, map, address, drawn, outside: origin.into_iter().next() })
 }
 
 /// A file that nobody but its owner may read.

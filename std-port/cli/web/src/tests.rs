@@ -1,9 +1,11 @@
 //! The server over real connections, with a unit that answers as it is told.
 
+mod crowd;
+
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::ops::ControlFlow;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -13,7 +15,7 @@ use serde_json::{Value, json};
 
 use crate::limits::{BODY, CALLS, PAGES};
 use crate::start::{Prepared, prepare};
-use crate::{Arguments, Cancel, Connection, Unit, server};
+use crate::{Arguments, Beat, Cancel, Connection, Unit, server};
 
 const TOKEN: &str = "0123456789abcdef0123456789abcdef";
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -23,19 +25,21 @@ struct Fake {
     asked: Mutex<Sender<Question>>,
     go: Arc<Mutex<Receiver<()>>>,
     is_gone: AtomicBool,
+    beats: Arc<AtomicUsize>,
 }
 
 struct Way {
     asked: Sender<Question>,
     go: Arc<Mutex<Receiver<()>>>,
     wanted: Arc<AtomicBool>,
+    beats: Arc<AtomicUsize>,
 }
 
 impl Unit for Fake {
     fn connect(&self, _: bool) -> anyhow::Result<Box<dyn Connection>> {
         anyhow::ensure!(!self.is_gone.load(Ordering::Acquire), "no unit answers");
         let (asked, wanted) = (self.asked.lock().unwrap().clone(), Arc::new(AtomicBool::new(true)));
-        Ok(Box::new(Way { asked, go: self.go.clone(), wanted }))
+        Ok(Box::new(Way { asked, go: self.go.clone(), wanted, beats: self.beats.clone() }))
     }
 
     fn findings(&self, _: Duration) -> anyhow::Result<Value> {
@@ -64,10 +68,11 @@ impl Connection for Way {
             }
             Question::Streams { .. } => {
                 let value = json!({
-                    "answer": "value", "node": "agv/1", "stream": "pose(place: float[2], at: int[2])", "unix_ms": 0, "age_us": 0,
+                    "answer": "value", "node": "agv/1", "stream": "pose(place: float[2], at: int[2], load: {id: int, kg: float})", "unix_ms": 0, "age_us": 0,
                     "error": null, "values": [
                         { "name": "place", "size": 2, "type": "float", "value": [1.5, 2.0] },
                         { "name": "at", "size": 2, "type": "int", "value": [1, 2] },
+                        { "name": "load", "size": 1, "type": "record", "value": { "id": 1460549358372198212_i64, "a": 1.0 } },
                     ],
                 });
                 let _ = each(serde_json::from_value(value)?);
@@ -86,7 +91,10 @@ impl Connection for Way {
                 self.asked.send(question.clone())?;
                 let _ = each(called(Some(Failure::configuration("NoStop", "it has none"))));
             }
-            Question::Functions { .. } => {
+            Question::Functions { node } => {
+                while node == "hung" {
+                    std::thread::sleep(PATIENCE);
+                }
                 let function = json!({ "answer": "function", "name": "f", "signature": "f(a: int)", "lease_us": 5 });
                 let _ = each(serde_json::from_value(function)?);
             }
@@ -94,6 +102,13 @@ impl Connection for Way {
         }
         let _ = each(Answer::Done);
         Ok(())
+    }
+
+    fn beats(&mut self) -> anyhow::Result<Beat> {
+        let beats = self.beats.clone();
+        Ok(Box::new(move || {
+            beats.fetch_add(1, Ordering::AcqRel);
+        }))
     }
 
     fn cancel(&self) -> anyhow::Result<Cancel> {
@@ -113,7 +128,15 @@ struct Stage {
 
 fn arguments() -> Arguments {
     let listen = ([127, 0, 0, 1], 0).into();
-    Arguments { listen, token_file: None, cert: None, key: None, host_name: Vec::new(), background: None }
+    Arguments {
+        listen,
+        token_file: None,
+        cert: None,
+        key: None,
+        host_name: Vec::new(),
+        origin: Vec::new(),
+        background: None,
+    }
 }
 
 fn stage() -> Stage {
@@ -127,7 +150,8 @@ fn stage_with(change: impl FnOnce(Arguments, &std::path::Path) -> Arguments) -> 
     let address = prepared.listener.local_addr().unwrap();
     let ((asked, has_asked), (go, goes)) = (channel(), channel());
     let go_on = Arc::new(Mutex::new(goes));
-    let unit = Arc::new(Fake { asked: Mutex::new(asked), go: go_on, is_gone: AtomicBool::new(false) });
+    let unit =
+        Arc::new(Fake { asked: Mutex::new(asked), go: go_on, is_gone: AtomicBool::new(false), beats: Arc::default() });
     let own = unit.clone();
     std::thread::spawn(move || server::serve(prepared, own));
     Stage { address, asked: has_asked, go, unit, _folder: folder }
@@ -255,12 +279,52 @@ fn other_sites_and_strangers_are_refused_and_counted() {
     });
 }
 
+/// With what a stop needs, and without doing anything.
+#[test]
+fn a_page_is_ready_once_a_stop_would_pass() {
+    let stage = stage_with(|arguments, _| Arguments {
+        origin: vec!["https://fleet.example/hall/".parse().unwrap()],
+        ..arguments
+    });
+    let ready = |headers: &[(&str, &str)]| stage.answer("POST", "/api/ready", headers, "{}");
+    let proxied = ("origin", "https://fleet.example");
+    assert!(starts(&ready(&[]), 204) && starts(&ready(&[proxied, ("host", "fleet.example")]), 204));
+    assert!(starts(&ready(&[proxied]), 204), "a proxy may name the server as it reaches it");
+    for wrong in [("origin", "https://other.example"), ("x-cara", ""), ("sec-fetch-site", "cross-site")] {
+        let refused = ready(&[wrong]);
+        assert!(starts(&refused, 403) && refused.contains("--origin"), "{wrong:?}: {refused}");
+    }
+    assert!(starts(&ready(&[("authorization", "")]), 401) && starts(&ready(&[("host", "evil.example")]), 421));
+    assert!(starts(&stage.answer("GET", "/api/ready", &[], ""), 405));
+    // What Chromium sends with a module script, behind a proxy that ends TLS.
+    let script = stage.answer("GET", "/main.js", &[proxied, ("authorization", "")], "");
+    assert!(starts(&script, 200) && script.contains("content-length: "), "{script}");
+    assert!(stage.asked.try_recv().is_err(), "none of it came to the unit");
+}
+
+/// Below any path: a proxy takes that away.
+#[test]
+fn the_page_names_no_path_from_the_root() {
+    for (name, _, text) in crate::page::FILES {
+        for start in ["\"/", "'/", "`/"] {
+            let paths: Vec<_> =
+                text.match_indices(start).map(|(at, _)| text[at..].chars().take(20).collect::<String>()).collect();
+            // Keys, and what is no path.
+            let paths: Vec<_> =
+                paths.iter().filter(|path| path.chars().nth(2).is_some_and(char::is_alphabetic)).collect();
+            assert!(paths.is_empty(), "{name}: {paths:?}");
+        }
+    }
+}
+
 /// Not in the order of their names, which would have a vehicle drawn where `at` is.
 #[test]
 fn values_of_a_stream_come_in_the_order_of_its_signature() {
     stage().follow(|message| {
         let value = &message["values"]["rows"]["1"];
-        assert!(value.is_null() || value[2] == json!([["place", [1.5, 2.0]], ["at", ["1", "2"]]]), "{value}");
+        let load = "{\n  \"id\": 1460549358372198212,\n  \"a\": 1.0\n}";
+        let right = json!([["place", [1.5, 2.0]], ["at", ["1", "2"]], ["load", load, true]]);
+        assert!(value.is_null() || value[2] == right, "{value}");
         !value.is_null()
     });
 }
@@ -338,15 +402,17 @@ fn a_hold_goes_on_while_its_page_is_there() {
     let stage = stage();
     let mut stream = stage.send("POST", "/api/call", &[], &call("wait", true).to_string());
     stage.asked.recv_timeout(PATIENCE).unwrap();
+    assert_eq!(stage.unit.beats.load(Ordering::Acquire), 0, "the server makes no sign of life up");
     // Twice as long as an unattended one lasts. A host that holds this test up for longer ends it, which is right as well.
     let begun = std::time::Instant::now();
-    let (mut beaten, mut gap) = (std::time::Instant::now(), Duration::ZERO);
+    let (mut beaten, mut gap, mut count) = (std::time::Instant::now(), Duration::ZERO, 0);
     while begun.elapsed() < crate::asking::ATTENDED * 2 {
-        stage.post("/api/beat", &json!({ "hold": 1 }));
+        count += usize::from(starts(&stage.post("/api/beat", &json!({ "hold": 1 })), 204));
         gap = gap.max(beaten.elapsed());
         beaten = std::time::Instant::now();
         std::thread::sleep(Duration::from_millis(100));
     }
+    assert_eq!(stage.unit.beats.load(Ordering::Acquire), count, "each of the page's is passed on, and no other");
     stage.go.send(()).unwrap();
     let mut text = String::new();
     stream.read_to_string(&mut text).unwrap();

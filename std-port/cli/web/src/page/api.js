@@ -17,7 +17,7 @@ const headers = () => ({ authorization: `Bearer ${token()}` });
 
 // Calls `each` with each message until the connection ends; throws why it did.
 export async function follow(each, onOpen, signal) {
-  const response = await fetch("/api/stream", { headers: headers(), cache: "no-store", signal });
+  const response = await fetch("api/stream", { headers: headers(), cache: "no-store", signal });
   if (!response.ok) throw Object.assign(new Error(await response.text()), { status: response.status });
   onOpen();
   for await (const message of pieces(response.body, "\n\n")) {
@@ -27,22 +27,22 @@ export async function follow(each, onOpen, signal) {
 }
 
 // Asks, and yields each line of the answer.
-export async function* ask(path, body, signal) {
+export async function* ask(path, body, signal, priority = "auto") {
   const response = await fetch(path, {
-    method: "POST", signal, cache: "no-store",
+    method: "POST", signal, priority, cache: "no-store",
     headers: { ...headers(), "content-type": "application/json", "x-cara": "1" },
     body: JSON.stringify(body),
   });
-  if (!response.ok) throw new Error(`${response.status}: ${await response.text()}`);
+  if (!response.ok) throw Object.assign(new Error(`${response.status}: ${await response.text()}`), { status: response.status });
   for await (const line of pieces(response.body, "\n")) yield JSON.parse(line);
 }
 
 export async function beat(hold) {
-  for await (const _ of ask("/api/beat", { hold })) { /* it has no answer */ }
+  for await (const _ of ask("api/beat", { hold })) { /* it has no answer */ }
 }
 
 export async function map() {
-  const response = await fetch("/api/map", { headers: headers() });
+  const response = await fetch("api/map", { headers: headers() });
   return response.ok ? response.json() : null;
 }
 

@@ -4,8 +4,11 @@
 import { $, make, span, text } from "./dom.js";
 import { ask, beat } from "./api.js";
 
-// A page that holds says so often enough for the server, which gives up after 1.5 s.
-const BEAT = 400;
+// A page that holds says so four times in the length of the lease, and often enough for the server, which gives up after 1.5 s.
+// Nothing else renews it.
+const BEAT = [50, 400];
+// Of these messages so many may be on their way.
+const BEATS = 3;
 // Fields of their own for so many elements; more are written as a list.
 const FIELDS = 8;
 let about = { key: null, epoch: null, count: null, asked: 0 };
@@ -29,7 +32,7 @@ export async function refresh({ key, node }) {
   about = mine;
   const found = [];
   try {
-    for await (const line of ask("/api/functions", { node: key })) {
+    for await (const line of ask("api/functions", { node: key })) {
       if (line.answer === "function") found.push(line.function);
       if (line.answer === "failed") throw new Error(line.text);
     }
@@ -76,9 +79,15 @@ async function run(question, { call, outcome, running, info }) {
   tell(outcome, "", question.hold ? "asked …" : "waits for the answer …");
   let timer = null;
   let has = false;
+  let beats = 0;
+  const isHere = (hold) => {
+    if (document.hidden || beats >= BEATS) return;
+    beats += 1;
+    beat(hold).catch(() => {}).finally(() => { beats -= 1; });
+  };
   try {
-    for await (const line of ask("/api/call", question, running.abort.signal)) {
-      if (line.answer === "held") timer = setInterval(() => { if (!document.hidden) beat(line.hold).catch(() => {}); }, BEAT);
+    for await (const line of ask("api/call", question, running.abort.signal)) {
+      if (line.answer === "held") timer = setInterval(isHere, Math.min(BEAT[1], Math.max(BEAT[0], info.lease_us / 4000)), line.hold);
       else if (line.answer === "called") { has = true; called(outcome, line, question, info); }
       else if (line.answer === "ended") tell(outcome, line.expired ? "bad" : "good", line.expired ? "It stopped there: the node was lost, or stopped it." : "finished");
       else if (line.answer === "failed") { has = true; tell(outcome, "bad", failure(line)); }
@@ -107,11 +116,12 @@ function called(outcome, { results, call, error, took_us }, question, info) {
   tell(outcome, "good", `${values || "done"}\n${took}${held}`);
 }
 
+// Lists and records are text: no digit of theirs goes through a number of this page.
 function shown({ type, value, size }) {
   if (type === "string") return JSON.stringify(value);
   if (type === "bytes") return value === "" ? "(no bytes)" : `0x${value}`;
   if (Array.isArray(value)) return size === 1 ? String(value[0]) : `[${value.join(", ")}]`;
-  return JSON.stringify(value, null, 1);
+  return typeof value === "string" ? value : JSON.stringify(value, null, 1);
 }
 
 function tell(outcome, kind, what) {
@@ -150,8 +160,8 @@ let serial = 0;
 function wholeCall() {
   const made = frame("arguments", "", "as on the control socket: a list of name, size, type and value");
   const area = made.add(make("textarea", { rows: 4, className: "long", value: "[]" }));
-  const read = () => JSON.parse(area.value);
-  return made.done(() => { try { return Array.isArray(read()) ? null : "a list in [ ]"; } catch (error) { return error.message; } }, read);
+  const check = () => { try { return Array.isArray(JSON.parse(area.value)) ? null : "a list in [ ]"; } catch (error) { return error.message; } };
+  return made.done(check, () => area.value);
 }
 
 // Label, inputs and the place for what is wrong, joined for screen readers.
@@ -249,10 +259,10 @@ function textField(input, more) {
   return made.done(check, () => argument(input, type === "bytes" ? digits() : one.value));
 }
 
-// A type that this page has no fields for, as lists and records: its value as JSON.
+// A type that this page has no fields for, as lists and records: its value as JSON, which the server reads.
 function anything(input, more) {
   const made = frame(input.name, `${input.type}${input.size > 1 ? `[${input.size}]` : ""}`, ["as JSON", more].filter(Boolean).join(", "));
   const area = made.add(make("textarea", { className: "long code", rows: 3, spellcheck: false }));
   const check = () => { try { JSON.parse(area.value); return null; } catch (error) { return error.message; } };
-  return made.done(check, () => argument(input, JSON.parse(area.value)));
+  return made.done(check, () => argument(input, ["list", "record"].includes(input.type) ? area.value : JSON.parse(area.value)));
 }

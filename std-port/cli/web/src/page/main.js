@@ -15,14 +15,25 @@ const DRAW = 250;
 
 // A connection on which nothing came for so long is given up.
 const SILENT = 5000;
+// A page that was hidden for so long follows nothing: all pages of a browser share a few connections.
+const HIDDEN = 10000;
+// Between two attempts whether a stop would pass. They keep a connection open that has shown the token.
+const PREPARE = 10000;
 
+const wait = (ms) => new Promise((go) => setTimeout(go, ms));
 let connection = new AbortController();
+let isOpen = false;
 async function listen() {
   for (;;) {
+    while (document.hidden && state.heard !== null) await wait(DRAW);
     connection = new AbortController();
     try {
       await api.follow(heard, opened, connection.signal);
     } catch (error) {
+      if (error.isForStop) {
+        await wait(2 * RETRY);
+        continue;
+      }
       if (error.status === 401) {
         await login();
         continue;
@@ -30,11 +41,23 @@ async function listen() {
       state.broken = error.message;
       if (state.heard === null) shout("No connection to cara web.", error.message);
     }
-    await new Promise((go) => setTimeout(go, RETRY));
+    await wait(RETRY);
   }
 }
 
+// A stop gets the connection that this page, or another one of the browser, would follow what changes with.
+const pages = new BroadcastChannel("cara-stop");
+const makeWay = () => connection.abort(Object.assign(new Error("a stop needs the connection"), { isForStop: true }));
+pages.onmessage = makeWay;
+const stopAll = (what) => stop.all(what, () => { pages.postMessage(what); makeWay(); });
+
+async function prepare() {
+  for (;;) await wait(await stop.prepare() ? PREPARE : RETRY);
+}
+
 function opened() {
+  if (!isOpen) prepare();
+  isOpen = true;
   $("login").close();
   api.map().then((background) => background && map.lay(background)).catch(() => {});
 }
@@ -76,9 +99,12 @@ function drawLink() {
     shout(`${wrong.what}. What is shown is old.`, wrong.why);
     text($("link"), `old: ${span(wrong.age)} ago`);
   } else if (state.heard !== null) {
-    banner.hidden = true;
+    const refusal = stop.refusal();
+    if (refusal) shout("STOP ALL does not work on this page.", refusal);
+    else banner.hidden = true;
     text($("link"), "live");
   }
+  stop.note(wrong);
   flag($("link"), "bad", wrong);
   flag($("link"), "good", !wrong && state.heard !== null);
   const unit = state.unit[""];
@@ -118,7 +144,7 @@ function keyboard(event) {
     if (event.key === "Escape") event.target.blur();
     return;
   }
-  if (event.shiftKey && event.key === "S" && !event.repeat) return void stop.all("stop");
+  if (event.shiftKey && event.key === "S" && !event.repeat) return void stopAll("stop");
   if (KEYS[event.key] && !document.querySelector("dialog[open]")) {
     event.preventDefault();
     KEYS[event.key]();
@@ -130,7 +156,7 @@ async function doctor() {
   button.disabled = true;
   text($("doctor-about"), "listens for 6 s …");
   try {
-    for await (const line of api.ask("/api/doctor", {})) {
+    for await (const line of api.ask("api/doctor", {})) {
       if (line.answer === "failed") text($("doctor-about"), line.text);
     }
   } catch (error) {
@@ -143,13 +169,13 @@ api.token();
 theme();
 map.start(nodes.choose);
 $("theme").onclick = nextTheme;
-$("stop-all").onclick = () => stop.all("stop");
+$("stop-all").onclick = () => stopAll("stop");
 $("stop-close").onclick = () => { $("stop-panel").hidden = true; };
 $("node-stop").onclick = () => stop.one("stop");
 $("node-reset").onclick = () => stop.one("reset");
 $("reset-all").onclick = () => $("confirm").showModal();
 $("confirm-no").onclick = () => $("confirm").close();
-$("confirm-yes").onclick = () => { $("confirm").close(); stop.all("reset"); };
+$("confirm-yes").onclick = () => { $("confirm").close(); stopAll("reset"); };
 $("help-open").onclick = () => $("help").showModal();
 $("help-close").onclick = () => $("help").close();
 $("doctor").onclick = doctor;
@@ -157,6 +183,9 @@ $("filter").oninput = () => nodes.draw();
 // A token is not to be passed by: without it nothing is shown.
 $("login").addEventListener("cancel", (event) => event.preventDefault());
 document.addEventListener("keydown", keyboard);
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden) setTimeout(() => { if (document.hidden) connection.abort(new Error("this page was hidden")); }, HIDDEN);
+});
 // An address with a key, opened where the page is already.
 addEventListener("hashchange", () => location.reload());
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);

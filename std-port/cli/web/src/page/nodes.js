@@ -43,10 +43,11 @@ export function draw() {
   const some = filtered();
   const connected = all.filter((one) => one.node.connected).length;
   const missing = all.filter((one) => one.node.expected && !one.node.connected).length;
-  text($("count"), `${connected} of ${all.length} connected`);
+  text($("count"), state.unit[""] ? `${connected} of ${all.length} connected` : "");
   flag($("count"), "bad", missing > 0);
   text($("nodes-about"), some.length === all.length ? `${all.length}` : `${some.length} of ${all.length} shown`);
-  $("nodes-empty").hidden = some.length > 0;
+  // Streams may be told before the nodes that they are of.
+  $("nodes-empty").hidden = some.length > 0 || !state.unit[""];
   text($("nodes-empty"), all.length ? "No node fits the filter." : "No node has joined.");
   rows($("nodes"), some.map((one) => [one.key, one]), buildRow, updateRow);
   drawChosen();
@@ -98,7 +99,8 @@ const number = (value) => {
   const fine = Number(value);
   return Number.isInteger(fine) || Number.isNaN(fine) ? String(value) : fine.toFixed(2);
 };
-const show = (values) => values.map(([name, value]) => {
+const show = (values) => values.map(([name, value, isText]) => {
+  if (isText) return `${name} ${value}`;
   if (!Array.isArray(value)) return `${name} ${JSON.stringify(value)}`;
   return `${name} ${value.map(number).join(", ")}`;
 }).join("; ");

@@ -7,9 +7,41 @@ import { nodes, state } from "./state.js";
 
 // A vehicle that has not acknowledged by then is shown as such, though its answer may still come.
 const LATE = 1000;
+// A browser has few connections to one server. A stop that has none by then takes those that follow what changes, of all pages.
+const NO_WAY = 300;
+// How long the attempt of a stop may take.
+const ATTEMPT = 5000;
 let run = 0;
+let refused = null;
+let isReady = false;
 
-export async function all(what) {
+// Tries with a request that does nothing, and that has to pass all that a stop has to pass. Whether a stop can be asked for.
+export async function prepare() {
+  try {
+    for await (const _ of ask("api/ready", {}, AbortSignal.timeout(ATTEMPT))) { /* it has no answer */ }
+    refused = null;
+  } catch (error) {
+    // A server that is not reached now, or that is busy, may be reached when it matters: then the stop itself says if not.
+    if (!(error.status < 500)) return isReady;
+    refused = error;
+  }
+  isReady = refused === null;
+  for (const button of ["stop-all", "reset-all"]) $(button).disabled = !isReady;
+  return isReady;
+}
+
+// Why a stop would not pass, as far as the server has said that; null if it would.
+export function refusal() {
+  if (!refused) return null;
+  return refused.status === 403 ? `${refused.message} (here: --origin ${location.origin}${location.pathname})` : refused.message;
+}
+
+export function note(isCutOff) {
+  const started = isReady ? "" : "this page has not started";
+  text($("stop-note"), refused ? "refused by the server" : isCutOff ? "no connection" : started);
+}
+
+export async function all(what, makeWay) {
   const mine = run += 1;
   const isStop = what === "stop";
   const panel = $("stop-panel");
@@ -23,9 +55,10 @@ export async function all(what) {
   const seen = { answers: 0, good: 0, last: 0, error: null, ended: false };
   const tell = () => { if (mine === run) summary(seen, items, isStop, performance.now() - begun); };
   tell();
-  const timer = setTimeout(tell, LATE);
+  const timers = [setTimeout(tell, LATE), setTimeout(makeWay, NO_WAY)];
   try {
-    for await (const line of ask(`/api/${what}`, { node: null })) {
+    for await (const line of ask(`api/${what}`, { node: null }, undefined, "high")) {
+      clearTimeout(timers[1]);
       if (mine !== run) break;
       if (line.answer === "called") acknowledged(seen, item(items, `${line.node}/${line.id}`), line);
       if (line.answer === "failed") seen.error = failure(line);
@@ -36,7 +69,7 @@ export async function all(what) {
   } catch (error) {
     seen.error = `the server of this page was not reached: ${error.message}`;
   }
-  clearTimeout(timer);
+  timers.forEach(clearTimeout);
   seen.ended = true;
   tell();
 }
@@ -91,7 +124,7 @@ export async function one(what) {
   };
   tell("", `${what} asked …`);
   try {
-    for await (const line of ask(`/api/${what}`, { node })) {
+    for await (const line of ask(`api/${what}`, { node })) {
       if (state.chosen !== node) return;
       if (line.answer === "called" && line.error) tell("bad", `The ${what} failed. ${failure(line.error)}`);
       else if (line.answer === "called") tell("good", `${what} acknowledged after ${span(line.took_us / 1000)}`);

@@ -1,0 +1,98 @@
+//! What an operator holds is renewed as of the client's last sign of life, by the thread that watches the client.
+
+use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::mpsc::channel;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use cara_std::control::execute_while;
+use cara_std::control::protocol::{Answer, Question};
+use cara_std::{Call, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+
+use crate::support::{Depot, call, until};
+
+const LEASE: Duration = Duration::from_millis(400);
+
+struct Creeping {
+    depot: Depot,
+    lease: LeaseWatch,
+    made_safe: Arc<AtomicU32>,
+    _agv: Unit,
+}
+
+impl Creeping {
+    fn new() -> Self {
+        let (depot, agv) = Depot::with_agv();
+        let made_safe = Arc::<AtomicU32>::default();
+        let counted = made_safe.clone();
+        let safe = move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+        };
+        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let options = ServiceOptions::new().lease(LEASE, safe);
+        let lease = agv.my_function_list().add_service(&"creep()".parse().unwrap(), options, nothing).unwrap();
+        agv.publish_my_function_list().unwrap();
+        let peer = depot.system.s_unit("agv").unwrap();
+        until("it is known", || peer.function("creep").is_some());
+        Self { depot, lease, made_safe, _agv: agv }
+    }
+
+    fn hold(&self, answer: &mut dyn FnMut(Answer) -> ControlFlow<()>, lives: &dyn Fn() -> Option<Instant>) {
+        execute_while(&self.depot.system, &Question::Hold(call(Some("agv"), "creep", vec![])), answer, lives);
+    }
+
+    fn made_safe(&self) -> u32 {
+        self.made_safe.load(Ordering::SeqCst)
+    }
+}
+
+#[test]
+fn a_thread_that_hangs_while_it_watches_a_client_renews_nothing() {
+    let creeping = Creeping::new();
+    let (go_on, hangs) = channel::<()>();
+    let mut answer = move |answer| {
+        if matches!(answer, Answer::Called { error: None, .. }) {
+            // As with an answer or a line of a log that finds no room.
+            let _ = hangs.recv();
+        }
+        ControlFlow::Continue(())
+    };
+    std::thread::scope(|scope| {
+        let watching = scope.spawn(move || {
+            creeping.hold(&mut answer, &|| Some(Instant::now()));
+            creeping
+        });
+        // Dropped with a test that fails, so that the thread ends.
+        let go_on = go_on;
+        std::thread::sleep(5 * LEASE);
+        drop(go_on);
+        let creeping = watching.join().unwrap();
+        assert_eq!(creeping.made_safe(), 1, "it has moved as long as the thread hung");
+    });
+}
+
+#[test]
+fn a_gateway_that_makes_no_sign_of_life_up_lets_go() {
+    let creeping = Creeping::new();
+    let (is_there, told) = (AtomicBool::new(true), Mutex::new(Vec::new()));
+    let last = Mutex::new(Instant::now());
+    let lives = || {
+        if is_there.load(Ordering::SeqCst) {
+            *last.lock().unwrap() = Instant::now();
+        }
+        Some(*last.lock().unwrap())
+    };
+    std::thread::scope(|scope| {
+        let mut note = |answer| {
+            told.lock().unwrap().push(answer);
+            ControlFlow::Continue(())
+        };
+        scope.spawn(|| creeping.hold(&mut note, &lives));
+        until("it moves", || creeping.lease.is_live());
+        is_there.store(false, Ordering::SeqCst);
+        until("it stops", || creeping.made_safe() == 1);
+    });
+    let told = told.into_inner().unwrap();
+    assert!(matches!(told.last(), Some(Answer::Failed(failure)) if failure.error == "Unattended"), "{told:?}");
+}
