@@ -122,7 +122,7 @@ impl Seen {
             UnitEvent::LeaseExpired { function, .. } => Self::LeaseExpired(function.to_string()),
             UnitEvent::LeaseEnded { function, why, .. } => Self::LeaseEnded(function.to_string(), why),
             UnitEvent::Fenced { term } => Self::Fenced(term),
-            UnitEvent::FunctionsSkipped { .. } => return None,
+            UnitEvent::FunctionsSkipped { .. } | UnitEvent::Inhibited { .. } => return None,
             // A scenario that did not see it would pass for the wrong reason.
             other => panic!("no scenario knows {other:?}"),
         })
