@@ -5,7 +5,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
 
-use super::{met, pair};
+use super::met;
 use crate::scenario::scenarios;
 use crate::{Gate, Pending, Service, Spec, Unit, World, millis, number, secs};
 
@@ -60,15 +60,30 @@ fn a_call_whose_order_ends_while_it_waits_does_not_begin(world: &mut dyn World) 
     }
 }
 
+/// Calls that wait for a task of a board at the same time.
+const WAITING: i64 = 4;
+
 fn a_call_whose_caller_goes_while_it_waits_does_not_begin(world: &mut dyn World) {
     let gate = Gate::default();
     let service = Service::new("work(n: int[1])").in_turns().waits_at(&gate);
-    let (manager, agv) = pair(world, &service);
+    let other = Service::new("other(n: int[1])").takes(millis(1));
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = Spec::agv("agv", 7).service(&service).service(&other).limits(|limits| limits.calls_per_peer = 8);
+    let agv = world.add(agv);
+    met(world, &manager, "agv", "work");
+    met(world, &manager, "agv", "other");
     two(world, &manager, &agv, &service, PATIENT);
+    let begun = agv.counted(LinkCounter::RequestsRun);
+    (1..WAITING).for_each(|n| drop(manager.begin("agv", "work", &number("n", n), PATIENT)));
+    world.wait("all wait", || agv.counted(LinkCounter::RequestsRun) + 1 == begun + WAITING as u64, secs(20));
     manager.stop();
     world.wait("it has gone", || !agv.is_connected("manager"), secs(20));
+    manager.start();
+    met(world, &manager, "agv", "other");
+    let asked = world.ask(&manager, "agv", "other", &mut number("n", 1));
+    assert_eq!(asked, Ok(()), "what waited for the caller that has gone takes no place");
     gate.open();
     world.wait("the handler of the first one ends", || !service.log().ended().is_empty(), secs(20));
     world.run_for(millis(500));
-    assert_eq!(service.log().runs(), 1, "nobody waits for the second one");
+    assert_eq!(service.log().runs(), 1, "nobody waits for the others");
 }
