@@ -4,6 +4,7 @@ mod asking;
 mod audit;
 mod calling;
 mod clients;
+mod everybody;
 mod frozen;
 #[path = "../keyed/mod.rs"]
 mod keyed;
