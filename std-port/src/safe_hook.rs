@@ -413,6 +413,29 @@ mod tests {
         }
     }
 
+    /// What began earlier would be stopped by the hook of the order before it.
+    #[test]
+    fn an_order_does_not_begin_while_the_hook_of_the_one_before_runs() {
+        const LONG: Duration = Duration::from_secs(3_600);
+        let clock = Clock::new();
+        let ((came, comes), (goes_on, may_go_on)) = (channel(), channel::<()>());
+        let may_go_on = Mutex::new(may_go_on);
+        let hook = Arc::new(move || {
+            came.send(()).unwrap();
+            let _ = lock(&may_go_on).recv();
+        });
+        let parts = Parts { lease: Arc::default(), clock, hook, then: None, late: Arc::default() };
+        let safe = SafeHook::start(parts).unwrap();
+        let order = begin(&safe, clock, LONG);
+        assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
+        comes.recv().unwrap();
+        assert_eq!(safe.begin(clock.now() + LONG, &CLAIM), Err(ServiceError::NotReady.into()));
+        assert!(!safe.shared.lease().is_live(clock.now()));
+        goes_on.send(()).unwrap();
+        until(|| safe.begin(clock.now() + LONG, &CLAIM).is_ok());
+        safe.end();
+    }
+
     /// Two links serve calls of one service at once. What each of them does to the lease is done as a whole: no lease
     /// outlives its orders, and no hook of an earlier order runs while a later one is live.
     #[test]

@@ -192,8 +192,8 @@ impl<T: Send + 'static> Engine<T> {
         let Some((Parked { link, call, arguments }, turn)) = self.services.state.take_ready() else { return };
         self.go_on_with_parked();
         let now = self.now();
-        // A command that waited for its turn may no longer be wanted.
-        let is_cancelled = link.lock().session.is_cancelled(call.ticket);
+        // A command that waited for its turn may no longer be wanted, and its caller may be gone.
+        let is_cancelled = self.serving(&link, call.ticket).is_cancelled();
         let is_over = now >= call.deadline || is_cancelled || !self.is_wanted(now, &call);
         let result = if is_over { Err(Error::Expired) } else { turn.map(drop) };
         let own = std::mem::replace(&mut worker.arguments, arguments);

@@ -4,7 +4,9 @@ mod asking;
 mod audit;
 mod calling;
 mod clients;
+mod everybody;
 mod frozen;
+mod hearts;
 #[path = "../keyed/mod.rs"]
 mod keyed;
 mod operator;

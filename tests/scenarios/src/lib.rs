@@ -30,7 +30,7 @@ mod world;
 pub use measured::measurements;
 pub use rules::all;
 pub use scenario::{FaultProfile, Need, Scenario};
-pub use service::{Asked, CallLog, Service};
+pub use service::{Asked, CallLog, Gate, Service};
 pub use spec::{Spec, SpecRole};
 pub use unknown_client::UnknownClient;
 pub use values::{boxed, millis, number, numbers, position, secs, text, variable};

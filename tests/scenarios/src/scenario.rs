@@ -47,11 +47,15 @@ pub enum Need {
     Streams,
     /// A unit whose services tell why they fail and how far they are, and a caller that watches its calls.
     Details,
+    /// Services of which a call that has begun waits for the handler of the one before.
+    Turns,
+    /// Hearts that are dropped.
+    DroppedHearts,
 }
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 21] = [
+    pub const ALL: [Self; 23] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -73,15 +77,26 @@ impl Need {
         Self::Choice,
         Self::Streams,
         Self::Details,
+        Self::Turns,
+        Self::DroppedHearts,
     ];
 
     /// Why a port lacks it; `None` where it does not.
     pub const fn missing_on(self, port: Port) -> Option<&'static str> {
         match port {
-            Port::Simulator => None,
+            Port::Simulator => self.missing_on_simulator(),
             Port::Secured => self.missing_on_secured(),
             Port::Linux => self.missing_on_linux(),
             Port::Embassy => self.missing_on_embassy(),
+        }
+    }
+
+    const fn missing_on_simulator(self) -> Option<&'static str> {
+        match self {
+            Self::Turns => {
+                Some("its handlers are futures that run side by side: a call that has begun waits for nothing")
+            }
+            _ => None,
         }
     }
 
@@ -91,7 +106,7 @@ impl Need {
             Self::UnprovenClients => Some(
                 "a client without a proof is neither accepted nor told why; `tests/sim/tests/security` has what it tries",
             ),
-            _ => None,
+            _ => self.missing_on_simulator(),
         }
     }
 
@@ -112,6 +127,8 @@ impl Need {
             | Self::Choice
             | Self::Streams
             | Self::Details
+            | Self::Turns
+            | Self::DroppedHearts
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader
@@ -133,6 +150,7 @@ impl Need {
             Self::Panics => "a panic restarts a board",
             Self::Streams => "its nodes are those of boards without the feature `streams`",
             Self::Details => "its nodes are those of boards without the feature `details`",
+            Self::DroppedHearts => "a board's heart is a static, which is never dropped",
             Self::Choice => "a board that is an m_unit has few links, and meets every m_unit",
             _ => return None,
         })

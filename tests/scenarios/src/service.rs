@@ -1,5 +1,6 @@
 //! Services that both ports can run, and the log of what they did.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use cara_core::config::Priority;
@@ -7,6 +8,7 @@ use cara_core::distribution::failure::Failure;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
+use cara_core::services::lease::Ended;
 use cara_core::time::{Duration, Instant};
 
 /// What a service's body is told.
@@ -32,6 +34,8 @@ pub struct Service {
     pub(crate) stops_all: bool,
     pub(crate) resets_all: bool,
     pub(crate) in_turns: bool,
+    pub(crate) commits: bool,
+    gate: Option<Arc<AtomicBool>>,
     pub(crate) tells: i64,
     pub(crate) failure: Option<Failure>,
     log: Arc<CallLog>,
@@ -51,6 +55,8 @@ impl Service {
             stops_all: false,
             resets_all: false,
             in_turns: false,
+            commits: false,
+            gate: None,
             tells: 0,
             failure: None,
             log: Arc::new(CallLog::default()),
@@ -91,20 +97,30 @@ impl Service {
         Self { lease: Some(length), ..self }
     }
 
-    /// A call of it stops all that its unit moves.
+    /// Its calls run one after the other, in the order in which they began: on Linux they take the application's state, on a
+    /// board one task takes them. The handlers of other services run side by side where a unit has threads.
+    pub fn in_turns(self) -> Self {
+        Self { in_turns: true, ..self }
+    }
+
+    /// Before its handler runs, all that the unit moves stops, and nothing begins until it is reset.
     pub fn stops_all(self) -> Self {
         Self { stops_all: true, ..self }
     }
 
-    /// A call of it lets all that its unit moves move again.
+    /// When its handler has returned results, what was stopped may begin again.
     pub fn resets_all(self) -> Self {
         Self { resets_all: true, ..self }
     }
 
-    /// Its calls take the application's state, and so run one after the other, in the order in which they began. The handlers of
-    /// other services run side by side where a unit has threads.
-    pub fn in_turns(self) -> Self {
-        Self { in_turns: true, ..self }
+    /// Its handler waits until the gate is open.
+    pub fn waits_at(self, gate: &Gate) -> Self {
+        Self { gate: Some(Arc::clone(&gate.0)), ..self }
+    }
+
+    /// At its end it changes something, by the commit of its call's order. The log notes the call's int `n` if it did.
+    pub fn commits(self) -> Self {
+        Self { commits: true, ..self }
     }
 
     /// Before it answers it tells so many values of its progress `left`, from 1 on, one in each millisecond, for as long as its
@@ -120,7 +136,8 @@ impl Service {
 
     /// Whether its handler waits for anything, so that one that must not wait cannot serve it.
     pub(crate) fn awaits(&self) -> bool {
-        self.takes > Duration::ZERO || self.calls_back.is_some() || self.moves_every.is_some() || self.tells > 0
+        let waits = self.takes > Duration::ZERO || self.calls_back.is_some() || self.gate.is_some();
+        waits || self.moves_every.is_some() || self.tells > 0 || self.commits
     }
 
     /// Moves once, if the call of these parameters is wanted; the pause until the next move.
@@ -128,6 +145,24 @@ impl Service {
         let pause = self.moves_every.filter(|_| is_wanted)?;
         self.log.note(parameters.variable("n").ok()?);
         Some(pause)
+    }
+
+    /// Whether its handler is to wait, and to ask again.
+    pub(crate) fn is_held(&self) -> bool {
+        self.gate.as_ref().is_some_and(|is_open| !is_open.load(Ordering::SeqCst))
+    }
+
+    /// Changes what its call wants to change, by `commit` of the call's order.
+    pub(crate) fn commit(
+        &self,
+        parameters: &ParametersView,
+        commit: impl FnOnce(&dyn Fn()) -> Result<(), Ended>,
+    ) -> Result<(), ServiceError> {
+        if !self.commits {
+            return Ok(());
+        }
+        let n = parameters.variable("n").map_err(|_| ServiceError::BadResults)?;
+        Ok(commit(&|| self.log.note(n))?)
     }
 
     /// What it did so far, in all copies.
@@ -138,6 +173,28 @@ impl Service {
     /// The function's name.
     pub fn name(&self) -> &str {
         self.signature.split('(').next().unwrap_or_default()
+    }
+}
+
+/// Where handlers wait until the scenario lets them go on, or is over; closed at first.
+#[derive(Default)]
+pub struct Gate(Arc<AtomicBool>);
+
+impl Gate {
+    /// Lets all handlers through.
+    pub fn open(&self) {
+        self.0.store(true, Ordering::SeqCst);
+    }
+
+    /// Lets no handler through from here on.
+    pub fn close(&self) {
+        self.0.store(false, Ordering::SeqCst);
+    }
+}
+
+impl Drop for Gate {
+    fn drop(&mut self) {
+        self.open();
     }
 }
 

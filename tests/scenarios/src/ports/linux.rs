@@ -20,6 +20,7 @@ use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
+use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -441,6 +442,10 @@ fn serve(
     if service.takes > Duration::ZERO {
         thread::sleep(service.takes.into());
     }
+    while service.is_held() {
+        thread::sleep(LOOK);
+    }
+    service.commit(parameters, |change| call.lease.as_ref().map_or(Err(Ended), |order| order.commit(change)))?;
     if let Some(failure) = &service.failure {
         return Err(call.fail(failure.clone()));
     }

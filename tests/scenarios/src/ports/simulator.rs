@@ -14,6 +14,7 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::random::Random;
 use cara_core::services::access::Rule;
+use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -392,6 +393,12 @@ fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
                     kept.log().note(told);
                 }
                 call.unit.sleep(kept.takes).await;
+                while kept.is_held() {
+                    call.unit.sleep(millis(1)).await;
+                }
+                kept.commit(&parameters, |change| {
+                    call.lease.as_ref().map_or(Err(Ended), |order| order.commit(change))
+                })?;
                 if let Some(failure) = &kept.failure {
                     return Err(call.fail(failure.clone()));
                 }

@@ -1,7 +1,7 @@
 //! Access control.
 
 use cara_core::error::Error;
-use cara_core::services::access::{Functions, Rule, Verbs, Who};
+use cara_core::services::access::{Functions, Rate, Rule, Verbs, Who};
 
 use super::{met, pair};
 use crate::scenario::scenarios;
@@ -11,11 +11,14 @@ scenarios![
     a_peer_without_permission_is_refused_and_sees_nothing: "access control", Rough, [], ["RequestsForbidden"];
     a_change_of_the_access_table_takes_effect: "access control", Rough, [], ["RequestsRun"];
     what_a_peer_may_not_publish_is_not_seen: "access control", Rough, [], ["FunctionsForbidden"];
+    no_rate_refuses_a_stop: "access control, stop and reset", Light, [], ["RequestsForbidden"];
 ];
 
 /// `one` may call the mechanic.
 const ONE: &[Rule] = &[Rule::new(Who::node("one", 1), Functions::Named(&["call_mechanic"]), Verbs::CALL)];
 const MANAGER: &[Rule] = &[Rule::new(Who::node("manager", 1), Functions::All, Verbs::CALL)];
+/// One call of each function in a minute.
+const SLOWLY: &[Rule] = &[Rule::new(Who::node("manager", 1), Functions::All, Verbs::CALL).at(Rate::new(1, secs(60)))];
 const NOBODY: &[Rule] = &[];
 const ANYTHING_BUT_NOTES: &[Rule] = &[Rule::new(Who::S_UNITS, Functions::Named(&["go_to"]), Verbs::ALL)];
 
@@ -69,4 +72,22 @@ fn what_a_peer_may_not_publish_is_not_seen(world: &mut dyn World) {
     met(world, &manager, "other", "note");
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 2)), Ok(()));
     assert_eq!((note.log().runs(), other.log().runs()), (1, 0));
+}
+
+fn no_rate_refuses_a_stop(world: &mut dyn World) {
+    let drive = Service::new("drive(n: int[1])").lease(secs(60));
+    let stop = Service::new("stop()").stops_all();
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7).service(&drive).service(&stop));
+    agv.set_access(Some(SLOWLY)).expect("the AGV runs");
+    met(world, &manager, "agv", "drive");
+    met(world, &manager, "agv", "stop");
+    let ask = |world: &mut dyn World, function| world.ask(&manager, "agv", function, &mut number("n", 1));
+    assert_eq!(ask(world, "drive"), Ok(()));
+    assert!(matches!(ask(world, "drive"), Err(Error::TooSoon { .. })), "the rate holds");
+    for stops in 1..=3 {
+        assert_eq!(ask(world, "stop"), Ok(()), "a stop never comes too often");
+        assert_eq!((stop.log().runs(), agv.lease_is_live("drive")), (stops, false));
+    }
+    assert_eq!(drive.log().runs(), 1);
 }

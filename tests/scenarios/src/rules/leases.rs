@@ -21,6 +21,8 @@ scenarios![
     without_a_lease_motion_goes_on: "lease of a service (lease removed)", Rough, [], ["went on"];
     a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];
     a_loop_that_hangs_ends_what_it_wanted_and_nothing_else: "heart of a loop", Light, [], ["hung"];
+    a_heart_that_is_dropped_releases_all_that_it_renewed: "heart of a loop", Light, [DroppedHearts], ["released"];
+    a_renewal_that_comes_after_the_end_revives_nothing: "lease of a service", Light, [Suspend], ["LeasesExpired"];
     a_manager_that_takes_over_has_the_vehicle_alone: "terms of managers", Light, [], ["fenced"];
     an_operator_and_the_program_of_a_manager_hold_for_themselves: "lease of a service", Light, [], ["taken over"];
     a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
@@ -189,6 +191,44 @@ fn a_loop_that_hangs_ends_what_it_wanted_and_nothing_else(world: &mut dyn World)
     assert_eq!((agv.lease_is_live("drive"), drives.stops().len(), lifts.stops().len()), (true, 0, 1));
     world.measured("last beat to safe hook", stopped.since(hung));
     world.reached("hung");
+}
+
+fn a_heart_that_is_dropped_releases_all_that_it_renewed(world: &mut dyn World) {
+    let names = ["drive", "lift", "tilt"];
+    // So long that nothing ends by time.
+    let services = names.map(|name| Service::new(&format!("{name}(n: int[1])")).lease(secs(60)));
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(services.iter().fold(Spec::agv("agv", 7), Spec::service));
+    names.iter().for_each(|name| met(world, &manager, "agv", name));
+    let [mut dropped, mut kept] = [(); 2].map(|()| manager.heart(secs(30)));
+    want(world, &manager, "drive", &mut dropped);
+    want(world, &manager, "lift", &mut kept);
+    want(world, &manager, "tilt", &mut dropped);
+    drop(dropped);
+    let stops = || services.each_ref().map(|service| service.log().stops().len());
+    world.wait("what it renewed is safe", || stops() == [1, 0, 1], secs(10));
+    assert_eq!(names.map(|name| agv.lease_is_live(name)), [false, true, false]);
+    world.reached("released");
+}
+
+/// The vehicle's machine sleeps for longer than the lease, and not so long that its manager would give up.
+fn a_renewal_that_comes_after_the_end_revives_nothing(world: &mut dyn World) {
+    let (service, manager, agv) = driving(world);
+    let log = service.log();
+    for round in 1..=8 {
+        let calm = millis(500) + Duration::from_micros(world.random(100_000));
+        world.run_for(calm);
+        assert!(agv.lease_is_live("drive"));
+        let asleep = lease(world) + millis(2) + Duration::from_micros(world.random(90_000));
+        world.fault(Fault::Suspend(&agv, asleep));
+        world.run_for(asleep);
+        world.wait("the safe hook runs", || log.stops().len() == round, millis(60));
+        assert!(!agv.lease_is_live("drive"));
+        world.run_for(secs(2));
+        assert!(!agv.lease_is_live("drive"));
+        drive(world, &manager);
+    }
+    assert_eq!((log.runs(), log.stops().len()), (9, 8));
 }
 
 fn a_manager_that_takes_over_has_the_vehicle_alone(world: &mut dyn World) {

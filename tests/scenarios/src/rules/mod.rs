@@ -23,7 +23,9 @@ mod orders;
 mod priorities;
 mod publishing;
 mod slow;
+mod stops;
 mod streams;
+mod turns;
 
 use std::sync::{Arc, Mutex};
 
@@ -49,6 +51,8 @@ pub fn all() -> Vec<Scenario> {
         age::SCENARIOS,
         leases::SCENARIOS,
         orders::SCENARIOS,
+        stops::SCENARIOS,
+        turns::SCENARIOS,
         links::SCENARIOS,
         priorities::SCENARIOS,
         emergency::SCENARIOS,

@@ -8,7 +8,7 @@ use cara_core::services::session::{Delivery, RequestOptions};
 
 use super::{met, pair};
 use crate::scenario::scenarios;
-use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
+use crate::{Fault, Gate, Seen, Service, Spec, World, millis, number, secs};
 
 scenarios![
     a_call_that_is_not_answered_in_time_stops_at_once: "lease of a service", Light, [], ["stopped"];
@@ -17,6 +17,8 @@ scenarios![
     a_call_that_waits_keeps_its_place: "order of calls", Light, [], ["waited"];
     a_stop_of_all_outlasts_every_change_of_the_list: "latch", Light, [], ["stopped"];
     a_replaced_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
+    an_order_that_has_ended_commits_nothing: "lease of a service", Light, [], ["RequestsRun"];
+    a_release_ends_the_renewals_of_an_operators_call_too: "lease of a service", Light, [], ["stopped"];
 ];
 
 const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(60)), ..RequestOptions::renewing(Renew::Process) };
@@ -154,4 +156,67 @@ fn only_the_newest_moves(world: &mut dyn World, released: bool) {
     manager.release("agv", "drive").expect("it is connected");
     world.wait("the safe hook runs", || log.stops().len() == stops + 1, secs(20));
     assert_eq!(world.finish(&second).map(drop), Ok(()));
+}
+
+/// Its handler is held up until the order has ended, and changes something only then.
+fn an_order_that_has_ended_commits_nothing(world: &mut dyn World) {
+    let gate = Gate::default();
+    let service = Service::new("drive(n: int[1])").lease(secs(60)).waits_at(&gate).commits();
+    let stop = Service::new("stop()").stops_all();
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7).service(&service).service(&stop));
+    met(world, &manager, "agv", "drive");
+    met(world, &manager, "agv", "stop");
+    let log = service.log();
+    gate.open();
+    assert_eq!(world.ask_with(&manager, "agv", "drive", &mut number("n", 1), PATIENT), Ok(()));
+    assert_eq!(log.values(), [1], "it is live");
+    for (n, end) in [(2, "release"), (3, "replace"), (5, "release"), (6, "stop")] {
+        gate.close();
+        let (runs, changed, stops) = (log.runs(), log.values(), log.stops().len());
+        let begin = |n| manager.begin("agv", "drive", &number("n", n), PATIENT);
+        let ended = begin(n);
+        world.wait("its handler runs", || log.runs() == runs + 1, secs(20));
+        let newer = (end == "replace").then(|| begin(4));
+        match end {
+            "release" => manager.release("agv", "drive").expect("it is connected"),
+            "stop" => assert_eq!(world.ask(&manager, "agv", "stop", &mut number("n", 1)), Ok(())),
+            _ => world.wait("the newer one runs", || log.runs() == runs + 2, secs(20)),
+        }
+        if newer.is_none() {
+            world.wait("the safe hook runs", || log.stops().len() == stops + 1, secs(20));
+        }
+        gate.open();
+        assert!(world.finish(&ended).is_err(), "{end}");
+        let expected = if newer.is_some() { [changed, vec![4]].concat() } else { changed };
+        newer.iter().for_each(|newer| assert_eq!(world.finish(newer).map(drop), Ok(())));
+        assert_eq!(log.values(), expected, "it has changed something although its order has ended: {end}");
+        assert_eq!(agv.lease_is_live("drive"), newer.is_some());
+    }
+}
+
+fn a_release_ends_the_renewals_of_an_operators_call_too(world: &mut dyn World) {
+    let lease = millis(if world.is_virtual() { 400 } else { 1_600 });
+    let service = Service::new("drive(n: int[1])").lease(lease);
+    let (manager, agv) = pair(world, &service);
+    let told = |event: &Seen| matches!(event, Seen::LeaseEnded(..));
+    for operator in [false, true] {
+        let options = RequestOptions { operator, ..PATIENT };
+        let mut asked = Err(Error::Expired);
+        for _ in 0..200 {
+            asked = world.ask_with(&manager, "agv", "drive", &mut number("n", 1), options);
+            // On a busy machine the lease may be over before it began.
+            if asked != Err(Error::Expired) {
+                break;
+            }
+        }
+        assert_eq!(asked, Ok(()));
+        manager.release("agv", "drive").expect("it is connected");
+        let before = manager.count(told);
+        world.run_for(lease);
+        assert!(!agv.lease_is_live("drive"));
+        // A renewal of a call that has ended is answered, and what is still renewed is told.
+        assert_eq!(manager.count(told), before, "it was renewed behind its release, operator: {operator}");
+    }
+    world.reached("stopped");
 }

@@ -133,6 +133,24 @@ fn a_heart_that_stops_releases_at_once_and_its_next_owner_renews_nothing_of_it()
     assert!(!pair.agv.is_live(slot), "beats of the next owner renew it");
 }
 
+#[test]
+fn a_heart_that_stops_releases_all_that_it_renewed() {
+    let (dropped, kept) = (heart(), heart());
+    let mut pair = Pair::live();
+    let hearts = [("drive", dropped), ("lift", kept), ("tilt", dropped)];
+    let slots = hearts.map(|(name, _)| pair.agv.offer_leased(&std::format!("{name}()"), LEASE));
+    pair.publish();
+    for (function, heart) in hearts {
+        pair.manager.request_with(function, &none(), &named(heart.beats()), true).unwrap();
+    }
+    pair.settle();
+    let before = dropped.beats();
+    dropped.stop();
+    pair.manager.release_beats(before);
+    pair.settle();
+    assert_eq!(slots.map(|slot| pair.agv.is_live(slot)), [false, true, false]);
+}
+
 /// The way from the vehicle is cut, its renewals arrive.
 fn cut_from_the_vehicle(pair: &mut Pair) -> Instant {
     (pair.agv.net.frozen, pair.agv.net.datagrams) = (true, Datagrams::Lost);

@@ -109,6 +109,19 @@ fn a_lease_ends_in_time_when_nothing_comes_through() {
     assert_eq!(expirations(&pair), 1);
 }
 
+/// No interrupt has looked, and the session has not been polled since.
+#[test]
+fn a_renewal_that_comes_after_the_end_revives_nothing() {
+    let (mut pair, slot) = moving(true);
+    pair.run(LEASE);
+    // Its end is rounded down to the millisecond before; the manager has not given up yet.
+    pair.suspend_agv(LEASE - Duration::from_micros(500));
+    assert!(!pair.agv.is_live(slot));
+    assert!(is_told(&pair, LeaseEnd::Expired));
+    pair.run(Duration::from_secs(1));
+    assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
+}
+
 #[test]
 fn what_an_interrupt_has_seen_dead_is_not_renewed() {
     let (mut pair, slot) = moving(true);
@@ -269,6 +282,23 @@ fn a_lease_that_is_released_ends_at_once() {
     assert!(!pair.agv.is_live(slot));
     pair.run(Duration::from_secs(2));
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (1, 0));
+}
+
+#[test]
+fn a_release_ends_the_renewals_of_the_program_and_of_an_operator() {
+    for operator in [false, true] {
+        let mut pair = Pair::live();
+        let slot = pair.agv.offer_leased("go()", LEASE);
+        pair.publish();
+        let options = RequestOptions { operator, ..RequestOptions::renewing(Renew::Process) };
+        let call = pair.manager.request_with("go", &none(), &options, true).unwrap();
+        pair.run(LEASE);
+        assert!(pair.agv.is_live(slot) && pair.manager.session.holds(call));
+        pair.manager.release(slot).unwrap();
+        assert!(!pair.manager.session.holds(call), "operator: {operator}");
+        pair.run(Duration::from_secs(2));
+        assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (1, 0));
+    }
 }
 
 #[test]

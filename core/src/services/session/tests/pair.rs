@@ -1,5 +1,7 @@
 //! Two sessions joined by pipes in memory, on a clock that jumps to whatever is due next.
 
+use std::vec::Vec;
+
 use super::net::Net;
 use super::setup::Setup;
 use super::side::{Side, context};
@@ -113,6 +115,18 @@ impl Pair {
     pub(super) fn jump(&mut self, span: Duration) {
         self.set_elapsed(self.elapsed + span);
         self.settle();
+    }
+
+    /// Lets time pass for the manager alone, as while the AGV's host is suspended. What was sent meanwhile is what the AGV sees
+    /// first.
+    pub(super) fn suspend_agv(&mut self, span: Duration) {
+        let end = self.elapsed + span;
+        let base = Instant::START + self.manager.base;
+        while self.manager.session.deadline() <= base + end {
+            self.manager.now = self.manager.session.deadline();
+            self.manager.work(Vec::new());
+        }
+        self.jump(span);
     }
 
     fn set_elapsed(&mut self, elapsed: Duration) {

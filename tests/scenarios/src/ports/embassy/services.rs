@@ -4,7 +4,7 @@ use std::rc::{Rc, Weak};
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Ended, Lease};
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_embassy::{Handle, Handler, ServiceOptions, TakenCall};
@@ -54,7 +54,8 @@ fn at_once(node: Weak<BoardNode>, service: Service) -> Handler<()> {
     })))
 }
 
-/// Takes the calls of one name, for as long as there is such a service, and begins a task for each.
+/// Takes the calls of one name, for as long as there is such a service, and begins a task for each; one after the other where
+/// they run in turns.
 async fn take_calls(node: Rc<BoardNode>, board: Board, unit: Handle, function: String) {
     let mut parameters = boxed_parameters(PARAMETERS);
     loop {
@@ -65,7 +66,10 @@ async fn take_calls(node: Rc<BoardNode>, board: Board, unit: Handle, function: S
                 let mut own = boxed_parameters(PARAMETERS);
                 own.copy_from(&parameters).expect("there is as much room");
                 node.begins(&function, call.lease);
-                board.spawn(async move { serve(unit, &service, call, &mut own).await });
+                match service.in_turns {
+                    true => serve(unit, &service, call, &mut own).await,
+                    false => board.spawn(async move { serve(unit, &service, call, &mut own).await }),
+                }
             }
         }
     }
@@ -100,5 +104,8 @@ async fn run(
     while let Some(pause) = service.moves_on(call.lease.is_some_and(|lease| lease.is_live()), parameters) {
         embassy_time::Timer::after_micros(pause.as_micros()).await;
     }
-    Ok(())
+    while service.is_held() {
+        embassy_time::Timer::after_millis(1).await;
+    }
+    service.commit(parameters, |change| call.lease.map_or(Err(Ended), |order| order.commit(change)))
 }
