@@ -271,7 +271,7 @@ impl Board {
 
     /// Holds it up, as a hung processor.
     pub(crate) fn freeze(&self) -> Result<()> {
-        self.signal(Signal::STOP)
+        cara_processes::freeze(&self.child).with_context(|| format!("{} cannot be held up", self.name))
     }
 
     /// Lets it go on.
