@@ -94,7 +94,7 @@ fn text(value: &str) -> Parameters<40_000> {
 fn joined(manager: &CommunicationSystem, count: usize) {
     until("the vehicles have joined", || manager.number_of_s_units() == count);
     for peer in manager.s_units() {
-        assert!(peer.wait_for_function("echo", cara_std::Duration::from_secs(5)));
+        assert!(peer.wait_for_function("echo", PATIENCE));
     }
 }
 

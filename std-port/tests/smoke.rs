@@ -13,7 +13,7 @@ fn fleet() -> u32 {
 }
 
 fn until(what: &str, condition: impl Fn() -> bool) {
-    let end = Instant::now() + Duration::from_secs(10);
+    let end = Instant::now() + Duration::from_secs(30);
     while !condition() {
         assert!(Instant::now() < end, "not in time: {what}");
         std::thread::sleep(Duration::from_millis(2));
@@ -47,7 +47,7 @@ fn a_manager_finds_an_agv_and_calls_it() {
     agv.start().unwrap();
     until("the AGV has joined", || manager.number_of_s_units() == 1);
     let peer = manager.s_units().remove(0);
-    assert!(peer.wait_for_function("echo", cara_std::Duration::from_secs(5)));
+    assert!(peer.wait_for_function("echo", cara_std::Duration::from_secs(30)));
 
     let mut pos = Parameters::new();
     pos.add_int("position", 2).unwrap();

@@ -7,7 +7,7 @@ use cara_processes::{Process, random_fleet};
 use cara_test_keys::KeyFolder;
 
 /// How long a step may take on a machine that does other things as well.
-const STEP: Duration = Duration::from_secs(15);
+const STEP: Duration = Duration::from_secs(30);
 
 /// Starts examples of one fleet, which have keys.
 struct Fleet {

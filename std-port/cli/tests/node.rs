@@ -438,7 +438,7 @@ const GO: &str = "echo going >> motion; echo '{\"m\": 1}'";
 fn leased(script: &str) -> Node {
     let go = shell("go", script);
     Node::start(&format!(
-        "{go}lease = \"500ms\"\nat_lease_end = [\"sh\", \"-c\", \"sleep 0.2; echo stopped >> motion\"]\n"
+        "{go}lease = \"1500ms\"\nat_lease_end = [\"sh\", \"-c\", \"sleep 0.2; echo stopped >> motion\"]\n"
     ))
 }
 
@@ -452,7 +452,7 @@ fn the_end_of_a_lease_runs_what_makes_safe() {
     let (unit, manager) = node.vehicle("agv", 7);
     assert_eq!(call(&manager, "go", 1), Ok(1));
     // Its caller is there, so that it goes on for longer than the lease.
-    std::thread::sleep(Duration::from_millis(1500));
+    std::thread::sleep(Duration::from_secs(3));
     assert_eq!(motion(&node), "going\n");
     manager.release("go").unwrap();
     until("the release stops it", || motion(&node) == "going\nstopped\n");

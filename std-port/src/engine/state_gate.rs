@@ -449,7 +449,7 @@ mod tests {
         };
         gate.waiting_for(LinkId(1), || assert!(receiver.recv_timeout(Duration::from_millis(20)).is_err()));
         drop(held);
-        assert_eq!(receiver.recv_timeout(Duration::from_secs(5)), Ok(1));
+        assert_eq!(receiver.recv_timeout(Duration::from_secs(30)), Ok(1));
         other.join().unwrap();
     }
 
@@ -574,7 +574,7 @@ mod tests {
         drop(held);
         assert_refused(&gate, HERE, Error::NotRunning);
         assert!(gate.enter().is_ok(), "the application still reads its state");
-        assert!(began.elapsed() < Duration::from_secs(5));
+        assert!(began.elapsed() < Duration::from_secs(60));
     }
 
     #[test]

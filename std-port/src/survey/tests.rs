@@ -1,4 +1,4 @@
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, TcpListener};
 
 use cara_core::config::Constraints;
 use cara_core::distribution::hello::Manager;
@@ -8,17 +8,21 @@ use super::*;
 use crate::keys::FleetKeys;
 
 /// Longest wait for a datagram on loopback.
-const PATIENCE: Duration = Duration::from_secs(10);
+const PATIENCE: Duration = Duration::from_secs(30);
 
 fn survey() -> Survey {
     Survey::open(Interfaces::Loopback, free_port()).unwrap()
 }
 
-/// A free port below those that the system gives away: it gives one that is shared to several.
+/// A free port below those that the system gives away: it gives one that is shared to several. The TCP port of the same number
+/// is kept until the process ends, so that no other test, of whatever process, takes this one as well.
 fn free_port() -> u16 {
     let ports = std::iter::repeat_with(|| 22_000 + (random() % 10_000) as u16);
-    let mut free = ports.filter(|port| UdpSocket::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok());
-    free.next().unwrap()
+    let free = |port: &u16| {
+        let kept = TcpListener::bind((Ipv4Addr::LOCALHOST, *port)).map(std::mem::forget);
+        kept.is_ok() && UdpSocket::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok()
+    };
+    ports.filter(free).next().unwrap()
 }
 
 /// A sender on loopback, and where the survey listens.
@@ -116,7 +120,8 @@ fn a_manager_answers_and_own_broadcasts_come_back() {
     manager.start().unwrap();
     assert!(survey.ask(Fleet(fleet)));
     listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.answers > 0));
-    let boss = survey.heard().iter().find(|heard| heard.answers > 0).unwrap();
+    let boss = survey.heard().iter().find(|heard| heard.answers > 0);
+    let boss = boss.unwrap_or_else(|| panic!("no answer: {survey:?}; {:?}", manager.counters()));
     assert_eq!(boss.identity.as_ref(), Some(&manager.identity()));
     assert_eq!(boss.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
     assert_eq!((boss.room, boss.to_us, boss.standing), (Some(Constraints::M_UNIT.maximum_nodes), 1, Standing::Plain));
@@ -164,10 +169,10 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
     let manager = manager.interfaces(Interfaces::Loopback).keys(ring(&boss)).build().unwrap();
     manager.start().unwrap();
-    other.ask(Fleet(fleet));
-    survey.ask(Fleet(fleet));
+    assert!(other.ask(Fleet(fleet)) && survey.ask(Fleet(fleet)), "{:?}, {:?}", other.reach(), survey.reach());
     listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.to_us > 0));
-    let answer = survey.heard().iter().find(|heard| heard.to_us > 0).unwrap();
+    let answer = survey.heard().iter().find(|heard| heard.to_us > 0);
+    let answer = answer.unwrap_or_else(|| panic!("no answer: {survey:?}; {:?}", manager.counters()));
     assert_eq!((answer.identity.as_ref(), answer.mode), (Some(&boss), Mode::Secured));
     assert_eq!((answer.standing, answer.room), (Standing::Proven(1), Some(Constraints::M_UNIT.maximum_nodes)));
     assert_eq!(answer.listens_at().map(|at| at.port()), Some(manager.tcp_port()));

@@ -232,7 +232,7 @@ mod tests {
 
     use super::*;
 
-    const LIMIT: Option<Duration> = Some(Duration::from_secs(5));
+    const LIMIT: Option<Duration> = Some(Duration::from_secs(30));
     const NOW: Option<Duration> = Some(Duration::ZERO);
 
     fn ready(set: &Epoll, timeout: Option<Duration>) -> Vec<Ready> {
@@ -319,15 +319,14 @@ mod tests {
     fn short_time_outs_are_kept_without_rounding_to_milliseconds() {
         let set = Epoll::new().unwrap();
         let span = Duration::from_micros(300);
-        let fastest = (0..20)
-            .map(|_| {
-                let start = Instant::now();
-                assert!(ready(&set, Some(span)).is_empty());
-                let waited = Duration::from(start.elapsed());
-                assert!(waited >= span, "{waited:?}");
-                waited
-            })
-            .min();
-        assert!(fastest < Some(Duration::from_micros(990)), "{fastest:?}");
+        // On a busy machine most waits are longer, of so many not all.
+        let is_kept = (0..5_000).any(|_| {
+            let start = Instant::now();
+            assert!(ready(&set, Some(span)).is_empty());
+            let waited = Duration::from(start.elapsed());
+            assert!(waited >= span, "{waited:?}");
+            waited < Duration::from_micros(990)
+        });
+        assert!(is_kept);
     }
 }

@@ -288,7 +288,7 @@ mod tests {
     use super::super::epoll::{Epoll, Events, Interest};
     use super::*;
 
-    const LIMIT: Duration = Duration::from_secs(5);
+    const LIMIT: Duration = Duration::from_secs(30);
 
     /// Waits until `fd` is ready for `interest`; fails after [`LIMIT`].
     fn await_ready(fd: impl AsFd, interest: Interest) {

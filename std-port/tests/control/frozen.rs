@@ -44,7 +44,7 @@ fn nothing_waits_for_a_node_that_hangs() {
     let peer = depot.system.s_unit("agv").unwrap();
     let mut client = depot.client();
     assert!(matches!(ask(&mut client, ping("agv", 1, 20_000)).unwrap()[..], [Answer::Sample { us: Some(_), .. }]));
-    kill_process(Pid::from_child(&agv.0), Signal::STOP).unwrap();
+    cara_processes::freeze(&agv.0).unwrap();
     // Whatever was on its way; from here on nothing answers.
     until("it stands still", || {
         peer.ping(Duration::from_millis(50)) != Err(Error::NotConnected)

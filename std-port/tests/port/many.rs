@@ -75,7 +75,8 @@ fn a_handler_on_shared_threads_may_stop_units() {
 #[test]
 fn all_are_called_although_the_interval_has_not_passed() {
     let (manager, _threads, agvs) = many(fleet());
-    let interval = Duration::from_millis(300);
+    // Longer than a thread waits for its turn, or the last call would not come too soon.
+    let interval = Duration::from_secs(1);
     let constraints = Constraints { minimum_interval: interval.into(), ..manager.constraints() };
     manager.set_constraints(constraints).unwrap();
     manager.start().unwrap();

@@ -42,14 +42,7 @@ impl Process {
 
     /// Returns when all its threads stand still.
     fn freeze(&self) {
-        self.signal(Signal::STOP);
-        until("it stands still", || {
-            let tasks = std::fs::read_dir(format!("/proc/{}/task", self.0.id())).unwrap();
-            let stats =
-                tasks.map(|task| std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap_or_default());
-            // The state follows the name, which ends with a bracket.
-            stats.into_iter().all(|stat| stat.rsplit(')').next().is_some_and(|rest| rest.starts_with(" T")))
-        });
+        cara_processes::freeze(&self.0).unwrap();
     }
 
     fn signal(&self, signal: Signal) {
@@ -92,7 +85,8 @@ fn as_child() {
                 }),
             )
             .unwrap();
-            let moves = ServiceOptions::new().lease(Duration::from_millis(400), || ());
+            // Less than three keep-alives, and longer than a thread waits for its turn.
+            let moves = ServiceOptions::new().lease(Duration::from_secs(2), || ());
             let drive = |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
                 call.lease.as_ref().unwrap().wait_until_ended();
                 Ok(())
@@ -209,7 +203,8 @@ fn publishing_names_who_has_not_acknowledged() {
     let _quick = Process::agv(fleet, "quick", 1, 1);
     let frozen = Process::agv(fleet, "frozen", 2, 2);
     until("both have come", || manager.nodes_offering("life").len() == 2);
-    let span = cara_std::Duration::from_secs(1);
+    // Both together are less than three keep-alives.
+    let [span, short] = [1_500, 200].map(cara_std::Duration::from_millis);
     manager.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
     assert_eq!(manager.publish_and_wait(cara_std::Duration::from_secs(10)), Ok(vec![]));
     frozen.freeze();
@@ -217,7 +212,7 @@ fn publishing_names_who_has_not_acknowledged() {
     let missing = manager.publish_and_wait(span).unwrap();
     assert_eq!(missing.iter().map(|identity| identity.name()).collect::<Vec<_>>(), ["frozen"]);
     let lost = manager.s_unit("frozen").unwrap();
-    assert_eq!(lost.publish_and_wait(span), Err(Error::TimedOut));
+    assert_eq!(lost.publish_and_wait(short), Err(Error::TimedOut));
     // Silent for three keep-alives, it is lost; it comes back when it goes on.
     until("it is lost", || !lost.is_connected());
     assert_eq!(manager.number_of_s_units(), 1);

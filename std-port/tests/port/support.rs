@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Builder, Call, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer, SUnit,
-    ServiceError, Unit,
+    Builder, Call, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer,
+    RequestOptions, SUnit, ServiceError, Unit,
 };
 
 use crate::keyed::keyed;
@@ -143,10 +143,11 @@ pub(crate) fn service(
     }
 }
 
-/// Calls `function` with a number.
+/// Calls `function` with a number. A call that hangs ends after longer than a thread may wait for its turn on a busy machine.
 pub(crate) fn ask<T: Send + 'static>(peer: &Peer<T>, function: &str, number_in: i64) -> Result<i64, Error> {
     let mut parameters = number(number_in);
-    peer.block_request(function, &mut parameters).map(|()| value(&parameters))
+    let patient = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::default() };
+    peer.block_request_with(function, &mut parameters, &patient).map(|()| value(&parameters))
 }
 
 /// A counter of the peer's link, or of a unit's discovery.

@@ -234,7 +234,12 @@ impl Board {
 
     /// As [`finds`](Self::finds), with the first line that has one of several texts.
     pub(crate) fn finds_any(&self, from: usize, texts: &[&str]) -> Result<(usize, String)> {
-        let deadline = Instant::now() + LONG;
+        self.finds_within(LONG, from, texts)
+    }
+
+    /// As [`finds_any`](Self::finds_any), for so long.
+    pub(crate) fn finds_within(&self, span: Duration, from: usize, texts: &[&str]) -> Result<(usize, String)> {
+        let deadline = Instant::now() + span;
         let has = |line: &str| texts.iter().any(|text| line.contains(text));
         let mut lines = self.log.lock();
         loop {
@@ -266,7 +271,7 @@ impl Board {
 
     /// Holds it up, as a hung processor.
     pub(crate) fn freeze(&self) -> Result<()> {
-        self.signal(Signal::STOP)
+        cara_processes::freeze(&self.child).with_context(|| format!("{} cannot be held up", self.name))
     }
 
     /// Lets it go on.

@@ -11,7 +11,7 @@ use cara_apps::mechanic;
 use cara_std::control::Control;
 use cara_std::{
     Builder, CloseReason, CommunicationSystem, Constraints, Duration as CoreDuration, Error, MUnit, Parameters, Peer,
-    Renew, RequestOptions, StartError, UnitEvent,
+    Renew, RequestOptions, ServiceError, StartError, UnitEvent,
 };
 
 use crate::board::{Board, FLEET, LONG, Who};
@@ -116,13 +116,24 @@ pub(crate) fn announce(peer: &Peer) -> Result<()> {
     patiently(|| peer.block_request("fault", &mut fault(0)?))
 }
 
+/// Whether a call may have ended so because this machine was too busy for it: no answer in time, or no room, or an order that
+/// was over before its handler could begin with it, which says that the service is not ready.
+pub(crate) const fn is_of_a_busy_host(error: &Error) -> bool {
+    matches!(error, Error::TimedOut | Error::Expired | Error::Busy | Error::Service(ServiceError::NotReady))
+}
+
 /// Asks for what may run twice, again where this machine was too busy for an answer in time.
-pub(crate) fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()> {
+pub(crate) fn patiently(ask: impl FnMut() -> Result<(), Error>) -> Result<()> {
+    Ok(outcome(ask)?)
+}
+
+/// As [`patiently`]: what it came to in the end.
+pub(crate) fn outcome(mut ask: impl FnMut() -> Result<(), Error>) -> Result<(), Error> {
     let deadline = Instant::now() + LONG;
     loop {
         match ask() {
-            Err(Error::TimedOut | Error::Expired | Error::Busy) if Instant::now() < deadline => {}
-            ended => return Ok(ended?),
+            Err(error) if is_of_a_busy_host(&error) && Instant::now() < deadline => {}
+            ended => return ended,
         }
     }
 }
@@ -132,8 +143,8 @@ pub(crate) fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()
 pub(crate) fn reset(peer: &Peer) -> Result<()> {
     let deadline = Instant::now() + LONG;
     loop {
-        match peer.block_request("reset", &mut Parameters::<512>::new()) {
-            Err(Error::TimedOut | Error::Expired | Error::Inhibited { .. }) if Instant::now() < deadline => {}
+        match outcome(|| peer.block_request("reset", &mut Parameters::<512>::new())) {
+            Err(Error::Inhibited { .. }) if Instant::now() < deadline => {}
             ended => return Ok(ended?),
         }
     }
@@ -142,7 +153,7 @@ pub(crate) fn reset(peer: &Peer) -> Result<()> {
 /// Sends a vehicle to a place; `false` if this machine was too busy for that and the lease has ended.
 pub(crate) fn sends(peer: &Peer, position: [i64; 2], renew: Renew) -> Result<bool> {
     match peer.block_request_with("go_to", &mut at(position)?, &RequestOptions::renewing(renew)) {
-        Err(Error::TimedOut | Error::Expired | Error::Busy) => {
+        Err(error) if is_of_a_busy_host(&error) => {
             // The call may have run all the same, and its lease is not renewed then.
             peer.release("go_to")?;
             Ok(false)
@@ -160,23 +171,26 @@ pub(crate) fn sets_out(peer: &Peer, position: [i64; 2]) -> Result<()> {
     Ok(())
 }
 
-/// Sends a vehicle to a place with `ask`, until it is there: on a busy machine it may lose its lease on the way.
+/// Sends a vehicle to a place with `ask`, until it is there: on a busy machine it may lose its lease on the way, or the call may
+/// come too late to begin.
 pub(crate) fn drives(board: &Board, position: [i64; 2], mut ask: impl FnMut() -> Result<()>) -> Result<()> {
     let [x, y] = position;
     let deadline = Instant::now() + LONG;
-    while Instant::now() < deadline {
+    loop {
         let line = board.line();
         ask()?;
-        let (_, said) = board.finds_any(line, &["arrived at", "stopped at"])?;
-        if said.contains(&format!("arrived at {x} {y}")) {
-            return Ok(());
+        match board.finds_within(LONG / 4, line, &["arrived at", "stopped at"]) {
+            Ok((_, said)) if said.contains(&format!("arrived at {x} {y}")) => return Ok(()),
+            ended if Instant::now() >= deadline => {
+                return ended.and_then(|(_, said)| bail!("it does not come to {position:?}, but {said}"));
+            }
+            _ => {}
         }
     }
-    bail!("it does not come to {position:?}")
 }
 
 /// Parameters with a position.
-pub(crate) fn at(position: [i64; 2]) -> Result<Parameters> {
+pub(crate) fn at(position: [i64; 2]) -> Result<Parameters, Error> {
     let mut parameters = Parameters::new();
     parameters.add_int("position", 2)?;
     parameters.set_value("position", position)?;

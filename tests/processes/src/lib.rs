@@ -12,7 +12,7 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// How often a process that is to end is looked at: there is no wait with a deadline.
@@ -118,10 +118,10 @@ impl Process {
         Ok(at)
     }
 
-    /// Holds it up, as a hung program: its connections stay open. When it was done.
+    /// Holds it up, as a hung program: its connections stay open. When that began; it stands still when this returns.
     pub fn freeze(&mut self) -> Result<Instant> {
         let at = Instant::now();
-        self.signal(Signal::STOP).map(|()| at)
+        freeze(&self.child).with_context(|| format!("{} cannot be held up", self.name)).map(|()| at)
     }
 
     /// Lets it go on.
@@ -166,6 +166,33 @@ impl Process {
         let last = &lines[lines.len().saturating_sub(LAST_LINES)..];
         last.iter().fold(String::from("; it printed last:"), |text, line| text + "\n    " + &line.text)
     }
+}
+
+/// Stops a process by a signal. On a busy machine its threads go on until each has had a turn, so this returns when all of them
+/// stand still.
+pub fn freeze(child: &Child) -> Result<()> {
+    kill_process(Pid::from_child(child), Signal::STOP)?;
+    let deadline = Instant::now() + STANDS_STILL;
+    while !stands_still(child.id())? {
+        ensure!(Instant::now() < deadline, "it does not stand still");
+        std::thread::sleep(LOOK);
+    }
+    Ok(())
+}
+
+/// Longest wait for a process to stand still.
+const STANDS_STILL: Duration = Duration::from_secs(30);
+
+fn stands_still(process: u32) -> Result<bool> {
+    for task in std::fs::read_dir(format!("/proc/{process}/task"))? {
+        // A thread may have ended since.
+        let stat = std::fs::read_to_string(task?.path().join("stat")).unwrap_or_default();
+        // The state follows the name, which ends with a bracket.
+        if stat.rsplit(')').next().is_some_and(|rest| !rest.is_empty() && !rest.starts_with(" T")) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 impl Drop for Process {
@@ -227,7 +254,7 @@ mod tests {
     use std::path::Path;
     use std::time::Duration;
 
-    const LONG: Duration = Duration::from_secs(10);
+    const LONG: Duration = Duration::from_secs(30);
 
     fn shell(script: &str) -> Process {
         Process::start("shell", Path::new("sh"), ["-c", script]).unwrap()

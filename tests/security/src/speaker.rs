@@ -18,7 +18,7 @@ use cara_secure::keys::PairKey;
 use cara_secure::link::{Cipher, Credentials};
 
 /// Longest wait for the other end.
-pub const PATIENCE: Duration = Duration::from_secs(10);
+pub const PATIENCE: Duration = Duration::from_secs(30);
 /// The first steps, which prove the link.
 pub const HANDSHAKE: usize = 3;
 /// All steps.

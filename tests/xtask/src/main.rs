@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+mod again;
 mod bad_input;
 mod bench;
 mod binaries;
@@ -60,6 +61,12 @@ enum Task {
         /// Shows the groups, what each checks and its budget, and runs none.
         #[arg(long)]
         list: bool,
+        /// Runs the groups named so many times, each time as a process of its own.
+        #[arg(long, value_name = "N", default_value_t = 1, requires = "groups", value_parser = clap::value_parser!(u16).range(1..))]
+        times: u16,
+        /// Runs beside so many threads that do nothing but keep a processor busy.
+        #[arg(long, value_name = "N", default_value_t = 0)]
+        busy: u16,
     },
     /// Breaks what rows of docs/paper.md say, one committed patch at a time, and requires that the row's test fails.
     Paper {
@@ -143,7 +150,7 @@ fn main() -> ExitCode {
         Task::Demo(options) if options.warehouse => demo::warehouse(&options),
         Task::Demo(_) => demo::run(),
         Task::Test { list: true, .. } => runner::list(),
-        Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
+        Task::Test { groups, quick, times, busy, list: false } => runner::run(&groups, quick, times, busy),
         Task::Sizes { board, json, write } => firmware::sizes(board.as_deref(), json.as_deref(), write),
         Task::Versions { revisions } => later::versions(&revisions).map(|()| ExitCode::SUCCESS),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),

@@ -2,7 +2,8 @@
 //!
 //! Each group is a process of its own. Groups that fill the processors run one after the other. Groups that mostly wait (for an
 //! emulator, for a time-out, for a linker with one thread) run three at a time behind them, and what one printed is printed at its
-//! end. The last lines of what failed are repeated behind the table: a log that was cut has them.
+//! end. What failed runs once more, alone, after all others, and is flaky if it passes then. The last lines of what failed are
+//! repeated behind the table: a log that was cut has them.
 
 use std::collections::VecDeque;
 use std::process::ExitCode;
@@ -11,8 +12,8 @@ use std::time::Instant;
 
 use anyhow::{Result, bail};
 
+use crate::again;
 use crate::command::Run;
-
 use crate::groups::{Extent, GROUPS, Group, Outcome};
 
 /// A group that has run.
@@ -23,8 +24,10 @@ struct Report {
     /// Of the processors, by all processes that it waited for. None outside Linux.
     cpu: f64,
     budget: u64,
-    /// The last of what it printed, where that was seen.
-    tail: Vec<String>,
+    /// What it printed, where that was seen.
+    output: String,
+    /// The tests that failed in its first run, if it passed in its second.
+    flaky: Vec<String>,
 }
 
 /// Prints the table of groups.
@@ -38,17 +41,24 @@ pub(crate) fn list() -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Runs the groups named, or those of the default run.
-pub(crate) fn run(names: &[String], quick: bool) -> Result<ExitCode> {
-    let chosen = chosen(names, quick)?;
+/// Runs the groups named, or those of the default run; several times, or beside threads that keep processors busy, if asked for.
+pub(crate) fn run(names: &[String], quick: bool, times: u16, busy: u16) -> Result<ExitCode> {
+    let chosen = chosen(names, quick)?.repeat(times.into());
+    (0..busy).for_each(|_| drop(std::thread::spawn(|| std::iter::repeat(()).for_each(std::hint::black_box))));
     let (start, before) = (Instant::now(), cpu_of_children());
-    let (waiting, busy): (Vec<&Group>, Vec<&Group>) =
+    let (mut waiting, busy): (Vec<&Group>, Vec<&Group>) =
         chosen.into_iter().partition(|group| group.waits && names.is_empty());
+    // The longest first: what is left for the end is short. `unit` is built already, and waits for no other group's build.
+    waiting.sort_by_key(|group| std::cmp::Reverse(extent_of(group, quick).1));
     // One group is run here; of several, each is a process of its own.
     let alone = busy.len() == 1 && waiting.is_empty();
     let here = |group| if alone { run_group(group, quick) } else { run_apart(group, quick, true) };
     let mut reports: Vec<Report> = busy.into_iter().map(here).collect();
     reports.extend(run_side_by_side(waiting, quick));
+    // Who runs a group several times asks how often it fails.
+    if times == 1 {
+        reports = reports.into_iter().map(|report| run_again(report, |group| run_apart(group, quick, true))).collect();
+    }
     summarise(&reports);
     let (seconds, cpu) = (start.elapsed().as_secs_f64(), cpu_of_children() - before);
     println!("{:<14}{seconds:>10.1}{cpu:>10.1}", "all of it");
@@ -81,7 +91,7 @@ fn run_group(group: &'static Group, quick: bool) -> Report {
     let (start, before) = (Instant::now(), cpu_of_children());
     let outcome = (group.run)(extent);
     let (seconds, cpu) = (start.elapsed().as_secs_f64(), cpu_of_children() - before);
-    let report = Report { group, outcome, seconds, cpu, budget, tail: Vec::new() };
+    let report = Report { group, outcome, seconds, cpu, budget, output: String::new(), flaky: Vec::new() };
     println!("{REPORT}{}", report.line());
     report.warn();
     report
@@ -129,14 +139,30 @@ fn run_apart(group: &'static Group, quick: bool, at_once: bool) -> Report {
     if !at_once {
         println!("{output}");
     }
-    let lines: Vec<&str> = output.lines().collect();
     Report {
         group,
         outcome: outcome_in(group.name, &output),
         seconds: start.elapsed().as_secs_f64(),
         cpu: cpu_in(group.name, &output),
         budget,
-        tail: lines.iter().skip(lines.len().saturating_sub(TAIL)).map(ToString::to_string).collect(),
+        output,
+        flaky: Vec::new(),
+    }
+}
+
+/// Runs a group that failed once more, unless what failed must not fail even once.
+fn run_again(first: Report, run: impl FnOnce(&'static Group) -> Report) -> Report {
+    // One that ran here has shown its failure to a person who waits for it.
+    if first.output.is_empty() || !again::may_run(first.group, &first.outcome, &first.output) {
+        return first;
+    }
+    let Outcome::Failed(reason) = &first.outcome else { return first };
+    println!("== {} failed and runs once more: {reason}", first.group.name);
+    let second = run(first.group);
+    let (seconds, cpu) = (first.seconds + second.seconds, first.cpu + second.cpu);
+    match second.outcome {
+        Outcome::Passed => Report { flaky: again::failed_tests(&first.output, reason), seconds, cpu, ..second },
+        _ => Report { seconds, cpu, ..first },
     }
 }
 
@@ -194,10 +220,13 @@ fn summarise(reports: &[Report]) {
         println!("{}", report.line());
     }
     let failed =
-        reports.iter().filter(|report| matches!(report.outcome, Outcome::Failed(_)) && !report.tail.is_empty());
-    for Report { group, tail, .. } in failed {
+        reports.iter().filter(|report| matches!(report.outcome, Outcome::Failed(_)) && !report.output.is_empty());
+    for Report { group, output, .. } in failed {
+        let lines: Vec<&str> = output.lines().collect();
+        let tail = &lines[lines.len().saturating_sub(TAIL)..];
         println!("\n== the last lines of {}:\n{}\n", group.name, tail.join("\n"));
     }
+    reports.iter().flat_map(Report::flaky_lines).for_each(|line| println!("{line}"));
 }
 
 const PASSED: &str = "  passed";
@@ -210,6 +239,11 @@ impl Report {
         if *seconds > *budget as f64 {
             println!("warning: {} took {seconds:.0} s, its budget is {budget} s", group.name);
         }
+    }
+
+    /// One for each test that failed before its group passed.
+    fn flaky_lines(&self) -> impl Iterator<Item = String> {
+        self.flaky.iter().map(|test| format!("FLAKY {}: {test}", self.group.name))
     }
 
     fn line(&self) -> String {
@@ -240,14 +274,57 @@ fn is_strict(ci: Option<&str>) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{REPORT, Report, chosen, cpu_in, is_strict, outcome_in, verdict};
+    use super::{REPORT, Report, chosen, cpu_in, is_strict, outcome_in, run_again, verdict};
     use crate::groups::{GROUPS, Outcome};
 
+    fn report(name: &str, outcome: Outcome, output: &str) -> Report {
+        let group = GROUPS.iter().find(|group| group.name == name).unwrap();
+        let (output, flaky) = (output.to_owned(), Vec::new());
+        Report { group, outcome, seconds: 1.0, cpu: 2.5, budget: 1, output, flaky }
+    }
+
     fn reports(outcomes: Vec<Outcome>) -> Vec<Report> {
-        outcomes
-            .into_iter()
-            .map(|outcome| Report { group: &GROUPS[0], outcome, seconds: 1.0, cpu: 2.5, budget: 1, tail: Vec::new() })
-            .collect()
+        outcomes.into_iter().map(|outcome| report(GROUPS[0].name, outcome, "")).collect()
+    }
+
+    fn failed() -> Outcome {
+        Outcome::Failed("exit code 101".into())
+    }
+
+    const FAILING: &str = "test access::a_file ... FAILED\n";
+
+    #[test]
+    fn a_group_that_passes_when_run_again_is_flaky() {
+        let again = run_again(report("unit", failed(), FAILING), |group| report(group.name, Outcome::Passed, "x"));
+        assert_eq!(again.flaky_lines().collect::<Vec<_>>(), ["FLAKY unit: access::a_file"]);
+        assert_eq!((again.seconds, again.cpu), (2.0, 5.0));
+        assert_eq!(verdict(&[again], true), ("1 passed, 0 failed, 0 skipped".into(), true));
+    }
+
+    #[test]
+    fn a_group_that_passes_neither_time_fails() {
+        for second in [failed(), Outcome::Skipped("no root".into())] {
+            let again = run_again(report("unit", failed(), FAILING), |group| report(group.name, second, ""));
+            assert_eq!(again.flaky, [""; 0]);
+            assert_eq!(verdict(&[again], false), ("0 passed, 1 failed, 0 skipped".into(), false));
+        }
+    }
+
+    #[test]
+    fn nothing_else_runs_again() {
+        let never = |_| -> Report { unreachable!("it must not run again") };
+        let of_the_core = format!("{FAILING}error: 1 target failed:\n    `-p cara-core --lib`\n");
+        for first in [
+            report("unit", Outcome::Passed, FAILING),
+            report("unit", Outcome::Skipped("no root".into()), FAILING),
+            report("unit", failed(), &of_the_core),
+            report("firmware", failed(), FAILING),
+            report("unit", failed(), ""),
+        ] {
+            let line = first.line();
+            let again = run_again(first, never);
+            assert_eq!((again.line(), again.flaky), (line, vec![]));
+        }
     }
 
     #[test]

@@ -11,7 +11,7 @@ use cara_std::{
 
 use crate::support::{PATIENCE, Running, Stage};
 
-const LEASE: Duration = Duration::from_millis(1_200);
+const LEASE: Duration = Duration::from_millis(2_400);
 
 /// A vehicle that drives until it is told that it has arrived, or until its lease ends.
 struct Driver {
@@ -166,7 +166,7 @@ fn a_call_that_its_own_lease_has_ended_says_so() {
     let stage = Stage::with(&[]);
     let _driver = Driver::join(&stage);
     let ended = stage.ends(1, &["call", "driver", "carry"]);
-    ended.says("the lease of `carry` (1.2").says("ended before it had finished").says("--hold").says("code 137");
+    ended.says("the lease of `carry` (2.4").says("ended before it had finished").says("--hold").says("code 137");
 }
 
 #[test]

@@ -142,8 +142,7 @@ impl Stage {
     /// The manager stands still, as after Ctrl-Z: the system still takes connections for it.
     pub(crate) fn freeze_manager(&self) {
         let manager = self.manager.as_ref().expect("it runs");
-        rustix::process::kill_process(rustix::process::Pid::from_child(manager), rustix::process::Signal::STOP)
-            .unwrap();
+        cara_processes::freeze(manager).unwrap();
     }
 
     /// The command with the stage's fleet, on loopback, to be run.
@@ -287,7 +286,7 @@ impl Running {
 
     /// Ctrl-Z, as far as one process is concerned, and not to be caught.
     pub(crate) fn freeze(&self) {
-        self.signal(rustix::process::Signal::STOP);
+        cara_processes::freeze(&self.child).unwrap();
     }
 
     pub(crate) fn thaw(&self) {

@@ -12,7 +12,7 @@ use super::{patient, within_millis};
 use crate::support::{Gate, fleet, held, meet, number, pair, retire_absent, service, system, unit, value};
 
 /// Longest wait; what blocks would block for so long.
-const LIMIT: Duration = Duration::from_secs(8);
+const LIMIT: Duration = Duration::from_secs(30);
 
 /// Runs `waits` on one thread with a second task that ticks a few times and then does what ends the wait.
 pub(super) fn beside<R>(waits: impl Future<Output = R>, brings_about: impl FnOnce() + Send + 'static) -> R {
@@ -45,11 +45,11 @@ fn calls_starve_no_other_task() {
     retire_absent(&manager);
     let [one, all, kept] = gates.map(|gate| move || gate.open());
     let mut parameters = number(5);
-    let call = async { peer.request_async("hang0", &mut parameters, &within_millis(7_000))?.await };
+    let call = async { peer.request_async("hang0", &mut parameters, &within_millis(25_000))?.await };
     assert_eq!(beside(call, one), Ok(()));
-    let outcomes = beside(manager.request_all_async("hang1", &number(4), &within_millis(7_000)), all);
+    let outcomes = beside(manager.request_all_async("hang1", &number(4), &within_millis(25_000)), all);
     assert_eq!(outcomes.iter().map(|(_, outcome)| outcome.as_ref().map(|p| value(p))).collect::<Vec<_>>(), [Ok(4)]);
-    assert!(beside(peer.hold_async("hang2", &mut number(1), &within_millis(7_000)), kept).is_ok());
+    assert!(beside(peer.hold_async("hang2", &mut number(1), &within_millis(25_000)), kept).is_ok());
 }
 
 /// One that blocks does starve the other: the check can fail.
@@ -134,7 +134,7 @@ fn a_service_that_waits_and_its_caller_share_a_thread() {
     let called = async {
         let runtime = tokio::runtime::Handle::current();
         agv.run_services_on(move |task| drop(runtime.spawn(task)));
-        peer.request_async("waits", &mut parameters, &within_millis(7_000))?.await
+        peer.request_async("waits", &mut parameters, &within_millis(25_000))?.await
     };
     assert_eq!(beside(called, move || opens.store(1, Ordering::SeqCst)), Ok(()));
     let unrenewed = RequestOptions { renew: cara_std::Renew::Never, ..patient() };

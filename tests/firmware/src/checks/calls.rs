@@ -4,7 +4,7 @@ use anyhow::{Context, Result, ensure};
 use cara_std::{Delivery, Error, Parameters, Renew, RequestOptions, UnitEvent};
 
 use crate::board::{Bench, Who};
-use crate::manager::{Manager, arrives, at, drives, patiently, position, reset, sets_out};
+use crate::manager::{Manager, arrives, at, drives, outcome, patiently, position, reset, sets_out};
 
 /// What the board offers, in the order in which it was added.
 const FUNCTIONS: &str = "\
@@ -69,15 +69,15 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     board.logs("stopped at")?;
     let [x, _] = position(&agv)?;
     ensure!((0..10).contains(&x), "it stands at {x}");
-    sets_out(&agv, [1_000, 0])?;
     let line = board.line();
+    sets_out(&agv, [1_000, 0])?;
     agv.release("go_to")?;
     board.logs_behind(line, "stopped at")?;
     let line = board.line();
     sets_out(&agv, [1_000, 0])?;
     patiently(|| agv.block_request("stop", &mut Parameters::<512>::new()))?;
     board.logs_behind(line, "stopped at")?;
-    let refused = agv.block_request("go_to", &mut at([0, 0])?);
+    let refused = outcome(|| agv.block_request("go_to", &mut at([0, 0])?));
     ensure!(matches!(refused, Err(Error::Inhibited { by: 1, reason: 0 })), "behind the stop it says {refused:?}");
     reset(&agv)?;
     sets_out(&agv, [0, 0])?;

@@ -6,14 +6,14 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
-use cara_std::{Error, Heart, LeaseEnd, Peer, Renew, RequestOptions, UnitEvent};
+use cara_std::{Heart, LeaseEnd, Peer, Renew, RequestOptions, UnitEvent};
 
 use super::Stop;
 use super::inject::{EmulatedBoard, LEFT, OFF, ON, PHASES, STANDS, TRIES, pause};
 use super::kind::POLL;
 use super::orders::{CREEP, arguments};
 use crate::board::LONG;
-use crate::manager::{Manager, announce, at, sends};
+use crate::manager::{Manager, announce, at, is_of_a_busy_host, sends};
 
 /// At most so long between two beats of a loop.
 const PERIOD: Duration = Duration::from_millis(100);
@@ -89,7 +89,7 @@ impl EmulatedBoard {
             let line = self.board.line();
             let wanted = RequestOptions::renewing(Renew::Process);
             let held = match agv.hold("go_to", &mut at([9_000, 0])?, &wanted) {
-                Err(Error::TimedOut | Error::Expired | Error::Busy) => continue,
+                Err(error) if is_of_a_busy_host(&error) => continue,
                 held => held?,
             };
             let line = self.board.logs_behind(line, ON)?;
@@ -113,7 +113,7 @@ fn goes_on(manager: &Manager, agv: &Peer, is_held: &SyncSender<()>, ends: &Atomi
     let held = loop {
         heart.beat();
         match agv.hold(CREEP, &mut arguments(0, 0)?, &RequestOptions::renewing(heart.renew())) {
-            Err(Error::TimedOut | Error::Expired | Error::Busy) if Instant::now() < deadline => {}
+            Err(error) if is_of_a_busy_host(&error) && Instant::now() < deadline => {}
             held => break held.context(CREEP)?,
         }
     };

@@ -12,7 +12,7 @@ use super::inject::{EmulatedBoard, ON, STANDS, pause};
 use super::kind::TIMEOUT;
 use crate::board::{FLEET, LONG, Way};
 use crate::keys::MANAGER;
-use crate::manager::{Manager, announce, patiently};
+use crate::manager::{Manager, announce, is_of_a_busy_host, patiently};
 
 /// The service of the image whose calls tasks take.
 pub(super) const CREEP: &str = "creep";
@@ -66,7 +66,7 @@ impl EmulatedBoard {
                 loop {
                     match agv.block_request_with(CREEP, &mut arguments(1, NEVER)?, &options) {
                         // It did not begin: the clock of this board runs ahead while it computes a proof.
-                        Err(Error::Expired | Error::Busy) => {}
+                        Err(error) if error != Error::TimedOut && is_of_a_busy_host(&error) => {}
                         outcome => break outcome,
                     }
                 }

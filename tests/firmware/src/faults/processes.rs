@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use cara_apps::agv::{GO_TO, GO_TO_LEASE};
 use cara_processes::Process;
 use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceOptions, Unit};
 use rustix::time::{ClockId, clock_gettime};
 
-use super::inject::{STANDS, pause};
+use super::inject::{STANDS, TRIES, pause};
 use super::kind::{Bound, Failing, Kind};
 use super::{Stop, Target, shared};
 use crate::board::{FLEET, LONG, Who};
@@ -75,11 +75,7 @@ fn state_is_held(dice: &mut fastrand::Rng) -> Result<u64> {
 /// A second manager does not start beside the first one, starts when the first one hangs, and the first one moves nothing
 /// when it goes on.
 fn second_manager(dice: &mut fastrand::Rng) -> Result<u64> {
-    let (mut vehicle, mut first) = (vehicle()?, manager()?);
-    vehicle.expect(ON, LONG)?;
-    let ended = manager()?.wait(LONG)?;
-    ensure!(!ended.success(), "a second manager ran beside the first one");
-    ensure!(!vehicle.has(OFF), "the vehicle stopped though its manager was there");
+    let (mut vehicle, mut first) = beside_a_second_manager()?;
     pause(dice);
     let fault = now();
     first.freeze()?;
@@ -93,6 +89,20 @@ fn second_manager(dice: &mut fastrand::Rng) -> Result<u64> {
     let running = second.has("driving");
     ensure!(running && offs <= 2, "the first manager came back: {:?}", vehicle.lines());
     Ok(took)
+}
+
+/// A vehicle that drives, and its manager, beside which a second one has not started.
+fn beside_a_second_manager() -> Result<(Process, Process)> {
+    for _ in 0..TRIES {
+        let (mut vehicle, first) = (vehicle()?, manager()?);
+        vehicle.expect(ON, LONG)?;
+        let ended = manager()?.wait(LONG)?;
+        ensure!(!ended.success(), "a second manager ran beside the first one");
+        if !vehicle.has(OFF) {
+            return Ok((vehicle, first));
+        }
+    }
+    bail!("in {TRIES} tries the vehicle stopped though its manager was there")
 }
 
 /// From the fault until both the motors' loop and the safe hook have stopped the vehicle for the `nth` time, in microseconds;

@@ -10,14 +10,13 @@ use cara_processes::Process;
 use cara_std::access::AccessTable;
 use cara_std::control::Control;
 use cara_std::{
-    Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions,
-    ServiceOptions,
+    Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, ServiceOptions,
 };
 
 use super::inject::{STANDS, pause};
 use super::processes::{OFF, ON, SAFE, motors, now, start, stopped};
 use crate::board::{FLEET, LONG};
-use crate::manager::at;
+use crate::manager::{at, outcome, patiently, sets_out};
 
 const VEHICLE: (&str, u32) = ("crane", 3);
 /// A motion that ended before the fault, as the host may be too busy to renew its lease, is begun again so often.
@@ -41,7 +40,7 @@ pub(super) fn held(dice: &mut fastrand::Rng) -> Result<u64> {
         let (mut seen, one, two) = (lines(&vehicle, OFF), peer(&one)?, peer(&two)?);
         moves(&vehicle, &one)?;
         pause(dice);
-        let refused = two.block_request("go_to", &mut at([1, 2])?);
+        let refused = outcome(|| two.block_request("go_to", &mut at([1, 2])?));
         std::thread::sleep(STANDS);
         if lines(&vehicle, OFF) > seen {
             one.release("go_to")?;
@@ -63,11 +62,11 @@ pub(super) fn stopped_without_right(dice: &mut fastrand::Rng) -> Result<u64> {
     moves(&vehicle, &one)?;
     pause(dice);
     let fault = now();
-    two.block_request("stop", &mut Parameters::new())?;
+    patiently(|| two.block_request("stop", &mut Parameters::new()))?;
     let took = stopped(&vehicle, fault, lines(&vehicle, OFF).max(1), false)?;
-    let (refused, ons) = (two.block_request("reset", &mut Parameters::new()), lines(&vehicle, ON));
+    let (refused, ons) = (outcome(|| two.block_request("reset", &mut Parameters::new())), lines(&vehicle, ON));
     ensure!(refused == Err(Error::NotAllowed), "a reset without right came to {refused:?}");
-    let moved = one.block_request("go_to", &mut at([1, 2])?);
+    let moved = outcome(|| one.block_request("go_to", &mut at([1, 2])?));
     ensure!(moved == Err(Error::Inhibited { by: 2, reason: 0 }), "a call behind the stop came to {moved:?}");
     std::thread::sleep(STANDS);
     ensure!(lines(&vehicle, ON) == ons, "it moves again: {:?}", vehicle.lines());
@@ -99,7 +98,7 @@ fn peer(caller: &CommunicationSystem) -> Result<Peer> {
 /// Moves it.
 fn moves(vehicle: &Process, caller: &Peer) -> Result<()> {
     let ons = lines(vehicle, ON);
-    caller.block_request_with("go_to", &mut at([1, 2])?, &RequestOptions::renewing(Renew::Process))?;
+    sets_out(caller, [1, 2])?;
     let deadline = std::time::Instant::now() + LONG;
     while lines(vehicle, ON) == ons {
         ensure!(std::time::Instant::now() < deadline, "it does not move");

@@ -8,7 +8,7 @@ use cara_std::{Error, Parameters, Peer, Priority, RequestOptions, ServiceError};
 
 use super::Stop;
 use super::inject::{Drive, EmulatedBoard, OFF, TRIES};
-use crate::manager::{Manager, at, fault, patiently, reset};
+use crate::manager::{Manager, at, fault, outcome, patiently, reset};
 
 /// Callers that keep the board busy.
 const CALLERS: usize = 4;
@@ -65,7 +65,7 @@ impl EmulatedBoard {
         let (behind, stop) = self.stopped(line)?;
         let inhibited = Error::Inhibited { by: 0, reason: BUMPER };
         self.is_latched(&agv, inhibited)?;
-        let refused = agv.block_request("reset", &mut Parameters::new());
+        let refused = outcome(|| agv.block_request("reset", &mut Parameters::new()));
         let pressed = Err(Error::Service(ServiceError::Failed(BUMPER_IS_PRESSED)));
         ensure!(refused == pressed, "with its bumper pressed the reset came to {refused:?}");
         patiently(|| agv.block_request("fault", &mut fault(FREE)?))?;
@@ -79,9 +79,8 @@ impl EmulatedBoard {
     /// A call that would move it is refused.
     fn is_latched(&self, agv: &Peer, latch: Error) -> Result<()> {
         let mut far = at([-9_000, 0])?;
-        let moved = patiently(|| agv.block_request("go_to", &mut far));
-        let refused = moved.as_ref().err().and_then(|error| error.downcast_ref::<Error>());
-        ensure!(refused == Some(&latch), "a call behind the stop came to {moved:?}");
+        let moved = outcome(|| agv.block_request("go_to", &mut far));
+        ensure!(moved == Err(latch), "a call behind the stop came to {moved:?}");
         Ok(())
     }
 }
