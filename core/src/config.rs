@@ -86,8 +86,16 @@ pub const SHORTEST_KEEP_ALIVE: Duration = Duration::from_millis(1);
 pub const LONGEST_KEEP_ALIVE: Duration = Duration::from_secs(60);
 /// Keep-alives that may be missed in a row.
 pub const MISSED_KEEP_ALIVES: u8 = 3;
-/// Loss is declared this late where only TCP passes, since one retransmission alone can take seconds.
-pub const TCP_ONLY_LOSS: Duration = Duration::from_secs(8);
+/// Where only the stream passes, no peer is lost earlier than this, however short its keep-alives: retransmissions after one lost
+/// segment take as long.
+pub const STREAM_ONLY_LOSS: Duration = Duration::from_secs(3);
+/// A stream into which nothing was written for this long is probed.
+pub const PROBE: Duration = Duration::from_secs(4);
+/// A stream is dead when what was written does not reach the peer, and nothing else does, for this long.
+pub const STREAM_DEAD: Duration = Duration::from_secs(8);
+/// The maximum segment size with which a stream is dialled again that died with more than this outstanding: the least that every
+/// IPv4 host takes (RFC 9293, section 3.7.1).
+pub const SHORT_SEGMENT: u16 = 536;
 /// One-way messages written this soon after the last write are gathered.
 pub const GATHER: Duration = Duration::from_micros(50);
 /// First back-off between two searches; doubles up to [`LONGEST_SEARCH`], each with full jitter on top.

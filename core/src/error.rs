@@ -200,7 +200,7 @@ pub enum CloseReason {
     /// The connection was reset or closed below.
     #[error("the connection was closed below: the peer's process ended, or the network reset it; it is opened again")]
     Reset = 2,
-    /// Nothing was heard for the time of three keep-alives (8 s where only TCP passes).
+    /// Nothing was heard for the time of three keep-alives.
     #[error("nothing was heard from the peer: check power, cable and manager")]
     Silent = 3,
     /// The same identity came back with a new boot epoch.
@@ -235,6 +235,16 @@ pub enum CloseReason {
     /// This unit was stopped in an orderly way. Its peer is told [`Stopped`](Self::Stopped).
     #[error("this unit was stopped")]
     StoppedHere = 13,
+    /// The stream brought nothing to one of the ends for 8 s, while the peer was heard and did not hold reading back.
+    #[error(
+        "the stream is dead though the peer is heard: {}; it is opened again",
+        if *.long { "look for a part of the path that drops long packets (its MTU)" }
+        else { "look for a firewall or a NAT that forgets or drops TCP sessions" }
+    )]
+    StreamDead {
+        /// More than one segment of 536 bytes was outstanding: the stream is dialled again with segments of that size.
+        long: bool,
+    } = 14,
 }
 
 /// What a handler answers instead of results. Text and values of a failure go beside it: `Failure`, with the feature `details`.

@@ -25,7 +25,9 @@ MESSAGE_SIZE = 4096
 CHUNK_SIZE = 1024
 OPENING = 2.0
 REPLY_WITHIN = 2.0
-WITHOUT_DATAGRAMS = 8.0
+WITHOUT_DATAGRAMS = 3.0
+PROBE = 4.0
+STREAM_DEAD = 8.0
 KEYS_LIVE, SHORTEST_HANDSHAKE_LIFE, RENEWAL_WITHIN = 12 * 3600.0, 0.5, 60.0
 REFUSED_VERSION, REFUSED_FLEET, REFUSED_MANAGER, REFUSED_DUPLICATE, REFUSED_ROLE = 1, 2, 3, 5, 6
 REFUSED_MALFORMED, REFUSED_MODE, REFUSED_SUITE, REFUSED_FENCED = 8, 9, 11, 12
@@ -139,6 +141,7 @@ class Unit:
 
     def open_link(self, tcp, dialed):
         self.tcp, self.dialed, self.peer, self.end = tcp, dialed, None, None
+        self.sent = self.received = 0
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.opened = time.monotonic()
         longest = MESSAGE_SIZE + wire.LONGEST_HEADER
@@ -253,6 +256,7 @@ class Unit:
             raise Ended(error) from None
         if not data:
             raise Ended("the connection was closed without a close frame")
+        self.received += len(data)
         return data
 
     def write(self, frames):
@@ -260,7 +264,9 @@ class Unit:
             sealed = self.end is not None and self.end.sending is not None
             # A peer that has gone may have said why: the reader hears it.
             with contextlib.suppress(ConnectionError):
-                self.tcp.sendall(self.end.seal_frame(frame) if sealed else frame)
+                data = self.end.seal_frame(frame) if sealed else frame
+                self.sent += len(data)
+                self.tcp.sendall(data)
 
     def send_frame(self, name, payload=b""):
         self.write([wire.encode_frame(name, payload)])
@@ -303,8 +309,9 @@ class Unit:
         self.lease, self.renewals, self.newest_order = None, 0, 0
         self.theirs, self.not_kept = {}, 0
         self.waiting, self.held = {}, {}
-        self.datagrams_pass, self.missed, self.next_question = False, 0, 0
-        self.heard = self.next_keep_alive = time.monotonic()
+        self.hears, self.is_heard, self.missed, self.no_datagram, self.next_question = False, False, 0, 0, 0
+        self.heard = self.heard_datagram = self.next_keep_alive = self.next_probe = time.monotonic()
+        self.sent_before, self.arrived, self.stuck_since, self.stale = 0, 0, None, 0
         self.rest()
         self.readers = {self.tcp: lambda: self.stream(self.read()), self.udp: self.datagram}
         say("joined", self.peer["identity"]["name"], "in plain mode" if self.end is None else "secured")
@@ -358,20 +365,45 @@ class Unit:
         pause, before = self.pause(), self.missed
         # One more at a time, so that a process that was held up does not end the link by itself.
         self.missed = max(0, min(before + 1, int((now - self.heard) / pause - 0.5)))
-        if self.missed >= 3 and (self.datagrams_pass or self.missed * pause >= WITHOUT_DATAGRAMS):
+        if self.missed >= 3 and (self.hears or self.missed * pause >= WITHOUT_DATAGRAMS):
             self.close(3, "silence")
-        if self.datagrams_pass and self.missed > 0 and now >= self.next_question:
+        none_before = self.no_datagram
+        self.no_datagram = max(0, min(none_before + 1, int((now - self.heard_datagram) / pause - 0.5)))
+        if self.hears and self.no_datagram >= 3:
+            say("datagrams do not pass")
+            self.hears, self.next_keep_alive = False, now
+        if self.hears and self.no_datagram > 0 and now >= self.next_question:
             self.send_datagram({"ping": {}})
             self.next_question = now + pause / 4
-        if self.datagrams_pass and self.missed > before:
+        silent = self.missed > before or self.hears and self.no_datagram > none_before
+        if now >= self.next_probe:
+            silent, self.sent_before = silent or self.sent == self.sent_before, self.sent
+            self.next_probe = now + PROBE
+        if silent:
             self.send_frame("ping")
 
+    def report(self):
+        return {"received": self.received & 0xFFFFFFFF, "hears": self.hears, "holds": False}
+
+    def reported(self, report):
+        """What the peer tells of the stream and the datagrams of this unit."""
+        now, stands = time.monotonic(), report["received"] == self.arrived
+        self.is_heard, self.arrived = report["hears"], report["received"]
+        missing = (self.sent - report["received"]) & 0xFFFFFFFF
+        if not stands or report["holds"] or missing == 0 or self.stuck_since is None:
+            self.stuck_since, self.stale = now if missing else None, 0
+            return
+        self.stale += 1
+        if self.stale >= 3 and now >= self.stuck_since + STREAM_DEAD:
+            code = 14 if missing > 536 else 13
+            self.send_datagram({"close": {"code": code}})
+            self.close(code, "the stream is dead")
+
     def keep_alive(self):
-        body = {"keep_alive": {"stamp": clock()}}
+        body = {"keep_alive": {"stamp": clock(), **self.report()}}
         self.send_datagram(body)
-        if not self.datagrams_pass:
+        if not self.hears or not self.is_heard:
             self.send_frame("session", wire.encode_session_body(body))
-            self.send_frame("ping")
 
     def stream(self, data):
         with self.reading():
@@ -413,15 +445,18 @@ class Unit:
 
     def datagram(self):
         data, source = self.udp.recvfrom(2048)
-        if source[0] != self.tcp.getpeername()[0]:
+        # Under a seal the session's nonce tells whose it is: a host may have several addresses.
+        if self.end is None and source[0] != self.tcp.getpeername()[0]:
             return
         try:
             body = self.session_of(data)
         except wire.Malformed:
             return
-        if not self.datagrams_pass:
+        if not self.hears:
             say("datagrams pass")
-        self.datagrams_pass, self.heard = True, time.monotonic()
+            self.next_keep_alive = 0
+        self.hears, self.heard = True, time.monotonic()
+        self.heard_datagram = self.heard
         self.session_body(body, self.send_datagram)
 
     def session_of(self, data):
@@ -438,8 +473,13 @@ class Unit:
         (kind, value), = body.items()
         if kind == "keep_alive":
             self.hear_stamp(value["stamp"])
+            self.reported(value)
         elif kind == "ping":
-            self.send_datagram({"pong": {}})
+            self.send_datagram({"pong": self.report()})
+        elif kind == "pong":
+            self.reported(value)
+        elif kind == "close" and answer == self.send_datagram and value["code"] in (13, 14):
+            raise Ended("close %d" % value["code"], by_peer=True)
         elif kind == "renew":
             self.renewed(value)
             answer({"renewed": {"call": value["call"]}})

@@ -797,7 +797,7 @@ def decode_session_body(data):
     kind = reader.u8()
     if kind == 1:
         stamp, = reader.fixed("Q")
-        body = {"keep_alive": {"stamp": stamp}}
+        body = {"keep_alive": {"stamp": stamp, **decode_report(reader)}}
     elif kind == 2:
         priority, call, stamp, since, age = reader.fixed("BIQII")
         require(priority < len(PRIORITIES))
@@ -816,8 +816,12 @@ def decode_session_body(data):
     elif kind == 7:
         slot, call = reader.fixed("HI")
         body = {"release_all": {"slot": slot, "call": call}}
-    elif kind in (4, 5):
-        body = {"ping" if kind == 4 else "pong": {}}
+    elif kind == 4:
+        body = {"ping": {}}
+    elif kind == 5:
+        body = {"pong": decode_report(reader)}
+    elif kind == 10:
+        body = {"close": {"code": reader.u8()}}
     else:
         require(kind == 3)
         priority = reader.u8()
@@ -826,12 +830,25 @@ def decode_session_body(data):
     return body
 
 
+def decode_report(reader):
+    received, flags = reader.fixed("IB")
+    return {"received": received, "hears": bool(flags & 1), "holds": bool(flags & 2)}
+
+
+def encode_report(value):
+    return struct.pack("<IB", value["received"], value["hears"] | value["holds"] << 1)
+
+
 def encode_session_body(body):
     (name, value), = body.items()
     if name == "keep_alive":
-        return struct.pack("<BQ", 1, value["stamp"])
-    if name in ("ping", "pong"):
-        return bytes([4 if name == "ping" else 5])
+        return struct.pack("<BQ", 1, value["stamp"]) + encode_report(value)
+    if name == "ping":
+        return bytes([4])
+    if name == "pong":
+        return bytes([5]) + encode_report(value)
+    if name == "close":
+        return bytes([10, value["code"]])
     if name == "renew":
         numbers = value["call"], value["stamp"], value["since"], value["age"]
         return struct.pack("<BBIQII", 2, PRIORITIES.index(value["class"]), *numbers)

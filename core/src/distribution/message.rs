@@ -11,6 +11,7 @@ use super::block::Put;
 use super::function_list::{Generation, Slot};
 use crate::config::{LATER, Priority};
 use crate::error::{Error, ServiceError};
+use crate::host::connections::Report;
 use crate::host::frame::ChunkWriter;
 use crate::time::Duration;
 
@@ -428,10 +429,12 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
 /// What travels in a session's datagrams, or in the stream as a session frame.
 #[derive(Debug, PartialEq, Eq)]
 pub enum SessionBody<'b> {
-    /// The sender is alive; its clock in microseconds.
+    /// The sender is alive.
     KeepAlive {
-        /// The sender's clock.
+        /// The sender's clock in microseconds.
         stamp: u64,
+        /// What comes of the peer.
+        report: Report,
     },
     /// The caller still wants what a leased call started. To be answered at once, on the way that it came.
     Renew(Renewal),
@@ -448,8 +451,10 @@ pub enum SessionBody<'b> {
     Message(u8, &'b [u8]),
     /// To be answered at once, in a datagram.
     Ping,
-    /// The answer.
-    Pong,
+    /// The answer, with what comes of the peer.
+    Pong(Report),
+    /// The sender ends the link, whose stream is dead: a close code. In a datagram only.
+    Close(u8),
 }
 
 /// A renewal of a leased call; its age is bounded like a request's.
@@ -496,13 +501,21 @@ const RELEASE_ALL: u8 = 7;
 const RENEWED: u8 = 8;
 #[cfg(feature = "details")]
 const CANCEL: u8 = 9;
+const CLOSE: u8 = 10;
+
+/// Flags of a report.
+const HEARS: u8 = 1;
+const HOLDS: u8 = 2;
 
 impl<'b> SessionBody<'b> {
     /// Reads a session body. All but a message may be longer than this version knows; `None` for what it does not know.
     pub fn decode(bytes: &'b [u8]) -> Option<Self> {
         let (&kind, rest) = bytes.split_first()?;
         match kind {
-            KEEP_ALIVE => Some(Self::KeepAlive { stamp: u64::from_le_bytes(*rest.first_chunk()?) }),
+            KEEP_ALIVE => {
+                let (stamp, rest) = rest.split_first_chunk()?;
+                Some(Self::KeepAlive { stamp: u64::from_le_bytes(*stamp), report: report_of(rest)? })
+            }
             RENEW => {
                 let (&class, rest) = rest.split_first()?;
                 let (call, rest) = rest.split_first_chunk()?;
@@ -529,15 +542,17 @@ impl<'b> SessionBody<'b> {
                 Some(Self::Message(priority, message))
             }
             PING => Some(Self::Ping),
-            PONG => Some(Self::Pong),
+            PONG => Some(Self::Pong(report_of(rest)?)),
+            CLOSE => rest.first().map(|code| Self::Close(*code)),
             _ => None,
         }
     }
 
     /// A keep-alive's bytes.
-    pub fn keep_alive(stamp: u64) -> [u8; 9] {
+    pub fn keep_alive(stamp: u64, report: Report) -> [u8; 14] {
         let [a, b, c, d, e, f, g, h] = stamp.to_le_bytes();
-        [KEEP_ALIVE, a, b, c, d, e, f, g, h]
+        let [_, r0, r1, r2, r3, flags] = Self::pong(report);
+        [KEEP_ALIVE, a, b, c, d, e, f, g, h, r0, r1, r2, r3, flags]
     }
 
     /// A renewal's bytes.
@@ -577,13 +592,30 @@ impl<'b> SessionBody<'b> {
 
     /// A ping's byte.
     pub const PING: [u8; 1] = [PING];
-    /// A pong's byte.
-    pub const PONG: [u8; 1] = [PONG];
+
+    /// A pong's bytes.
+    pub fn pong(report: Report) -> [u8; 6] {
+        let [r0, r1, r2, r3] = report.received.to_le_bytes();
+        let flags = if report.hears { HEARS } else { 0 } | if report.holds { HOLDS } else { 0 };
+        [PONG, r0, r1, r2, r3, flags]
+    }
+
+    /// The bytes that end a link with this close code.
+    pub const fn close(code: u8) -> [u8; 2] {
+        [CLOSE, code]
+    }
 
     /// The two bytes before a message.
     pub const fn message_prefix(priority: u8) -> [u8; 2] {
         [MESSAGE, priority]
     }
+}
+
+fn report_of(bytes: &[u8]) -> Option<Report> {
+    let (received, rest) = bytes.split_first_chunk()?;
+    let flags = rest.first()?;
+    let is_set = |flag: u8| flags & flag != 0;
+    Some(Report { received: u32::from_le_bytes(*received), hears: is_set(HEARS), holds: is_set(HOLDS) })
 }
 
 #[cfg(test)]
@@ -596,6 +628,7 @@ mod tests {
     use proptest::prelude::*;
 
     const MS: Duration = Duration::from_millis(1);
+    const REPORT: Report = Report { received: 0x0102_0304, hears: true, holds: false };
 
     fn headers() -> impl Strategy<Value = RequestHeader> {
         let numbers = (any::<u32>(), any::<u16>(), any::<u16>(), any::<u32>(), any::<u64>(), any::<u32>());
@@ -741,10 +774,11 @@ mod tests {
         let longer = |bytes: &[u8]| format!("{:?}", SessionBody::decode(&[bytes, &[0xEE; 5]].concat()));
         let exact = |bytes: &[u8]| format!("{:?}", SessionBody::decode(bytes));
         let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4), age: MS };
-        let bodies: [&[u8]; 7] = [
+        let bodies: [&[u8]; 8] = [
             &SessionBody::PING,
-            &SessionBody::PONG,
-            &SessionBody::keep_alive(9),
+            &SessionBody::pong(REPORT),
+            &SessionBody::keep_alive(9, REPORT),
+            &SessionBody::close(13),
             &SessionBody::renewal(&renewal),
             &SessionBody::renewed(9),
             &SessionBody::release(&Release { call: 5, class: Priority::High }),
@@ -759,8 +793,10 @@ mod tests {
     #[test]
     fn session_bodies_survive() {
         assert_eq!(SessionBody::decode(&SessionBody::PING), Some(SessionBody::Ping));
-        assert_eq!(SessionBody::decode(&SessionBody::PONG), Some(SessionBody::Pong));
-        assert_eq!(SessionBody::decode(&SessionBody::keep_alive(9)), Some(SessionBody::KeepAlive { stamp: 9 }));
+        assert_eq!(SessionBody::decode(&SessionBody::pong(REPORT)), Some(SessionBody::Pong(REPORT)));
+        assert_eq!(SessionBody::decode(&SessionBody::close(13)), Some(SessionBody::Close(13)));
+        let keep_alive = SessionBody::KeepAlive { stamp: 9, report: REPORT };
+        assert_eq!(SessionBody::decode(&SessionBody::keep_alive(9, REPORT)), Some(keep_alive));
         let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4), age: MS };
         assert_eq!(SessionBody::decode(&SessionBody::renewal(&renewal)), Some(SessionBody::Renew(renewal)));
         assert_eq!(SessionBody::decode(&SessionBody::renewed(7)), Some(SessionBody::Renewed(7)));

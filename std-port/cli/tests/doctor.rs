@@ -408,3 +408,36 @@ fn broadcasts_that_do_not_reach_the_other_host_are_told() {
         clinic.doctor(&["boss"]).is(&["answers"], 0);
     });
 }
+
+/// Addresses as scripts give them: without a broadcast address, or with one that is no other host's, and no route beside that of
+/// the network.
+#[test]
+fn hosts_without_a_broadcast_address_or_with_an_odd_one_hear_each_other() {
+    let name = "hosts_without_a_broadcast_address_or_with_an_odd_one_hear_each_other";
+    namespace::inside(name, &[], || {
+        let clinic = Clinic::on_all_interfaces();
+        let far = Peer::start(&[
+            MANAGER,
+            &clinic.fleet.to_string(),
+            &clinic.port.to_string(),
+            clinic.key_file("boss").to_str().unwrap(),
+        ]);
+        for command in ["link set lo up", "link add v0 type veth peer name v1", "link set v0 up"] {
+            ip(command);
+        }
+        ip(&format!("link set v1 netns {}", far.process()));
+        let there = far.network();
+        there.run("ip link set v1 up").unwrap();
+        for (near, beyond) in [("", ""), ("brd 10.77.0.77", ""), ("", "brd 255.255.255.255"), ("brd +", "brd 0.0.0.0")]
+        {
+            ip("address flush dev v0");
+            ip(&format!("address add 10.77.0.1/24 {near} dev v0"));
+            there.run("ip address flush dev v1").unwrap();
+            there.run(&format!("ip address add 10.77.0.2/24 {beyond} dev v1")).unwrap();
+            if near.is_empty() && beyond.is_empty() {
+                far.go();
+            }
+            clinic.doctor(&["boss"]).is(&["answers"], 0);
+        }
+    });
+}

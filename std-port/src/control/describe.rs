@@ -49,6 +49,7 @@ fn interface(interface: &Interface) -> InterfaceInfo {
         address: interface.address.to_string(),
         broadcast: interface.broadcast.map(|address| address.to_string()),
         up: interface.up,
+        refused: interface.refused.map(|kind| kind.to_string()),
     }
 }
 

@@ -444,6 +444,9 @@ pub struct InterfaceInfo {
     pub broadcast: Option<String>,
     /// Whether it is up and has a carrier.
     pub up: bool,
+    /// Why the system did not take the last broadcast of the unit there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refused: Option<String>,
 }
 
 /// Constraints (paper, section 2). Times in microseconds.

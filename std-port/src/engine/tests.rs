@@ -14,7 +14,7 @@ use cara_core::distribution::identity::Epoch;
 use cara_core::distribution::message::SessionBody;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::host::connections::LinkCounter;
+use cara_core::host::connections::{LinkCounter, Report};
 use cara_core::host::frame::{self, Frame};
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -279,7 +279,7 @@ fn a_session_datagram_does_not_take_the_hubs_lock() {
     let (engine, near, far) = (pair.manager.engine(), pair.near(), pair.far());
     let (to, nonce) = (near.id.0, far.lock().session.hello().unwrap().nonce);
     let header = session_header(Mode::Plain, cara_core::config::VERSIONS.last, engine.fleet, to, nonce);
-    let mut bytes = [&header[..], &SessionBody::keep_alive(0)].concat();
+    let mut bytes = [&header[..], &SessionBody::keep_alive(0, Report::default())].concat();
     let from = near.lock().session.address();
     let received = || near.lock().session.counters().value(LinkCounter::DatagramsReceived);
     std::thread::scope(|scope| {

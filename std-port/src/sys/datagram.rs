@@ -3,6 +3,7 @@
 //! Everything is sent from the own socket and answered to it. The shared socket only hears broadcasts; of unicast
 //! datagrams to its port the kernel gives each to one unit alone.
 
+use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -111,31 +112,44 @@ impl Datagrams {
 
     /// Sends one datagram to one address. `false` when the network refused it or has no room.
     pub fn send_to(&self, to: SocketAddr, datagram: &[u8]) -> bool {
-        match send_datagram(&self.own, to, datagram) {
-            Ok(()) => true,
-            Err(errno) => {
-                tracing::debug!(%errno, %to, "a datagram could not be sent");
-                false
-            }
+        self.try_send_to(to, datagram).is_ok()
+    }
+
+    fn try_send_to(&self, to: SocketAddr, datagram: &[u8]) -> rustix::io::Result<()> {
+        let sent = send_datagram(&self.own, to, datagram);
+        if let Err(errno) = sent {
+            tracing::debug!(%errno, %to, "a datagram could not be sent");
         }
+        sent
     }
 
     /// Sends one datagram to the discovery port of all nodes on each interface. `false` when no interface took it.
     pub fn broadcast(&self, datagram: &[u8]) -> bool {
         let mut sent = false;
-        for target in
-            self.targets().iter().filter(|interface| interface.is_usable()).filter_map(|interface| interface.broadcast)
-        {
-            sent |= self.send_to(SocketAddrV4::new(target, self.discovery_port).into(), datagram);
+        for interface in self.targets().iter().filter(|interface| interface.is_usable()) {
+            let Some(target) = interface.broadcast else { continue };
+            let outcome = self.try_send_to(SocketAddrV4::new(target, self.discovery_port).into(), datagram);
+            let refused = outcome.err().map(|errno| io::Error::from(errno).kind());
+            if refused != interface.refused {
+                self.note_refused(interface.address, refused);
+            }
+            sent |= refused.is_none();
         }
         sent
+    }
+
+    fn note_refused(&self, address: Ipv4Addr, refused: Option<io::ErrorKind>) {
+        let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut list = targets.list.to_vec();
+        list.iter_mut().filter(|known| known.address == address).for_each(|known| known.refused = refused);
+        targets.list = list.into();
     }
 
     /// The interfaces that are used, with those that are down.
     pub fn targets(&self) -> Arc<[Interface]> {
         let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
         if targets.asked.elapsed() >= REFRESH {
-            *targets = Targets { list: look(self.interfaces).into(), asked: Instant::now() };
+            targets.look(self.interfaces);
         }
         targets.list.clone()
     }
@@ -143,10 +157,9 @@ impl Datagrams {
     /// Names of the interfaces on which broadcasts can go out, as any unit of the process has seen them half a second ago at
     /// most.
     pub fn usable(&self) -> Vec<String> {
-        let list: Arc<[Interface]> = look(self.interfaces).into();
-        *self.targets.lock().unwrap_or_else(PoisonError::into_inner) =
-            Targets { list: list.clone(), asked: Instant::now() };
-        list.iter().filter(|interface| interface.is_usable()).map(|interface| interface.name.clone()).collect()
+        let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        targets.look(self.interfaces);
+        targets.list.iter().filter(|interface| interface.is_usable()).map(|interface| interface.name.clone()).collect()
     }
 
     /// Whether nodes that this unit may look for can be reached on the interfaces of these names.
@@ -167,6 +180,18 @@ impl Datagrams {
     }
 }
 
+impl Targets {
+    /// Asks the system; what became of the last broadcast stays with its address.
+    fn look(&mut self, interfaces: Interfaces) {
+        let mut list = look(interfaces);
+        for interface in &mut list {
+            let known = self.list.iter().find(|known| known.address == interface.address);
+            interface.refused = known.and_then(|known| known.refused);
+        }
+        *self = Self { list: list.into(), asked: Instant::now() };
+    }
+}
+
 /// A list of interfaces serves all units of the process for so long: a thousand that start together ask the system once.
 const SHARED: Duration = Duration::from_millis(500);
 
@@ -183,7 +208,7 @@ fn look(wanted: Interfaces) -> Vec<Interface> {
     }
 }
 
-fn all_interfaces() -> std::io::Result<Arc<[Interface]>> {
+fn all_interfaces() -> io::Result<Arc<[Interface]>> {
     let mut seen = SEEN.lock().unwrap_or_else(PoisonError::into_inner);
     match &*seen {
         Some((at, all)) if at.elapsed() < SHARED => Ok(all.clone()),

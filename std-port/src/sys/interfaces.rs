@@ -55,6 +55,8 @@ pub struct Interface {
     pub broadcast: Option<Ipv4Addr>,
     /// Whether the interface is up and has a carrier.
     pub up: bool,
+    /// Why the system did not take the last broadcast here.
+    pub refused: Option<io::ErrorKind>,
 }
 
 impl Interface {
@@ -73,18 +75,16 @@ pub fn interfaces() -> io::Result<Vec<Interface>> {
 fn interface(found: if_addrs::Interface) -> Option<Interface> {
     let up = found.is_oper_up();
     let if_addrs::IfAddr::V4(v4) = found.addr else { return None };
-    let broadcast = match (v4.ip.is_loopback(), found.is_p2p) {
-        // The system gives none for loopback, yet it carries them.
-        (true, _) => Some(directed_broadcast(v4.ip, v4.netmask)),
-        (_, true) => None,
-        _ if v4.prefixlen >= 31 => None,
-        _ => Some(v4.broadcast.unwrap_or_else(|| directed_broadcast(v4.ip, v4.netmask))),
-    };
-    Some(Interface { name: found.name, address: v4.ip, broadcast, up })
+    // The system's own value is not used: without one, getifaddrs shows the interface's address in its place, and scripts
+    // set any other. Each kernel takes the address with all host bits set as a broadcast.
+    let broadcast = directed_broadcast(v4.ip, v4.netmask).filter(|_| v4.ip.is_loopback() || !found.is_p2p);
+    Some(Interface { name: found.name, address: v4.ip, broadcast, up, refused: None })
 }
 
-fn directed_broadcast(address: Ipv4Addr, netmask: Ipv4Addr) -> Ipv4Addr {
-    Ipv4Addr::from_bits(address.to_bits() | !netmask.to_bits())
+/// The address with all host bits set; `None` for a network of one or two addresses, which has none.
+fn directed_broadcast(address: Ipv4Addr, netmask: Ipv4Addr) -> Option<Ipv4Addr> {
+    let host = !netmask.to_bits();
+    (host > 1).then(|| Ipv4Addr::from_bits(address.to_bits() | host))
 }
 
 #[cfg(test)]
@@ -101,9 +101,29 @@ mod tests {
 
     #[test]
     fn the_broadcast_address_has_all_host_bits_set() {
-        let broadcast = |address: [u8; 4], mask: [u8; 4]| directed_broadcast(address.into(), mask.into()).octets();
-        assert_eq!(broadcast([192, 168, 3, 7], [255, 255, 255, 0]), [192, 168, 3, 255]);
-        assert_eq!(broadcast([10, 1, 2, 3], [255, 255, 240, 0]), [10, 1, 15, 255]);
+        let broadcast = |address: [u8; 4], mask: [u8; 4]| directed_broadcast(address.into(), mask.into());
+        assert_eq!(broadcast([192, 168, 3, 7], [255, 255, 255, 0]), Some([192, 168, 3, 255].into()));
+        assert_eq!(broadcast([10, 1, 2, 3], [255, 255, 240, 0]), Some([10, 1, 15, 255].into()));
+        assert_eq!(broadcast([10, 1, 2, 1], [255, 255, 255, 252]), Some([10, 1, 2, 3].into()));
+        assert_eq!(broadcast([10, 1, 2, 1], [255, 255, 255, 254]), None);
+        assert_eq!(broadcast([10, 1, 2, 1], [255, 255, 255, 255]), None);
+    }
+
+    /// As after `ip address add ADDRESS/24 dev NAME`, and with a value that nobody else has.
+    #[test]
+    fn what_the_system_says_of_broadcasts_is_not_believed() {
+        for said in [None, Some([10, 91, 3, 1].into()), Some([10, 91, 3, 77].into()), Some([255; 4].into())] {
+            let [address, netmask] = [[10, 91, 3, 1], [255, 255, 255, 0]].map(Ipv4Addr::from);
+            let v4 = if_addrs::Ifv4Addr { ip: address, netmask, prefixlen: 24, broadcast: said };
+            let found = if_addrs::Interface {
+                name: "v0".into(),
+                addr: if_addrs::IfAddr::V4(v4),
+                index: None,
+                oper_status: if_addrs::IfOperStatus::Up,
+                is_p2p: false,
+            };
+            assert_eq!(interface(found).unwrap().broadcast, Some([10, 91, 3, 255].into()), "{said:?}");
+        }
     }
 
     #[test]

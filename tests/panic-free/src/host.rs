@@ -94,8 +94,9 @@ entry!(link_counters, {
 entry!(liveness, {
     let mut liveness = Liveness::new(*unknown(), *unknown());
     liveness.heard(*unknown());
-    liveness.heard_datagram(*unknown());
-    keep((liveness.datagrams_pass(), liveness.deadline(), liveness.poll(*unknown())));
+    keep((liveness.heard_datagram(*unknown()), liveness.reported(*unknown(), *unknown(), *unknown())));
+    keep((liveness.hears(), liveness.is_heard(), liveness.is_deaf(), liveness.stream_silent_for(*unknown())));
+    keep((liveness.deadline(), liveness.poll(*unknown(), *unknown())));
 });
 
 fn any_endpoint<E: Endpoint>(endpoint: &E) {

@@ -24,7 +24,8 @@ entry!(messages_written, {
     keep(unknown::<RequestHeader>().encode());
     keep((message::encode_reply(*unknown(), *unknown()), message::encode_failure(*unknown(), *unknown())));
     keep(unknown::<Control<'static>>().encode(unknown_slice()));
-    keep((SessionBody::keep_alive(*unknown()), SessionBody::renewal(unknown())));
+    keep((SessionBody::keep_alive(*unknown(), *unknown()), SessionBody::renewal(unknown())));
+    keep((SessionBody::pong(*unknown()), SessionBody::close(*unknown())));
     keep((SessionBody::release(unknown()), SessionBody::release_all(*unknown(), *unknown())));
     keep(SessionBody::renewed(*unknown()));
     keep(unknown::<SampleHeader>().encode());

@@ -138,6 +138,8 @@ entry!(session_asked, {
         session.is_acknowledged(*unknown()),
     ));
     keep((session.constraints(), session.silent_for(*unknown()), session.bytes_queued()));
+    keep((session.stream_silent_for(*unknown()), session.hears_datagrams(), session.is_heard()));
+    session.hold_back();
 });
 
 entry!(session_details, {

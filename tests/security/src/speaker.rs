@@ -12,6 +12,7 @@ use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::message::{Message, RequestHeader, SessionBody};
+use cara_core::host::connections::Report;
 use cara_core::host::frame::{self, Frame};
 use cara_core::host::secure::{Seal, Secure};
 use cara_secure::keys::PairKey;
@@ -157,7 +158,7 @@ impl Speaker {
             (_, 4) => stream(self.request(0, Priority::High, true)),
             (_, 5) => stream(self.sealed(&[4])),
             (_, 6) => Ok(Some(self.request_in_datagram(0))),
-            (_, 7) => stream(self.sealed(&[&[6][..], &SessionBody::keep_alive(7)].concat())),
+            (_, 7) => stream(self.sealed(&[&[6][..], &SessionBody::keep_alive(7, Report::default())].concat())),
             _ => Ok(None),
         }
     }

@@ -80,7 +80,7 @@ fn answer((name, about, link, given, wait, expected): Case<Given>) -> Answer {
 }
 
 fn stream_bytes(side: &mut Side) -> Vec<u8> {
-    let keep_alive = |bytes: &[u8]| bytes.starts_with(&[10, 0, 6, 1]);
+    let keep_alive = |bytes: &[u8]| bytes.starts_with(&[15, 0, 6, 1]);
     let pieces = side.written().into_iter().filter_map(|piece| match piece {
         Written::Stream(bytes) if !keep_alive(&bytes) => Some(bytes),
         _ => None,

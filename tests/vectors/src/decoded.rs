@@ -12,6 +12,7 @@ use cara_core::distribution::message::{
 };
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
+use cara_core::host::connections::Report;
 use cara_core::host::secure::Plain;
 use cara_core::services::lease::{LastOrder, Latch, LeaseEnd};
 use serde_json::{Value, json};
@@ -272,9 +273,14 @@ fn variable(value: Variable<'_>) -> Value {
 
 pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
     Some(match SessionBody::decode(bytes)? {
-        SessionBody::KeepAlive { stamp } => json!({ "keep_alive": { "stamp": stamp } }),
+        SessionBody::KeepAlive { stamp, report: Report { received, hears, holds } } => json!({ "keep_alive": {
+            "stamp": stamp, "received": received, "hears": hears, "holds": holds,
+        }}),
         SessionBody::Ping => json!({ "ping": {} }),
-        SessionBody::Pong => json!({ "pong": {} }),
+        SessionBody::Pong(Report { received, hears, holds }) => {
+            json!({ "pong": { "received": received, "hears": hears, "holds": holds } })
+        }
+        SessionBody::Close(code) => json!({ "close": { "code": code } }),
         SessionBody::Renew(renewal) => json!({ "renew": {
             "class": renewal.class.word(),
             "call": renewal.call,

@@ -6,6 +6,7 @@ use cara_core::distribution::datagram::{Announce, WhoHas, session_header, short_
 use cara_core::distribution::hello::{ClaimReport, Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::message::SessionBody;
+use cara_core::host::connections::Report;
 use cara_core::host::secure::Plain;
 use serde_json::{Value, json};
 
@@ -223,7 +224,9 @@ fn datagrams() -> Vec<Vector> {
     let of_claim = of_claim.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let answer = answer.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let header = session_header(Mode::Plain, VERSIONS.last, Fleet(7), 300, 0xA1A2_A3A4_A5A6_A7A8);
-    let session = [&header[..], &SessionBody::keep_alive(1_000_000)].concat();
+    let session =
+        [&header[..], &SessionBody::keep_alive(1_000_000, Report { received: 300, hears: true, holds: false })]
+            .concat();
     let with = |bytes: &[u8], kind| [bytes, &item(kind, b"later")].concat();
     let of_versions = |bytes: &[u8], first, last| {
         let mut bytes = bytes.to_vec();
@@ -293,7 +296,7 @@ fn datagrams() -> Vec<Vector> {
             7,
             &session,
             &json!({ "session": {
-                "link": 300, "nonce": 0xA1A2_A3A4_A5A6_A7A8_u64, "body": { "keep_alive": { "stamp": 1_000_000 } },
+                "link": 300, "nonce": 0xA1A2_A3A4_A5A6_A7A8_u64, "body": { "keep_alive": { "stamp": 1_000_000, "received": 300, "hears": true, "holds": false } },
             }}),
         ),
         datagram(("other_fleet", "another fleet is told as such"), 8, &answer, &json!({ "other_fleet": 7 })).lossy(),

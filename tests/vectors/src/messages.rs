@@ -8,6 +8,7 @@ use cara_core::distribution::message::{
     SubscriptionRefusal, encode_failure, encode_progress, encode_reply,
 };
 use cara_core::error::{Error, ServiceError};
+use cara_core::host::connections::Report;
 use cara_core::time::Duration;
 use serde_json::{Value, json};
 
@@ -406,17 +407,28 @@ fn session_bodies() -> Vec<Vector> {
         age: Duration::from_micros(100_000),
     };
     let release = Release { call: 0x0102_0304, class: Priority::Low };
+    let report = Report { received: 0x0A0B_0C0D, hears: true, holds: false };
     let emergency = [&SessionBody::message_prefix(0)[..], &request(false, &[])].concat();
     let body =
         |names, bytes: &[u8], value: &Value| Vector::new(names, Kind::SessionBody, Context::default(), bytes, value);
     vec![
         body(
-            ("keep_alive", "the sender's clock"),
-            &SessionBody::keep_alive(0x0001_0203_0405_0607),
-            &json!({ "keep_alive": { "stamp": 0x0001_0203_0405_0607_u64 } }),
+            (
+                "keep_alive",
+                "the sender's clock, and what comes of the receiver: bytes of the stream, and its datagrams",
+            ),
+            &SessionBody::keep_alive(0x0001_0203_0405_0607, report),
+            &json!({ "keep_alive": {
+                "stamp": 0x0001_0203_0405_0607_u64, "received": 0x0A0B_0C0D, "hears": true, "holds": false,
+            }}),
         ),
         body(("ping", "to be answered at once, in a datagram"), &SessionBody::PING, &json!({ "ping": {} })),
-        body(("pong", "the answer"), &SessionBody::PONG, &json!({ "pong": {} })),
+        body(
+            ("pong", "the answer, of a unit that does not read more of the stream for now"),
+            &SessionBody::pong(Report { hears: false, holds: true, ..report }),
+            &json!({ "pong": { "received": 0x0A0B_0C0D, "hears": false, "holds": true } }),
+        ),
+        body(("close", "the stream is dead"), &SessionBody::close(13), &json!({ "close": { "code": 13 } })),
         body(
             ("renew", "the caller still wants what a leased call started"),
             &SessionBody::renewal(&renewal),
@@ -452,7 +464,7 @@ fn session_bodies() -> Vec<Vector> {
             &json!({ "release": { "class": "low", "call": 0x0102_0304 } }),
         )
         .lossy(),
-        body(("session_body_unknown", "refused: there is no kind 10"), &[10, 9], &Value::Null),
+        body(("session_body_unknown", "refused: there is no kind 11"), &[11, 9], &Value::Null),
         body(
             ("session_message", "an emergency's second copy"),
             &emergency,

@@ -2,6 +2,7 @@
 
 use cara_core::config::Priority;
 use cara_core::distribution::message::{SessionBody, encode_reply};
+use cara_core::host::connections::Report;
 use cara_core::host::frame::{ChunkWriter, Chunking, Frame, encode};
 use serde_json::{Value, json};
 
@@ -46,7 +47,7 @@ fn stream(names: (&'static str, &'static str), limits: (usize, usize), bytes: &[
 }
 
 fn small_frames() -> Vec<Vector> {
-    let keep_alive = SessionBody::keep_alive(1_000_000);
+    let keep_alive = SessionBody::keep_alive(1_000_000, Report { received: 300, hears: false, holds: true });
     let frames = [
         frame(&Frame::Ping),
         frame(&Frame::Pong),
@@ -54,7 +55,7 @@ fn small_frames() -> Vec<Vector> {
         frame(&Frame::Refuse(4)),
         frame(&Frame::Close(1)),
     ];
-    let value = json!(["ping", "pong", { "session": { "keep_alive": { "stamp": 1_000_000 } } }, { "refuse": 4 }, { "close": 1 }]);
+    let value = json!(["ping", "pong", { "session": { "keep_alive": { "stamp": 1_000_000, "received": 300, "hears": false, "holds": true } } }, { "refuse": 4 }, { "close": 1 }]);
     vec![
         stream(
             ("frames", "one after the other: ping, pong, session, refuse, close"),

@@ -103,6 +103,16 @@ impl Talk {
                 ("talk_keep_alive_manager_stream", "which it sent before the other's datagram came"),
             ],
         );
+        self.agv.poll();
+        self.pass(
+            From::Agv,
+            &[
+                ("talk_hears_agv", "the manager's datagram has come, so it tells that at once"),
+                ("talk_hears_agv_stream", "and in the stream, since it was not told yet that its own come"),
+            ],
+        );
+        self.manager.poll();
+        self.pass(From::Manager, &[("talk_hears_manager", "so does the manager, in a datagram alone: its own come")]);
         self.agv.publish(&[0, 1, 2]);
         self.pass(From::Agv, &[("talk_publish", "the s_unit publishes its functions, and ends the list")]);
         self.pass(From::Manager, &[("talk_list_ack", "the manager has read them")]);

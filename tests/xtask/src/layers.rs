@@ -32,7 +32,7 @@ struct Purpose {
 }
 
 /// A layer talks to its neighbour. These are the exceptions of services; everything else of host goes through distribution.
-const HOST_FOR_SERVICES: [Purpose; 19] = [
+const HOST_FOR_SERVICES: [Purpose; 20] = [
     Purpose {
         what: "the cipher's trait, over which all of a session is generic",
         places: &["services"],
@@ -63,6 +63,11 @@ const HOST_FOR_SERVICES: [Purpose; 19] = [
         what: "whether the peer is still there decides how long a session lasts",
         places: &["services/session/mod.rs", "services/session/proving.rs"],
         items: &["connections::Liveness"],
+    },
+    Purpose {
+        what: "what each end tells of the other one's stream and datagrams",
+        places: &["services/session/timing.rs"],
+        items: &["connections::Report"],
     },
     Purpose {
         what: "where the details of a failure and progress lie, and their frames",

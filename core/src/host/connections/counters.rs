@@ -43,6 +43,10 @@ crate::counters::counters! {
         KeysMissing,
         /// Keep-alives that did not come in time.
         KeepAlivesMissed,
+        /// Times that no session datagram came for three keep-alives, so that the link does without them.
+        DatagramsMissing,
+        /// Links ended because their stream was dead while the peer was heard.
+        StreamsDied,
         /// Requests sent.
         RequestsSent,
         /// Requests received.

@@ -1,27 +1,45 @@
-//! Whether the peer is still there.
+//! Whether the peer is still there, and by which ways: the stream and its datagrams each have signs of life of their own.
 
-use crate::config::{LONGEST_KEEP_ALIVE, MISSED_KEEP_ALIVES, SHORTEST_KEEP_ALIVE, TCP_ONLY_LOSS};
+use super::delivery::{Delivery, Report, is_long};
+use crate::config::{LONGEST_KEEP_ALIVE, MISSED_KEEP_ALIVES, SHORTEST_KEEP_ALIVE, STREAM_ONLY_LOSS};
 use crate::time::{Duration, Instant};
 
 /// Pings per period while a keep-alive is missing. With 10 % loss, a live peer answers none of the eight pings before
 /// the link is given up once in 600,000 times.
 const QUESTIONS_PER_PERIOD: u64 = 4;
 
-/// Whether the peer is still there: any frame renews it, and each keep-alive period without one is counted.
+/// Whether the peer is still there: any frame or datagram renews it, and each keep-alive period without one is counted.
 ///
-/// A peer that has missed a keep-alive is pinged repeatedly until a frame of it arrives: a live peer is heard despite
+/// A peer that has missed a keep-alive is pinged repeatedly until something of it arrives: a live peer is heard despite
 /// lost frames, and a dead one is detected no later. While keep-alives arrive, no pings are sent.
+///
+/// Datagrams may not pass at all: after three keep-alives without one the link does without them. Of the stream the peer tells
+/// how much of it arrives ([`Report`]).
 ///
 /// At most one keep-alive counts as missed per poll, so that a suspended host or a jumped clock ends nothing by itself.
 #[derive(Debug)]
 pub struct Liveness {
     period: Duration,
-    next_check: Instant,
+    /// Of both ways together.
+    silence: Silence,
+    datagrams: Silence,
     /// When to ask again.
     next_question: Instant,
+    /// The earliest of what is due, but for the end of `silence`, which each frame moves.
+    due: Instant,
+    /// Session datagrams of the peer arrive.
+    hears: bool,
+    /// Those of this unit arrive there.
+    is_heard: bool,
+    stream_heard: Instant,
+    delivery: Delivery,
+}
+
+/// Since when nothing has come on a way.
+#[derive(Debug)]
+struct Silence {
+    next_check: Instant,
     missed: u8,
-    /// Session datagrams of the peer arrive: their absence is the faster signal.
-    datagrams_pass: bool,
 }
 
 /// What is to be done about the peer.
@@ -31,8 +49,28 @@ pub struct Look {
     pub missed: bool,
     /// Ask for a sign of life, in a datagram.
     pub ask: bool,
+    /// Write something into the stream that is answered there.
+    pub probe: bool,
+    /// The peer's datagrams are found not to pass.
+    pub deaf: bool,
     /// The peer is lost.
     pub lost: bool,
+}
+
+impl Silence {
+    fn new(now: Instant, period: Duration) -> Self {
+        Self { next_check: now + period + period.divided_by(2), missed: 0 }
+    }
+
+    /// Counts one missed keep-alive if the time for it has come.
+    fn poll(&mut self, now: Instant, period: Duration) -> bool {
+        let missed = now >= self.next_check;
+        if missed {
+            self.missed = self.missed.saturating_add(1);
+            self.next_check = now + period;
+        }
+        missed
+    }
 }
 
 impl Liveness {
@@ -40,61 +78,111 @@ impl Liveness {
     /// that advertises 2^32-1 ms is lost 210 s after it vanished, not never.
     pub fn new(now: Instant, period: Duration) -> Self {
         let period = period.clamp(SHORTEST_KEEP_ALIVE, LONGEST_KEEP_ALIVE);
-        let next_check = now + period + period.divided_by(2);
-        Self { period, next_check, next_question: Instant::FAR_FUTURE, missed: 0, datagrams_pass: false }
+        let mut liveness = Self {
+            period,
+            silence: Silence::new(now, period),
+            datagrams: Silence::new(now, period),
+            next_question: Instant::FAR_FUTURE,
+            due: now,
+            hears: false,
+            is_heard: false,
+            stream_heard: now,
+            delivery: Delivery::new(now),
+        };
+        liveness.note_due();
+        liveness
     }
 
     /// Something arrived in the stream.
+    #[inline]
     pub fn heard(&mut self, now: Instant) {
-        self.missed = 0;
+        self.silence = Silence::new(now, self.period);
+        self.stream_heard = now;
+    }
+
+    /// A datagram of the session arrived; whether they have begun to pass.
+    pub fn heard_datagram(&mut self, now: Instant) -> bool {
+        self.silence = Silence::new(now, self.period);
+        self.datagrams = Silence::new(now, self.period);
         self.next_question = Instant::FAR_FUTURE;
-        self.next_check = now + self.period + self.period.divided_by(2);
+        self.note_due();
+        !core::mem::replace(&mut self.hears, true)
     }
 
-    /// A datagram of the session arrived.
-    pub fn heard_datagram(&mut self, now: Instant) {
-        self.datagrams_pass = true;
-        self.heard(now);
+    /// The peer told what it receives, when `sent` bytes had been written into the stream. When the stream is dead: whether more
+    /// than one segment is missing there.
+    pub fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<bool> {
+        self.is_heard = report.hears;
+        self.delivery.reported(now, sent, report).map(is_long)
     }
 
-    /// Whether datagrams of the peer have come through.
-    pub const fn datagrams_pass(&self) -> bool {
-        self.datagrams_pass
+    /// Whether datagrams of the peer come through.
+    pub const fn hears(&self) -> bool {
+        self.hears
+    }
+
+    /// Whether this unit's datagrams come through, as the peer told last.
+    pub const fn is_heard(&self) -> bool {
+        self.is_heard
+    }
+
+    /// Whether datagrams of the peer were waited for in vain for three keep-alives.
+    pub const fn is_deaf(&self) -> bool {
+        self.datagrams.missed >= MISSED_KEEP_ALIVES
     }
 
     /// How long ago the peer was last heard. Late looks make it too short by as much as they were late.
     pub fn silent_for(&self, now: Instant) -> Duration {
-        let missed = (0..self.missed).fold(Duration::ZERO, |missed, _| missed + self.period);
-        now.since(self.next_check - missed - self.period - self.period.divided_by(2))
+        let missed = (0..self.silence.missed).fold(Duration::ZERO, |missed, _| missed + self.period);
+        now.since(self.silence.next_check - missed - self.period - self.period.divided_by(2))
+    }
+
+    /// How long ago something came in the stream.
+    pub fn stream_silent_for(&self, now: Instant) -> Duration {
+        now.since(self.stream_heard)
     }
 
     /// When to look again.
     #[inline]
     pub fn deadline(&self) -> Instant {
-        self.next_check.min(self.next_question)
+        self.silence.next_check.min(self.due)
     }
 
-    /// Counts one missed keep-alive, and asks, if the time for it has come.
-    pub fn poll(&mut self, now: Instant) -> Look {
-        let missed = now >= self.next_check;
-        if missed {
-            self.missed = self.missed.saturating_add(1);
-            self.next_check = now + self.period;
+    fn note_due(&mut self) {
+        let datagrams = if self.is_deaf() { Instant::FAR_FUTURE } else { self.datagrams.next_check };
+        self.due = datagrams.min(self.next_question).min(self.delivery.deadline());
+    }
+
+    /// Counts one missed keep-alive, asks and probes, if the time for it has come. `sent` bytes have been written into the stream.
+    pub fn poll(&mut self, now: Instant, sent: u32) -> Look {
+        if now < self.deadline() {
+            return Look::default();
         }
-        let lost = missed && self.missed >= self.allowed();
-        // Where no datagram has passed, each keep-alive asks in the stream already.
-        let ask = self.datagrams_pass && !lost && (missed || now >= self.next_question);
-        if ask {
-            self.next_question = now + self.period.divided_by(QUESTIONS_PER_PERIOD).max(SHORTEST_KEEP_ALIVE);
-        }
-        Look { missed, ask, lost }
+        let silent = self.silence.poll(now, self.period);
+        let lost = silent && self.silence.missed >= self.allowed();
+        let no_datagram = !self.is_deaf() && self.datagrams.poll(now, self.period);
+        let missed_datagram = no_datagram && self.hears;
+        let deaf = no_datagram && self.is_deaf();
+        self.hears &= !deaf;
+        let mut ask = self.hears && !lost && (missed_datagram || now >= self.next_question);
+        self.next_question = match (ask, self.hears) {
+            (true, _) => now + self.period.divided_by(QUESTIONS_PER_PERIOD).max(SHORTEST_KEEP_ALIVE),
+            (_, true) => self.next_question,
+            (_, false) => Instant::FAR_FUTURE,
+        };
+        let probe = self.delivery.poll(now, sent);
+        ask |= self.hears && probe.ask;
+        self.note_due();
+        // Datagrams may have ceased to pass while the stream goes on: it is asked as well, once for each miss.
+        let probe = !lost && (silent || missed_datagram || probe.write);
+        Look { missed: silent || missed_datagram, ask, probe, deaf, lost }
     }
 
     fn allowed(&self) -> u8 {
-        if self.datagrams_pass {
+        if self.hears {
             return MISSED_KEEP_ALIVES;
         }
-        let periods = TCP_ONLY_LOSS.as_micros().checked_div(self.period.as_micros()).unwrap_or(8);
+        let periods = STREAM_ONLY_LOSS.as_micros().checked_div(self.period.as_micros()).unwrap_or(0);
         u8::try_from(periods).unwrap_or(u8::MAX).max(MISSED_KEEP_ALIVES)
     }
 }
@@ -110,16 +198,22 @@ mod tests {
         Instant::START + Duration::from_millis(millis)
     }
 
-    const MISSED: Look = Look { missed: true, ask: true, lost: false };
-    const NOTHING: Look = Look { missed: false, ask: false, lost: false };
+    const NOTHING: Look = Look { missed: false, ask: false, probe: false, deaf: false, lost: false };
+    const MISSED: Look = Look { missed: true, ask: true, probe: true, ..NOTHING };
+
+    /// What one poll says of a stream into which something is always written, and arrives.
+    fn poll(liveness: &mut Liveness, now: Instant) -> Look {
+        let sent = now.as_micros() as u32;
+        liveness.delivery.reported(now, sent, Report { received: sent, ..Report::default() });
+        liveness.poll(now, sent)
+    }
 
     /// Polls at each deadline; returns (keep-alives missed, questions, when the peer was found lost).
     fn until_lost(liveness: &mut Liveness) -> (u32, u32, Instant) {
         let (mut missed, mut asked) = (0, 0);
         for _ in 0..100 {
             let now = liveness.deadline();
-            let look = liveness.poll(now);
-            assert!(look.missed || look.ask, "a deadline for nothing");
+            let look = poll(liveness, now);
             (missed, asked) = (missed + u32::from(look.missed), asked + u32::from(look.ask));
             if look.lost {
                 return (missed, asked, now);
@@ -139,7 +233,7 @@ mod tests {
             }
             let lost = (0..1_000).find_map(|_| {
                 let now = liveness.deadline();
-                liveness.poll(now).lost.then(|| now.since(start))
+                poll(&mut liveness, now).lost.then(|| now.since(start))
             });
             assert!(lost.is_some_and(|lost| lost <= Duration::from_secs(210)), "{lost:?}");
         }
@@ -153,13 +247,45 @@ mod tests {
     }
 
     #[test]
-    fn a_silent_peer_is_lost_after_eight_seconds_where_only_the_stream_passes() {
+    fn a_silent_peer_is_lost_as_soon_where_only_the_stream_passes() {
         let mut liveness = Liveness::new(at(0), PERIOD);
         liveness.heard(at(0));
-        assert_eq!(until_lost(&mut liveness), (8, 0, at(8_500)));
-        // However long the period: three are waited for.
+        assert_eq!(until_lost(&mut liveness), (3, 0, at(3_500)));
         let mut slow = Liveness::new(at(0), Duration::from_secs(10));
-        assert_eq!(until_lost(&mut slow), (3, 0, at(35_000)));
+        assert_eq!(until_lost(&mut slow).2, at(35_000));
+        // A retransmission takes its time, however short the period.
+        let mut fast = Liveness::new(at(0), Duration::from_millis(100));
+        assert_eq!(until_lost(&mut fast), (30, 0, at(3_050)));
+    }
+
+    #[test]
+    fn datagrams_that_fail_to_come_for_three_keep_alives_do_not_pass() {
+        let mut liveness = Liveness::new(at(0), PERIOD);
+        assert!(liveness.heard_datagram(at(0)) && !liveness.heard_datagram(at(500)));
+        let mut deaf_at = None;
+        for millis in (1_000..20_000).step_by(10) {
+            if millis % 1_000 == 0 {
+                liveness.heard(at(millis));
+            }
+            let look = poll(&mut liveness, at(millis));
+            assert!(!look.lost && !(look.ask && deaf_at.is_some()), "{millis} ms: {look:?}");
+            if look.deaf {
+                assert!(deaf_at.replace(millis).is_none(), "it is found once");
+            }
+        }
+        assert_eq!(deaf_at, Some(4_000));
+        assert!(liveness.is_deaf() && !liveness.hears());
+        assert!(liveness.heard_datagram(at(20_000)) && liveness.hears() && !liveness.is_deaf());
+    }
+
+    #[test]
+    fn datagrams_that_never_came_are_not_missed() {
+        let mut liveness = Liveness::new(at(0), PERIOD);
+        for second in 0..20 {
+            liveness.heard(at(second * 1_000));
+            let look = poll(&mut liveness, at(second * 1_000 + 600));
+            assert!(!look.missed && !look.ask && look.deaf == (second == 3), "{second}: {look:?}");
+        }
     }
 
     #[test]
@@ -167,8 +293,9 @@ mod tests {
         let mut liveness = Liveness::new(at(0), PERIOD);
         for second in 0..100 {
             liveness.heard_datagram(at(second * 1_000));
-            assert_eq!(liveness.deadline(), at(second * 1_000 + 1_500));
-            assert_eq!(liveness.poll(at(second * 1_000 + 999)), NOTHING);
+            assert_eq!(liveness.silence.next_check, at(second * 1_000 + 1_500));
+            let look = poll(&mut liveness, at(second * 1_000 + 999));
+            assert_eq!(look, NOTHING, "{second}");
         }
     }
 
@@ -177,7 +304,7 @@ mod tests {
         let mut liveness = Liveness::new(at(0), PERIOD);
         liveness.heard(at(1_000));
         assert_eq!(liveness.silent_for(at(1_200)), Duration::from_millis(200));
-        assert!(liveness.poll(at(2_500)).missed);
+        assert!(poll(&mut liveness, at(2_500)).missed);
         assert_eq!(liveness.silent_for(at(2_700)), Duration::from_millis(1_700));
         liveness.heard(at(3_000));
         assert_eq!(liveness.silent_for(at(3_000)), Duration::ZERO);
@@ -188,10 +315,10 @@ mod tests {
         let mut liveness = Liveness::new(at(0), PERIOD);
         liveness.heard_datagram(at(0));
         for second in 0..20 {
-            assert_eq!(liveness.poll(at(second * 3_000 + 1_500)), MISSED);
-            assert_eq!(liveness.poll(at(second * 3_000 + 2_500)), MISSED);
-            liveness.heard(at(second * 3_000 + 3_000));
-            assert_eq!(liveness.deadline(), at(second * 3_000 + 4_500));
+            assert_eq!(poll(&mut liveness, at(second * 3_000 + 1_500)), MISSED);
+            assert_eq!(poll(&mut liveness, at(second * 3_000 + 2_500)), MISSED);
+            liveness.heard_datagram(at(second * 3_000 + 3_000));
+            assert_eq!(liveness.silence.next_check, at(second * 3_000 + 4_500));
         }
     }
 
@@ -200,15 +327,15 @@ mod tests {
         let mut liveness = Liveness::new(at(0), PERIOD);
         liveness.heard_datagram(at(0));
         let jumped = at(0) + Duration::from_secs(49 * 24 * 3_600);
-        assert_eq!(liveness.poll(jumped), MISSED);
-        assert_eq!(liveness.poll(jumped), NOTHING);
+        assert_eq!(poll(&mut liveness, jumped), MISSED);
+        assert_eq!(poll(&mut liveness, jumped), NOTHING);
         assert_eq!(liveness.deadline(), jumped + PERIOD.divided_by(QUESTIONS_PER_PERIOD));
     }
 
     #[test]
     fn a_clock_that_stands_still_misses_nothing() {
         let mut liveness = Liveness::new(at(0), PERIOD);
-        assert!((0..1_000).all(|_| liveness.poll(at(1_499)) == NOTHING));
+        assert!((0..1_000).all(|_| poll(&mut liveness, at(1_499)) == NOTHING));
     }
 
     #[test]

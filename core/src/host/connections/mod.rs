@@ -5,12 +5,14 @@
 //! knows nothing of requests; it hands up whole messages and takes whole messages down.
 
 mod counters;
+mod delivery;
 mod liveness;
 mod receiver;
 mod sender;
 mod urgent;
 
 pub use counters::LinkCounter;
+pub use delivery::Report;
 pub use liveness::{Liveness, Look};
 
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};

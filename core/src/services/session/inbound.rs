@@ -120,6 +120,7 @@ impl<P: Port> Session<P> {
                 return Receipt { consumed: lent.len(), event: None, paused: false };
             }
         };
+        self.holds = received.paused;
         let Some(incoming) = received.incoming else {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
@@ -144,7 +145,9 @@ impl<P: Port> Session<P> {
         nonce: u64,
         body: &mut [u8],
     ) -> Option<Event> {
-        if self.phase != Phase::Live || nonce != self.local.nonce || !from.is_of_host(&self.peer_address) {
+        // Under a seal the nonce and the seal tell whose it is, and its source may be another address of the host, or a NAT's.
+        let is_of_peer = self.link.cipher().is_sealing() || from.is_of_host(&self.peer_address);
+        if self.phase != Phase::Live || nonce != self.local.nonce || !is_of_peer {
             self.link.counters.count(LinkCounter::DatagramsDropped);
             return None;
         }
@@ -234,12 +237,17 @@ impl<P: Port> Session<P> {
         if body.is_some() {
             match way {
                 Way::Stream => self.liveness.heard(cx.now),
-                Way::Datagram => self.liveness.heard_datagram(cx.now),
+                Way::Datagram if self.liveness.heard_datagram(cx.now) => {
+                    // The peer is told at once that its datagrams come.
+                    self.timers.keep_alive = cx.now;
+                }
+                Way::Datagram => {}
             }
         }
         match body {
-            Some(SessionBody::KeepAlive { stamp }) => {
+            Some(SessionBody::KeepAlive { stamp, report }) => {
                 self.clock.hear(cx.now, stamp);
+                self.reported(cx, report);
                 None
             }
             Some(SessionBody::Renew(renewal)) => {
@@ -272,11 +280,20 @@ impl<P: Port> Session<P> {
                 }
             }
             Some(SessionBody::Ping) => {
-                self.send_datagram(cx, &SessionBody::PONG, &[]);
+                let report = self.report();
+                self.send_datagram(cx, &SessionBody::pong(report), &[]);
                 None
             }
-            Some(SessionBody::Pong) => {
+            Some(SessionBody::Pong(report)) => {
                 self.show_life(cx);
+                self.reported(cx, report);
+                None
+            }
+            Some(SessionBody::Close(code)) => {
+                if let (Way::Datagram, reason @ CloseReason::StreamDead { .. }) = (way, close_reason(code)) {
+                    self.link.counters.count(LinkCounter::StreamsDied);
+                    self.end(reason);
+                }
                 None
             }
             None => self.unreadable_datagram(),

@@ -221,6 +221,8 @@ pub struct Session<P: Port> {
     liveness: Liveness,
     /// The hub waits for a sign of life.
     challenged: bool,
+    /// More of the stream is there and is not read for now.
+    holds: bool,
     pings: pinging::Pings,
     clock: PeerClock,
     timers: Timers,
@@ -273,6 +275,7 @@ impl<P: Port> Session<P> {
             peer_address: address,
             liveness: Liveness::new(now, constraints.keep_alive),
             challenged: false,
+            holds: false,
             pings: pinging::Pings::new(),
             clock: PeerClock::new(),
             timers: Timers::new(now),
@@ -411,6 +414,30 @@ impl<P: Port> Session<P> {
     /// How long ago the peer was last heard.
     pub fn silent_for(&self, now: Instant) -> Duration {
         self.liveness.silent_for(now)
+    }
+
+    /// How long ago something came in the stream: what it told is as old at least.
+    pub fn stream_silent_for(&self, now: Instant) -> Duration {
+        self.liveness.stream_silent_for(now)
+    }
+
+    /// Whether session datagrams of the peer come; `None` while that is not known.
+    pub const fn hears_datagrams(&self) -> Option<bool> {
+        match (self.liveness.hears(), self.liveness.is_deaf()) {
+            (false, false) => None,
+            (hears, _) => Some(hears),
+        }
+    }
+
+    /// Whether those of this unit come to the peer, as it told last.
+    pub const fn is_heard(&self) -> bool {
+        self.liveness.is_heard()
+    }
+
+    /// More bytes of the stream are there, and the port does not read them for now: the peer is told, which otherwise takes the
+    /// stream for dead. Until the next [`receive`](Self::receive).
+    pub const fn hold_back(&mut self) {
+        self.holds = true;
     }
 
     /// Bytes of messages and frames that the network has not taken yet.
@@ -603,6 +630,8 @@ const fn close_code(reason: CloseReason) -> u8 {
         CloseReason::Exhausted => 10,
         CloseReason::Unproven => 11,
         CloseReason::BadProof => 12,
+        CloseReason::StreamDead { long: false } => 13,
+        CloseReason::StreamDead { long: true } => 14,
     }
 }
 
@@ -616,6 +645,8 @@ const fn close_reason(code: u8) -> CloseReason {
         7 => CloseReason::HelloTimeout,
         10 => CloseReason::Exhausted,
         12 => CloseReason::BadProof,
+        13 => CloseReason::StreamDead { long: false },
+        14 => CloseReason::StreamDead { long: true },
         _ => CloseReason::Reset,
     }
 }

@@ -23,8 +23,8 @@ pub enum Delivery {
     /// In the stream: it arrives, in order, or the caller learns that it may not have.
     #[default]
     Reliable,
-    /// In one datagram, at most [`DATAGRAM_BYTES`]: now or never. Only for requests that want no reply. Right behind a join, while
-    /// the peer may not read datagrams yet, it goes in the stream.
+    /// In one datagram, at most [`DATAGRAM_BYTES`]: now or never. Only for requests that want no reply. As long as the peer has not
+    /// told that datagrams come, as right behind a join or where a firewall drops them, it goes in the stream.
     BestEffort,
 }
 
@@ -134,7 +134,7 @@ impl<P: Port> Session<P> {
         checked.header.id = id.0;
         checked.header.number = self.requests.made(options.made).number();
         let sent = match options.delivery {
-            Delivery::BestEffort if self.peer_is_live() => self.send_best_effort(cx, &checked, parameters),
+            Delivery::BestEffort if self.liveness.is_heard() => self.send_best_effort(cx, &checked, parameters),
             _ => self.send_reliable(cx, &checked, parameters),
         };
         // Nothing of the message has left, since a message that does not fit is refused before its first byte.
@@ -232,12 +232,6 @@ impl<P: Port> Session<P> {
             self.close(cx, CloseReason::Exhausted);
         }
         id.ok_or(Error::Closed(CloseReason::Exhausted))
-    }
-
-    /// Whether the peer is known to read this link's datagrams. An end that dialled sends its list before its link is live, and
-    /// drops datagrams until then: one that raced the confirmation would be lost on a network that loses nothing.
-    fn peer_is_live(&self) -> bool {
-        self.dialed || self.is_acknowledged(1)
     }
 
     fn send_reliable(

@@ -1,13 +1,13 @@
 //! What a session does because time has passed: keep-alives, deadlines, leases, the end of a silent link.
 
 use super::granting::expire_granted;
-use super::{Event, Phase, Session};
+use super::{CHALLENGE_DATAGRAMS, Event, Phase, Session, close_code};
 use crate::bytes::copy;
 use crate::config::{DATAGRAM_BYTES, GATHER, LATER};
 use crate::distribution::datagram;
 use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
 use crate::error::{CloseReason, Error};
-use crate::host::connections::LinkCounter;
+use crate::host::connections::{LinkCounter, Report};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
@@ -185,20 +185,56 @@ impl<P: Port> Session<P> {
 
     /// Asks a peer that has missed a keep-alive for a sign of life, and gives it up when none comes.
     fn look_for_peer(&mut self, cx: &mut Context<'_, P>) {
-        let look = self.liveness.poll(cx.now);
+        // What is not read for now has come all the same.
+        if self.holds && !self.liveness.hears() {
+            self.liveness.heard(cx.now);
+        }
+        let look = self.liveness.poll(cx.now, self.sent());
         if look.missed {
             self.link.counters.count(LinkCounter::KeepAlivesMissed);
         }
         if look.lost {
             return self.close(cx, CloseReason::Silent);
         }
+        if look.deaf {
+            self.link.counters.count(LinkCounter::DatagramsMissing);
+            // The peer is told at once, in the stream: it sends its keep-alives there then.
+            self.timers.keep_alive = cx.now;
+        }
         if look.ask {
             self.send_datagram(cx, &SessionBody::PING, &[]);
         }
-        if look.ask && look.missed {
-            // Datagrams may have ceased to pass while the stream goes on; it needs no more than one question each time.
+        if look.probe {
             self.send_ping(cx.now);
             self.flush(cx);
+        }
+    }
+
+    /// Bytes written into the stream, as reports count them.
+    fn sent(&self) -> u32 {
+        self.link.counters.value(LinkCounter::BytesSent) as u32
+    }
+
+    /// What comes of the peer here.
+    pub(super) fn report(&self) -> Report {
+        Report {
+            received: self.link.counters.value(LinkCounter::BytesReceived) as u32,
+            hears: self.liveness.hears(),
+            holds: self.holds,
+        }
+    }
+
+    /// The peer tells what comes of this unit there.
+    pub(super) fn reported(&mut self, cx: &mut Context<'_, P>, report: Report) {
+        let sent = self.sent();
+        if let Some(long) = self.liveness.reported(cx.now, sent, report) {
+            let reason = CloseReason::StreamDead { long };
+            // What the stream does not bring there: the peer need not find out by itself.
+            for _ in 0..CHALLENGE_DATAGRAMS {
+                self.send_datagram(cx, &SessionBody::close(close_code(reason)), &[]);
+            }
+            self.link.counters.count(LinkCounter::StreamsDied);
+            self.close(cx, reason);
         }
     }
 
@@ -226,16 +262,15 @@ impl<P: Port> Session<P> {
         self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
         self.publishing.actuators_due = true;
         self.pump(cx);
-        let body = SessionBody::keep_alive(cx.now.as_micros());
+        let body = SessionBody::keep_alive(cx.now.as_micros(), self.report());
         if LATER {
             self.link.send_frame(&Frame::Skipped);
             self.send_datagram(cx, &[200], &[]);
         }
         self.send_datagram(cx, &body, &[]);
-        if !self.liveness.datagrams_pass() {
+        // Where none come, none may arrive there either: the peer could not tell.
+        if !self.liveness.is_heard() || !self.liveness.hears() {
             self.link.send_frame(&Frame::Session(&body));
-            // A peer whose datagrams do not pass may hear ours, and then it sends nothing in the stream unless asked.
-            self.send_ping(cx.now);
             self.flush(cx);
         }
     }

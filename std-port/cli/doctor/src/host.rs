@@ -66,7 +66,7 @@ fn no_interface(seen: &Evidence) -> Option<Finding> {
             Finding::error(
                 Id::NoInterface,
                 devices,
-                "give the device an IPv4 address (DHCP, or `ip address add`) and switch it on (`ip link set NAME up`)",
+                "give the device an IPv4 address and a netmask (DHCP, or `ip address add ADDRESS/24 dev NAME`) and switch it on (`ip link set NAME up`)",
             )
             // Without loopback there is not even a node of this host to be heard.
             .certain(seen.reach.is_empty()),
@@ -106,6 +106,25 @@ fn send_refused(reach: &Reach) -> Option<Finding> {
         ),
     };
     Some(Finding::error(Id::SendRefused, found, advice).about(name).certain(kind == ErrorKind::PermissionDenied))
+}
+
+/// A running unit whose broadcasts the system does not take, where the doctor's own have not shown it already.
+pub(crate) fn unit_refused(seen: &Evidence, unit: &Running) -> Vec<Finding> {
+    let shown =
+        |name: &str| seen.reach.iter().any(|reach| reach.interface.name == name && send_refused(reach).is_some());
+    let refused = unit.unit.interfaces.iter().filter(|interface| interface.up && !shown(&interface.name));
+    let told = refused.filter_map(|interface| {
+        let found = format!(
+            "a broadcast of {} did not leave through {}: {}",
+            unit.name(),
+            interface.name,
+            interface.refused.as_ref()?
+        );
+        let advice =
+            "look at this host's firewall for outgoing packets (`nft list ruleset`) and at the routes (`ip route`)";
+        Some(Finding::warning(Id::SendRefused, found, advice).about(&interface.name))
+    });
+    told.collect()
 }
 
 fn broadcast_lost(reach: &Reach) -> Option<Finding> {
@@ -166,6 +185,8 @@ fn descriptors(running: &Running, open: u64, limit: u64, finding: fn(Id, String,
 
 #[cfg(test)]
 mod tests {
+    use cara_std::control::protocol::InterfaceInfo;
+
     use super::super::evidence::samples::{evidence, reach, running};
     use super::super::running::{Counted, Files};
     use super::*;
@@ -207,6 +228,22 @@ mod tests {
         seen.reach[0].sent = 0;
         seen.reach[0].refused = Some(ErrorKind::PermissionDenied);
         assert_eq!(ids(&seen), [Id::SendRefused]);
+    }
+
+    #[test]
+    fn a_broadcast_of_a_unit_that_did_not_leave_is_told_once() {
+        let mut seen = evidence();
+        let mut unit = running("boss", 1);
+        let refused = Some("permission denied".to_owned());
+        let interface =
+            InterfaceInfo { name: "eth0".into(), address: "10.0.0.1".into(), broadcast: None, up: true, refused };
+        unit.unit.interfaces = vec![InterfaceInfo { refused: None, ..interface.clone() }];
+        assert_eq!(unit_refused(&seen, &unit), []);
+        unit.unit.interfaces = vec![interface];
+        let found = unit_refused(&seen, &unit);
+        assert!(found.len() == 1 && found[0].id == Id::SendRefused && found[0].found.contains("boss/1"), "{found:?}");
+        (seen.reach[0].sent, seen.reach[0].refused) = (0, Some(ErrorKind::PermissionDenied));
+        assert_eq!(unit_refused(&seen, &unit), [], "the doctor's own have shown it");
     }
 
     #[test]

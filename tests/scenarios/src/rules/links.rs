@@ -13,6 +13,8 @@ scenarios![
     a_silent_peer_is_lost_after_three_keep_alives: "liveness, 4", Own, [Partition, LongTime],
         ["partition", "KeepAlivesMissed", "lost", "found again"];
     a_half_open_link_is_noticed_on_both_sides: "half-open TCP", Own, [Partition, LongTime], ["partition", "lost"];
+    a_dead_stream_ends_the_link_though_datagrams_pass: "liveness, 24", Own, [Freeze, LongTime], ["freeze", "StreamsDied", "found again"];
+    a_stream_held_for_a_while_is_not_dead: "liveness, 24", Own, [Freeze, LongTime], ["freeze"];
     the_hook_for_a_lost_manager_runs_once: "s_unit without manager", Rough, [], ["lost", "found again"];
     the_hook_runs_once_for_each_cut_cable: "s_unit without manager", Own, [Partition, LongTime], ["partition", "lost"];
     a_suspended_machine_ends_nothing: "liveness", Light, [Suspend, LongTime], ["suspend", "woke up"];
@@ -74,6 +76,50 @@ fn a_half_open_link_is_noticed_on_both_sides(world: &mut dyn World) {
     world.reached("lost");
     world.fault(Fault::Heal);
     met(world, &manager, "agv", "note");
+}
+
+fn stream_dead(event: &Seen) -> bool {
+    matches!(event, Seen::Left(_, CloseReason::StreamDead { .. }))
+}
+
+/// As behind a firewall that has forgotten the connection.
+fn a_dead_stream_ends_the_link_though_datagrams_pass(world: &mut dyn World) {
+    let (manager, agv) = pair(world, &Service::numbered("note"));
+    world.wait("both are connected", || agv.is_connected("manager") && manager.is_connected("agv"), secs(40));
+    let calm = secs(3) + millis(world.random(5_000));
+    world.run_for(calm);
+    let one_way = world.random(3);
+    if one_way != 1 {
+        world.fault(Fault::FreezeStreams(&manager, &agv, secs(16)));
+    }
+    if one_way != 2 {
+        world.fault(Fault::FreezeStreams(&agv, &manager, secs(16)));
+    }
+    let cut = world.now();
+    world.wait("both notice", || manager.count(stream_dead) + agv.count(stream_dead) >= 2, secs(30));
+    for unit in [&manager, &agv] {
+        let lost = unit.when(stream_dead).expect("the loss is noticed").since(cut);
+        assert!(lost >= secs(8) && lost <= secs(15), "{} ms", lost.as_millis());
+        world.measured("dead stream to loss", lost);
+    }
+    met(world, &manager, "agv", "note");
+    world.reached("found again");
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
+}
+
+fn a_stream_held_for_a_while_is_not_dead(world: &mut dyn World) {
+    let (manager, agv) = pair(world, &Service::numbered("note"));
+    world.wait("both are connected", || agv.is_connected("manager") && manager.is_connected("agv"), secs(40));
+    world.run_for(secs(3));
+    for _ in 0..5 {
+        world.fault(Fault::FreezeStreams(&manager, &agv, secs(7)));
+        world.fault(Fault::FreezeStreams(&agv, &manager, secs(7)));
+        let span = secs(7) + millis(200 + world.random(3_000));
+        world.run_for(span);
+    }
+    let left = |event: &Seen| matches!(event, Seen::Left(..));
+    assert_eq!((manager.count(left), agv.count(left)), (0, 0), "{}", world.story());
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
 }
 
 fn the_hook_for_a_lost_manager_runs_once(world: &mut dyn World) {

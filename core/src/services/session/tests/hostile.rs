@@ -17,7 +17,7 @@ use crate::distribution::message::{
     Control, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
 };
 use crate::error::{CloseReason, Error};
-use crate::host::connections::LinkCounter;
+use crate::host::connections::{LinkCounter, Report};
 use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
 use crate::time::Duration;
 
@@ -100,7 +100,9 @@ fn frames() -> impl Strategy<Value = Vec<u8>> {
     });
     let body = prop_oneof![
         prop::collection::vec(any::<u8>(), 0..20),
-        any::<u64>().prop_map(|stamp| SessionBody::keep_alive(stamp).to_vec()),
+        (any::<u64>(), any::<u32>(), any::<bool>(), any::<bool>()).prop_map(|(stamp, received, hears, holds)| {
+            SessionBody::keep_alive(stamp, Report { received, hears, holds }).to_vec()
+        }),
         (0..6_u32, 0..4_u8, any::<u64>()).prop_map(|(call, class, stamp)| renewal(call, class, stamp)),
         (0..6_u32, 0..4_u8).prop_map(|(call, class)| release(call, class)),
         (0..4_u16, 0..6_u32).prop_map(|(slot, id)| SessionBody::release_all(Slot(slot), id).to_vec()),

@@ -89,6 +89,8 @@ pub(super) struct Side {
     pub(super) held: Vec<Call>,
     pub(super) hub: Lobby,
     pub(super) inbox: Vec<u8>,
+    /// What comes stays in the inbox.
+    pub(super) holds_back: bool,
     pub(super) received: usize,
     /// Where the results of calls go.
     pub(super) results: BTreeMap<CallId, Arguments>,
@@ -147,6 +149,7 @@ impl Side {
             held: Vec::new(),
             hub: Lobby { hub: setup::hub(agv, "manager"), waits: false, entered: 0 },
             inbox: Vec::new(),
+            holds_back: false,
             received: 0,
             results: BTreeMap::new(),
             unanswered: Vec::new(),
@@ -198,6 +201,10 @@ impl Side {
     fn read(&mut self) -> bool {
         let mut worked = false;
         let mut arguments: Arguments = Box::default();
+        if self.holds_back {
+            self.session.hold_back();
+            return false;
+        }
         loop {
             let lent = &mut self.inbox;
             let receipt = self.session.receive(context!(self), lent, Some(&mut *arguments));

@@ -45,7 +45,8 @@ pub(crate) fn evidence() -> Evidence {
 /// An interface on which broadcasts come back.
 pub(crate) fn reach(name: &str, address: &str) -> Reach {
     let broadcast = Some("10.0.0.255".parse().unwrap());
-    let interface = Interface { name: name.into(), address: address.parse().unwrap(), broadcast, up: true };
+    let interface =
+        Interface { name: name.into(), address: address.parse().unwrap(), broadcast, up: true, refused: None };
     Reach { interface, port: 21_971, sent: 3, refused: None, heard: 3 }
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use cara_std::Fleet;
-use cara_std::survey::{Heard, Standing, Survey};
+use cara_std::survey::{Heard, Reach, Standing, Survey};
 use serde_json::{Value, json};
 
 use cara_tools::global::Global;
@@ -29,7 +29,10 @@ pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
         let heard: Vec<_> = heard.iter().map(|heard| as_json(heard)).collect();
         let keys_of: Vec<u32> = survey.keys().fleets().iter().map(|fleet| fleet.0).collect();
         let refused: Vec<String> = survey.keys().refused().iter().map(ToString::to_string).collect();
-        let whole = json!({ "unit": null, "keys_of": keys_of, "key_files_refused": refused, "heard": heard });
+        let targets: Vec<_> = survey.reach().iter().map(target).collect();
+        let whole = json!({
+            "unit": null, "keys_of": keys_of, "key_files_refused": refused, "targets": targets, "heard": heard
+        });
         return Ok(output::object(&whole)?);
     }
     if heard.is_empty() {
@@ -115,6 +118,19 @@ fn table(heard: &[&Heard]) -> Rows {
         );
     }
     rows
+}
+
+/// Where broadcasts go, and what became of them.
+fn target(reach: &Reach) -> Value {
+    json!({
+        "interface": reach.interface.name,
+        "address": reach.interface.address.to_string(),
+        "broadcast": reach.interface.broadcast.map(|address| address.to_string()),
+        "port": reach.port,
+        "up": reach.interface.up,
+        "sent": reach.sent,
+        "refused": reach.refused.map(|kind| kind.to_string()),
+    })
 }
 
 fn as_json(heard: &Heard) -> Value {
