@@ -287,7 +287,7 @@ impl<P: Port> Session<P> {
         sent
     }
 
-    /// The second copy of an emergency; at-most-once removes the double. Whether it has left, to a peer that reads datagrams.
+    /// The second copy of an emergency; at-most-once removes the double. Whether it has left, to a peer that has told that datagrams come.
     fn send_emergency_datagram(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -301,7 +301,7 @@ impl<P: Port> Session<P> {
         let length = write_message(&mut message, header, signature, parameters);
         let prefix = SessionBody::message_prefix(Priority::Emergency.to_wire());
         let sent = self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
-        sent && self.peer_is_live() && self.liveness.datagrams_pass()
+        sent && self.liveness.is_heard()
     }
 
     fn send_best_effort(
