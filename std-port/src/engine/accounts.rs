@@ -123,7 +123,7 @@ impl<T: Send + 'static> Engine<T> {
         self.accounts.hooks_late.clone()
     }
 
-    fn port_readings(&self, held: &Held) -> [Reading; 15] {
+    fn port_readings(&self, held: &Held) -> [Reading; 16] {
         // One that is stuck has not counted itself.
         let functions = self.functions();
         let actuators = functions.iter().filter_map(|function| function.handler.actuator.as_ref());

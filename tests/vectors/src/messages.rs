@@ -222,7 +222,7 @@ fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
     let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
     let publish = Control::Publish { slot: 300, generation: 2, attributes: &attributes, signature: stop.as_bytes() };
-    let all: [(&'static str, &'static str, Control<'_>, Value); 15] = [
+    let all: [(&'static str, &'static str, Control<'_>, Value); 16] = [
         (
             "publish",
             "a function may be called",
