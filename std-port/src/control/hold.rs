@@ -42,7 +42,7 @@ pub(super) fn hold<T: Send + 'static>(
         if last.is_some() && last_beat.replace(last) != last {
             heart.borrow_mut().beat();
         }
-        last.is_some_and(|last| lease.is_none_or(|lease| last.elapsed() < lease.into())) && !system.is_stopped()
+        last.is_some_and(|last| lease.is_none_or(|lease| last.elapsed() < lease)) && !system.is_stopped()
     };
     let gone = || match lives() {
         Some(_) if !system.is_stopped() => unattended(&question.function).into(),
