@@ -238,7 +238,7 @@ fn call_all<T: Send + 'static>(
         let calls: Vec<_> = peers.iter().map(|peer| (peer, question)).collect();
         return block_all(&calls, options, wanted, &mut |_, news| match news {
             News::Late => Ok(()),
-            News::Answer(answer) => send(sink, answer),
+            News::Answer(answer) => send(sink, *answer),
         });
     }
     peers.iter().try_for_each(|peer| tell(peer, question, options, sink))
@@ -248,7 +248,7 @@ fn call_all<T: Send + 'static>(
 pub(super) enum News {
     /// It could not be made, or has no answer after [`LATE`]. Once for each call at most.
     Late,
-    Answer(Answer),
+    Answer(Box<Answer>),
 }
 
 /// All at the same time, as far as the memory for their parameters reaches; `tell` gets the answers in the order of the replies,
@@ -280,7 +280,7 @@ pub(super) fn block_all<T: Send + 'static>(
                 }
                 Err(failure) => {
                     tell(number, News::Late)?;
-                    tell(number, News::Answer(called(peer, Err(failure), started)))?;
+                    tell(number, News::Answer(Box::new(called(peer, Err(failure), started))))?;
                 }
             }
         }
@@ -295,7 +295,7 @@ pub(super) fn block_all<T: Send + 'static>(
                 let outcome = prepared.outcome(outcome, call.take_failure().as_deref());
                 let (number, answer) = (*number, called(peer, outcome, *started));
                 drop(under_way.swap_remove(index));
-                tell(number, News::Answer(answer))?;
+                tell(number, News::Answer(Box::new(answer)))?;
             } else {
                 if !*is_late && started.elapsed() >= LATE {
                     *is_late = true;
@@ -335,7 +335,7 @@ pub(super) fn bench<T: Send + 'static>(
         }
         permit(system, &question.function, Verb::Call)?;
         let last = lives().ok_or(End::Gone)?;
-        if lease.is_some_and(|lease| last.elapsed() >= lease.into()) {
+        if lease.is_some_and(|lease| last.elapsed() >= lease) {
             return Err(unattended(&question.function).into());
         }
         parameters.copy_from(&prepared.parameters)?;

@@ -159,7 +159,7 @@ impl From<PlaceError> for ControlError {
 
 /// The units with a socket in the first of the [directories] of control sockets that has any; see [`running_in`].
 pub fn running() -> Result<Vec<RunningUnit>, ControlError> {
-    first_of(&directories(), |directory| running_in(directory))
+    first_of(&directories(), running_in)
 }
 
 /// What the first directory has that has anything. An error of one, such as that others can enter it, counts where no

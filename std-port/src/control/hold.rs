@@ -42,12 +42,13 @@ pub(super) fn hold<T: Send + 'static>(
         if last.is_some() && last_beat.replace(last) != last {
             heart.borrow_mut().beat();
         }
-        last.is_some_and(|last| lease.is_none_or(|lease| last.elapsed() < lease.into())) && !system.is_stopped()
+        last.is_some_and(|last| lease.is_none_or(|lease| last.elapsed() < lease)) && !system.is_stopped()
     };
     let gone = || match lives() {
         Some(_) if !system.is_stopped() => unattended(&question.function).into(),
         _ => End::Gone,
     };
+    let is_silent = || lives().zip(lease).is_none_or(|(last, lease)| last.elapsed() > lease / 2);
     // The question is a sign of life as well, and the call needs a heart that beats.
     if !is_wanted() {
         return Err(gone());
@@ -84,6 +85,8 @@ pub(super) fn hold<T: Send + 'static>(
                     format!("another call of '{}' took over what was held at {}", question.function, peer.identity());
                 return Err(Failure::resource("TakenOver", text).into());
             }
+            // It expired there since nothing was renewed here.
+            Some(LeaseEnd::Expired) if is_silent() => return Err(gone()),
             Some(why) => return send(sink, Answer::Ended { expired: why != LeaseEnd::Finished }),
         }
     }

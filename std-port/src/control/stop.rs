@@ -99,14 +99,15 @@ pub(super) fn call<T: Send + 'static>(
         let Some(outcome) = outcomes.get_mut(*of) else { return Ok(()) };
         match news {
             News::Late if is_stop => outcome.is_one_way |= send_one_way(outcome.peer, question, &options),
-            News::Answer(Answer::Called { error, .. }) => {
+            News::Late => {}
+            News::Answer(answer) => {
+                let Answer::Called { error, .. } = *answer else { return Ok(()) };
                 outcome.open -= 1;
                 outcome.error = outcome.error.take().or(error);
                 if outcome.open == 0 {
                     return tell(outcome);
                 }
             }
-            News::Late | News::Answer(_) => {}
         }
         Ok(())
     })?;

@@ -83,11 +83,11 @@ fn a_gateway_that_makes_no_sign_of_life_up_lets_go() {
         }
         Some(*last.lock().unwrap())
     };
+    let mut note = |answer| {
+        told.lock().unwrap().push(answer);
+        ControlFlow::Continue(())
+    };
     std::thread::scope(|scope| {
-        let mut note = |answer| {
-            told.lock().unwrap().push(answer);
-            ControlFlow::Continue(())
-        };
         scope.spawn(|| creeping.hold(&mut note, &lives));
         until("it moves", || creeping.lease.is_live());
         is_there.store(false, Ordering::SeqCst);

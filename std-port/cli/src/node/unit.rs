@@ -20,6 +20,9 @@ pub(super) enum Node {
     Vehicle(Unit),
 }
 
+/// Tells where a connected peer is.
+pub(super) type Addresses = Box<dyn Fn(&Identity) -> Option<SocketAddr> + Send>;
+
 /// Why a node could not be built.
 pub(super) enum NotBuilt {
     Unit(BuildError),
@@ -141,7 +144,7 @@ impl Node {
     }
 
     /// Where a connected peer is; holds no unit alive.
-    pub(super) fn addresses(&self) -> Box<dyn Fn(&Identity) -> Option<SocketAddr> + Send> {
+    pub(super) fn addresses(&self) -> Addresses {
         match self {
             Self::Manager(system) => {
                 let system = system.downgrade();
