@@ -14,6 +14,8 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::services::lease::{ActuatorState, OrderOutcome};
 use cara_core::services::requests::CallId;
+#[cfg(feature = "control")]
+use cara_core::services::requests::Made;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use core::net::SocketAddr;
@@ -487,6 +489,12 @@ impl<T: Send + 'static> Peer<T> {
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
         self.engine.request(&self.link()?, function, parameters, options)
+    }
+
+    /// The place of a call that is made now among those of its link, if there is one.
+    #[cfg(feature = "control")]
+    pub(crate) fn make(&self) -> Option<Made> {
+        self.link().ok().map(|link| link.lock().session.make())
     }
 
     /// The end of a call, to be polled for.

@@ -144,9 +144,11 @@ fn begin<T: Send + 'static>(
 ) -> Result<Result<CallFuture<T>, Error>, End> {
     let timeout = options.timeout.unwrap_or_else(|| peer.constraints().request_timeout);
     let started = Instant::now();
+    // It keeps its place among the calls that move the same thing, however long it waits for room.
+    let made = peer.make();
     loop {
         let left = timeout - started.elapsed().into();
-        let options = RequestOptions { timeout: Some(left), ..*options };
+        let options = RequestOptions { timeout: Some(left), made, ..*options };
         let error = match peer.call_future(function, &prepared.parameters, &options) {
             Ok(call) => return Ok(Ok(call)),
             Err(error) => error,
