@@ -62,8 +62,8 @@ pub fn execute<T: Send + 'static>(
 }
 
 /// As [`execute`], and what takes long ends as well once `wanted` says `false`: a watch, values of streams, a call, and what
-/// a [`Question::Hold`] keeps moving. Of the last it is asked with the length of the lease: whether who holds it has given a sign
-/// of life within that.
+/// a [`Question::Hold`] keeps moving. Of the last it is asked with the length of the lease: whether its holder has given a sign of
+/// life within that.
 pub fn execute_while<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &Question,
