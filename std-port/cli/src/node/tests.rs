@@ -127,7 +127,7 @@ fn parameters_travel_through_json() {
     sent.set_value("s", "grün\"").unwrap();
     sent.set_value("d", &[0_u8, 0xFF][..]).unwrap();
     let text = json::arguments(definition.signature(), &sent).to_string();
-    let expected = r#"{"b":true,"d":"00ff","n":-1,"ns":[-9223372036854775808,9223372036854775807],"s":"grün\"","x":[0.1,"inf","NaN"]}"#;
+    let expected = r#"{"n":-1,"ns":[-9223372036854775808,9223372036854775807],"x":[0.1,"inf","NaN"],"b":true,"s":"grün\"","d":"00ff"}"#;
     assert_eq!(text, expected);
     let mut received = parameters(&definition);
     json::set_results(definition.signature(), text.as_bytes(), &mut received).unwrap();

@@ -40,7 +40,7 @@ impl Door {
     }
 }
 
-/// Takes whatever comes, and waits for nobody's handshake or place: the next one may be a stop.
+/// Takes whatever comes, and waits for no handshake and no place: the next one may be a stop.
 async fn take(
     listener: TcpListener,
     tls: Option<TlsAcceptor>,

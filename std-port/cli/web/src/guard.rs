@@ -171,9 +171,8 @@ pub(crate) async fn pass(
     let path = request.uri().path();
     let (for_data, is_stop) = (path.starts_with("/api/"), path == "/api/stop");
     let checked = shared.guard.check(request.method(), request.headers(), for_data);
-    if for_data {
-        asks.proves(checked.is_ok());
-    }
+    // A file is nothing that a connection is kept for.
+    asks.proves(for_data && checked.is_ok());
     let mut place = None;
     let mut response = match checked {
         Err(refusal) => refuse(&shared, refusal).await,

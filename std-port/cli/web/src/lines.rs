@@ -36,7 +36,7 @@ pub(crate) struct Line {
 }
 
 struct State {
-    /// Its last request for data had the token.
+    /// Its last request was for data and had the token.
     is_proven: bool,
     phase: Phase,
     /// When the phase began.
@@ -207,7 +207,7 @@ impl Caller {
 pub(crate) struct Asks(Arc<Line>);
 
 impl Asks {
-    /// It is for data: whether it has the token. One that has goes on with its content.
+    /// Whether it is for data and has the token. Then it goes on with its content.
     pub(crate) fn proves(&self, is_proven: bool) {
         let mut state = self.0.state();
         state.is_proven = is_proven;
