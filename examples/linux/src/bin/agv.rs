@@ -1,5 +1,6 @@
 //! An AGV: an s_unit that keeps a position, drives while its manager wants it to, and calls a mechanic.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -16,6 +17,9 @@ use clap::Parser;
 
 /// The vehicle, which keeps the lease of the call that it drives for.
 type Agv = cara_apps::agv::Agv<LeaseWatch>;
+
+/// The power of the motors. The safe hook owns it: it takes no lock and writes no line, so nothing holds it up.
+static POWER: AtomicBool = AtomicBool::new(false);
 
 /// How often the AGV says where it is.
 const POSITION_EVERY: Duration = Duration::from_millis(500);
@@ -62,7 +66,7 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     let agv = own();
     let go_to = move |call: &Call, pos: &mut ParametersView| {
         let mut agv = lock(&agv);
-        call.commit(|| agv.go_to(pos, call.lease.clone()))??;
+        call.commit(|| agv.go_to(pos, call.lease.clone()).inspect(|()| POWER.store(true, Ordering::Release)))??;
         agv.target().into_iter().for_each(|target| say!("driving to {target}"));
         Ok(())
     };
@@ -79,10 +83,8 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
         say!("reset: {} said so", call.caller);
         Ok(())
     };
-    let agv = own();
-    let safe = move || lock(&agv).stop().into_iter().for_each(not_wanted);
     let functions = unit.my_function_list();
-    let drive = functions.actuator(safe)?;
+    let drive = functions.actuator(|| POWER.store(false, Ordering::Release))?;
     let plain = ServiceOptions::new;
     let stops = plain().idempotent().priority(Priority::Emergency).stops(&drive);
     functions.add_service(&Definition::parse(POS_INFO)?, plain().idempotent(), pos_info)?;
@@ -139,7 +141,8 @@ fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, streams: &Streams
         last += elapsed;
         let (progress, place, charge, finished) = {
             let mut agv = lock(agv);
-            (agv.step(elapsed.into(), order.is_live()), agv.place(), agv.charge(), agv.finished())
+            let drives = order.is_live() && POWER.load(Ordering::Acquire);
+            (agv.step(elapsed.into(), drives), agv.place(), agv.charge(), agv.finished())
         };
         streams.publish(place.exact(), charge)?;
         if let Some(order) = finished {
@@ -148,7 +151,7 @@ fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, streams: &Streams
         match progress {
             Some(Progress::Passed(place)) => say!("passed {place}"),
             Some(Progress::Arrived(place)) => say!("arrived at {place}"),
-            Some(Progress::Stopped(place)) => not_wanted(place),
+            Some(Progress::Stopped(place)) => say!("stopped at {place}: the order has ended"),
             None => {}
         }
         if said.elapsed() >= POSITION_EVERY {
@@ -161,10 +164,6 @@ fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, streams: &Streams
 /// The vehicle has a lock of its own, held for some assignments at a time: no service can keep the motors' loop from it.
 fn lock(agv: &Mutex<Agv>) -> MutexGuard<'_, Agv> {
     agv.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-fn not_wanted(place: cara_apps::agv::Place) {
-    say!("stopped at {place}: the order has ended");
 }
 
 /// Says what happens, and calls a mechanic, once, when the manager offers to send one.
