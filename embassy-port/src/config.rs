@@ -56,7 +56,17 @@ impl Config {
         let node = NodeConfig { identity, fleet, epoch, target, tcp_port: 0, udp_port, constraints, seed };
         let (claim, obeyed) = (Claim::NONE, StoredClaim::default());
         let access = Table(None);
-        Self { node, constraints: None, security, access, claim, store_own: None, obeyed, store: None, starts_stopped: None }
+        Self {
+            node,
+            constraints: None,
+            security,
+            access,
+            claim,
+            store_own: None,
+            obeyed,
+            store: None,
+            starts_stopped: None,
+        }
     }
 
     /// The manager of an s_unit.
