@@ -219,7 +219,7 @@ fn plain_and_secured_units_do_not_meet_even_on_one_port() {
     fn on<R>(port: Option<u16>, builder: Builder<(), R>) -> Builder<(), R> {
         port.into_iter().fold(builder, Builder::discovery_port)
     }
-    for port in [None, Some(24_971)] {
+    for port in [None, Some(cara_processes::discovery_port())] {
         let secured = started_manager(on(port, manager(fleet).keys(keys.ring(&depot()).unwrap())));
         let plain = started_vehicle(on(port, vehicle(fleet, 7).insecure()));
         stays_out(&secured);
@@ -269,6 +269,7 @@ fn an_unknown_vehicle_that_dials_saves_no_revoked_one() {
     let start = |id| started_vehicle(vehicle(fleet, id).key_file(store.file_of(&agv(id))));
     let (first, _second) = (start(7), start(8));
     joined(&manager, 2);
+    until("it knows its manager", || first.manager().is_some_and(|manager| manager.address().is_some()));
     let address = first.manager().unwrap().address().unwrap();
     let of_others = keys(fleet, &[99]).ring(&agv(99)).unwrap();
     let unknown = vehicle(fleet, 99).keys(of_others).manager_address(address).build().unwrap();

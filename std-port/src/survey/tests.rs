@@ -1,4 +1,4 @@
-use std::net::{Ipv4Addr, TcpListener};
+use std::net::Ipv4Addr;
 
 use cara_core::config::Constraints;
 use cara_core::distribution::hello::Manager;
@@ -11,18 +11,7 @@ use crate::keys::FleetKeys;
 const PATIENCE: Duration = Duration::from_secs(30);
 
 fn survey() -> Survey {
-    Survey::open(Interfaces::Loopback, free_port()).unwrap()
-}
-
-/// A free port below those that the system gives away: it gives one that is shared to several. The TCP port of the same number
-/// is kept until the process ends, so that no other test, of whatever process, takes this one as well.
-fn free_port() -> u16 {
-    let ports = std::iter::repeat_with(|| 22_000 + (random() % 10_000) as u16);
-    let free = |port: &u16| {
-        let kept = TcpListener::bind((Ipv4Addr::LOCALHOST, *port)).map(std::mem::forget);
-        kept.is_ok() && UdpSocket::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok()
-    };
-    ports.filter(free).next().unwrap()
+    Survey::open(Interfaces::Loopback, cara_processes::discovery_port()).unwrap()
 }
 
 /// A sender on loopback, and where the survey listens.

@@ -120,6 +120,8 @@ impl Depot {
             let peer = self.system.s_units().into_iter().find(|peer| peer.name() == name && peer.id() == id);
             peer.is_some_and(|peer| peer.their_function_list().len() == 4)
         });
+        // Its list goes out before its end of the link counts as joined.
+        until("it knows its manager", || agv.manager().is_some_and(|manager| manager.is_connected()));
         agv
     }
 }

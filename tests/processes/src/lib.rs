@@ -7,6 +7,7 @@ pub mod network;
 
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Write};
+use std::net::{Ipv4Addr, TcpListener, UdpSocket};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -240,6 +241,18 @@ impl Output {
 pub fn random_fleet() -> u32 {
     use std::hash::{BuildHasher, Hasher};
     (std::hash::RandomState::new().build_hasher().finish() as u32).max(1)
+}
+
+/// A UDP port for discovery that no other test uses, below those that the system gives away: it gives one that is shared to
+/// several. The TCP port of the same number is kept until this process ends, which keeps others off.
+pub fn discovery_port() -> u16 {
+    loop {
+        let port = 20_000 + (random_fleet() % 12_000) as u16;
+        let kept = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map(std::mem::forget);
+        if kept.is_ok() && UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok() {
+            return port;
+        }
+    }
 }
 
 /// Says past a test's captured output why something is skipped, which counts as failed where `CI` is set.

@@ -35,9 +35,9 @@ impl Clinic {
 
     /// For inside a namespace alone.
     pub(crate) fn on_all_interfaces() -> Self {
-        let (sockets, keys, fleet) = (private_directory(), private_directory(), random() as u32);
+        let (sockets, keys, fleet) = (private_directory(), private_directory(), cara_processes::random_fleet());
         Store::create(keys.path(), draw(fleet)).unwrap().save().unwrap();
-        Self { fleet, port: free_port(), sockets, keys, loopback: false }
+        Self { fleet, port: cara_processes::discovery_port(), sockets, keys, loopback: false }
     }
 
     /// A builder of an m_unit `name/1`.
@@ -249,13 +249,6 @@ pub(crate) fn while_running(again: impl Fn() + Sync, once: impl FnOnce()) {
     });
 }
 
-/// A free UDP port below those that the system gives away: it gives one that is shared to several.
-fn free_port() -> u16 {
-    let ports = std::iter::repeat_with(|| 22_000 + (random() % 10_000) as u16);
-    let mut free = ports.filter(|port| UdpSocket::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok());
-    free.next().unwrap()
-}
-
 /// A root for all nodes of these tests, each of which belongs to every m_unit.
 pub(crate) fn draw(fleet: u32) -> FleetKeys {
     let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
@@ -269,9 +262,4 @@ pub(crate) fn draw(fleet: u32) -> FleetKeys {
 
 pub(crate) fn private_directory() -> tempfile::TempDir {
     tempfile::Builder::new().permissions(Permissions::from_mode(0o700)).tempdir().unwrap()
-}
-
-fn random() -> u64 {
-    use std::hash::{BuildHasher, Hasher, RandomState};
-    RandomState::new().build_hasher().finish()
 }
