@@ -1,10 +1,10 @@
 //! Time, randomness, storage, errors.
 
 use cara_core::config::{Constraints, Priority};
+use cara_core::distribution::claim::Claim;
 use cara_core::error::Error;
 use cara_core::random::Random;
 use cara_core::storage::{Buffers, Lent, Pool};
-use cara_core::distribution::claim::Claim;
 use cara_core::time::{Duration, Instant};
 
 use crate::linkage::{keep, unknown, unknown_slice};
