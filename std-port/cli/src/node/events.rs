@@ -1,14 +1,15 @@
-//! Events of the node as lines of its log. Lines about refused connections are rate-limited.
+//! Events of the node as lines of its log. Lines that others can cause are rate-limited.
 
 use std::collections::HashMap;
+use std::fmt;
 use std::net::SocketAddr;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use cara_std::{Claim, CloseReason, Identity, UnitEvent};
 
-/// Links that did not come about for one reason are one line in this time: a port scan has hundreds a second.
-const PERIOD: Duration = Duration::from_secs(1);
+/// How often what is left out is looked for.
+const LOOK: Duration = Duration::from_secs(1);
 
 /// Tells what happens to the node, in a thread that ends with the unit; `fenced` once another manager has taken over. `address`
 /// tells where a connected peer is.
@@ -28,21 +29,20 @@ fn log_all(events: &Receiver<UnitEvent>, address: &dyn Fn(&Identity) -> Option<S
     loop {
         let event = match sparing.0.is_empty() {
             true => events.recv().map_err(|_| RecvTimeoutError::Disconnected),
-            false => events.recv_timeout(PERIOD),
+            false => events.recv_timeout(LOOK),
         };
         match event {
-            Ok(UnitEvent::NotJoined { reason, .. }) if !sparing.admits(reason, Instant::now()) => {}
             Ok(UnitEvent::Fenced { claim }) => fenced(claim),
-            Ok(UnitEvent::Joined { peer }) => {
-                let address = address(&peer);
-                tracing::info!(node = %peer, address = address.map(tracing::field::display), "joined");
-                addresses.insert(peer, address);
+            Ok(event) => {
+                let address = match &event {
+                    UnitEvent::Joined { peer } => *addresses.entry(peer.clone()).insert_entry(address(peer)).get(),
+                    UnitEvent::Left { peer, .. } => addresses.remove(peer).flatten(),
+                    _ => None,
+                };
+                if Line::of(&event).is_none_or(|line| sparing.admits(line, Instant::now())) {
+                    log_event(event, address);
+                }
             }
-            Ok(UnitEvent::Left { peer, reason }) => {
-                let address = addresses.remove(&peer).flatten();
-                tracing::warn!(node = %peer, address = address.map(tracing::field::display), "left: {reason}");
-            }
-            Ok(event) => log_event(event),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return sparing.0.into_iter().for_each(left_out),
         }
@@ -50,51 +50,99 @@ fn log_all(events: &Receiver<UnitEvent>, address: &dyn Fn(&Identity) -> Option<S
     }
 }
 
-fn left_out((reason, Told { left_out, .. }): (CloseReason, Told)) {
-    if left_out > 0 {
-        tracing::warn!(more = left_out, "not joined, likewise: {reason}");
+/// Lines of one kind that others can cause as often as they like: by a node that joins in a loop, or a port scan.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+enum Line {
+    NotJoined(CloseReason),
+    Joined(Identity),
+    Left(Identity),
+    Skipped(Identity),
+    Expired(Identity),
+}
+
+impl Line {
+    fn of(event: &UnitEvent) -> Option<Self> {
+        Some(match event {
+            UnitEvent::NotJoined { reason, .. } => Self::NotJoined(*reason),
+            UnitEvent::Joined { peer } => Self::Joined(peer.clone()),
+            UnitEvent::Left { peer, .. } => Self::Left(peer.clone()),
+            UnitEvent::FunctionsSkipped { peer, .. } => Self::Skipped(peer.clone()),
+            UnitEvent::LeaseExpired { peer, .. } => Self::Expired(peer.clone()),
+            _ => return None,
+        })
+    }
+
+    /// So many lines in so much time: a port scan has hundreds a second of a few reasons, and a node that works leaves seldom.
+    const fn limit(&self) -> (u64, Duration) {
+        match self {
+            Self::NotJoined(_) => (1, Duration::from_secs(1)),
+            _ => (4, Duration::from_secs(10)),
+        }
     }
 }
 
-/// Which reasons were logged a short while ago.
-#[derive(Default)]
-struct Sparing(HashMap<CloseReason, Told>);
+impl fmt::Display for Line {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NotJoined(reason) => write!(f, "not joined, likewise: {reason}"),
+            Self::Joined(node) => write!(f, "{node} has joined, again and again"),
+            Self::Left(node) => write!(f, "{node} has left, again and again"),
+            Self::Skipped(node) => write!(f, "{node} has no room for some of this node's functions, likewise"),
+            Self::Expired(node) => write!(f, "leases of {node} have expired, likewise"),
+        }
+    }
+}
 
-/// When a reason was logged last, and how often it was not since.
+fn left_out((line, Told { left_out, .. }): (Line, Told)) {
+    if left_out > 0 {
+        tracing::warn!(more = left_out, "{line}");
+    }
+}
+
+/// Which lines were logged a short while ago.
+#[derive(Default)]
+struct Sparing(HashMap<Line, Told>);
+
+/// How often a line was logged since `at`, and how often it was not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Told {
     at: Instant,
+    lines: u64,
     left_out: u64,
 }
 
 impl Sparing {
-    /// Whether a reason may have a line of its own.
-    fn admits(&mut self, reason: CloseReason, now: Instant) -> bool {
-        if let Some(told) = self.0.get_mut(&reason) {
-            told.left_out += 1;
-            return false;
-        }
-        self.0.insert(reason, Told { at: now, left_out: 0 });
-        true
+    /// Whether a line may be logged.
+    fn admits(&mut self, line: Line, now: Instant) -> bool {
+        let (limit, _) = line.limit();
+        let told = self.0.entry(line).or_insert(Told { at: now, lines: 0, left_out: 0 });
+        let admits = told.lines < limit;
+        *if admits { &mut told.lines } else { &mut told.left_out } += 1;
+        admits
     }
 
     /// Those whose time is over; what was left out of them is to be told now.
-    fn due(&mut self, now: Instant) -> Vec<(CloseReason, Told)> {
-        let over = |told: &Told| now.saturating_duration_since(told.at) >= PERIOD;
-        let due: Vec<_> = self.0.iter().filter(|(_, told)| over(told)).map(|(reason, told)| (*reason, *told)).collect();
-        for (reason, told) in &due {
+    fn due(&mut self, now: Instant) -> Vec<(Line, Told)> {
+        let over = |line: &Line, told: &Told| now.saturating_duration_since(told.at) >= line.limit().1;
+        let due = self.0.iter().filter(|(line, told)| over(line, told)).map(|(line, told)| (line.clone(), *told));
+        let due: Vec<_> = due.collect();
+        for (line, told) in &due {
             // The line that tells the number is one too.
             match told.left_out {
-                0 => self.0.remove(reason),
-                _ => self.0.insert(*reason, Told { at: now, left_out: 0 }),
+                0 => self.0.remove(line),
+                _ => self.0.insert(line.clone(), Told { at: now, lines: 1, left_out: 0 }),
             };
         }
         due
     }
 }
 
-fn log_event(event: UnitEvent) {
+/// `address` is that of a node that joins or leaves.
+fn log_event(event: UnitEvent, address: Option<SocketAddr>) {
+    let address = address.map(tracing::field::display);
     match event {
+        UnitEvent::Joined { peer } => tracing::info!(node = %peer, address, "joined"),
+        UnitEvent::Left { peer, reason } => tracing::warn!(node = %peer, address, "left: {reason}"),
         UnitEvent::NotJoined { address, peer, reason } => {
             let node = peer.map(|peer| peer.to_string());
             tracing::warn!(%address, node, "not joined: {reason}");
@@ -111,23 +159,45 @@ fn log_event(event: UnitEvent) {
 mod tests {
     use super::*;
 
+    const SECOND: Duration = Duration::from_secs(1);
+
     #[test]
     fn a_reason_is_a_line_in_a_period_and_what_is_left_out_is_counted() {
         let mut sparing = Sparing::default();
         let start = Instant::now();
-        let admitted = |sparing: &mut Sparing| (0..380).filter(|_| sparing.admits(CloseReason::Reset, start)).count();
+        let [reset, protocol] = [CloseReason::Reset, CloseReason::Protocol].map(Line::NotJoined);
+        let admitted = |sparing: &mut Sparing| (0..380).filter(|_| sparing.admits(reset.clone(), start)).count();
         assert_eq!(admitted(&mut sparing), 1);
-        assert!(sparing.admits(CloseReason::Protocol, start), "another reason has a line of its own");
+        assert!(sparing.admits(protocol.clone(), start), "another reason has a line of its own");
         assert_eq!(sparing.due(start), []);
-        let mut due = sparing.due(start + PERIOD);
+        let mut due = sparing.due(start + SECOND);
         due.sort_by_key(|(_, told)| told.left_out);
-        assert_eq!(
-            due.iter().map(|(reason, told)| (*reason, told.left_out)).collect::<Vec<_>>(),
-            [(CloseReason::Protocol, 0), (CloseReason::Reset, 379)]
-        );
+        let due = due.into_iter().map(|(line, told)| (line, told.left_out)).collect::<Vec<_>>();
+        assert_eq!(due, [(protocol, 0), (reset.clone(), 379)]);
         assert_eq!(admitted(&mut sparing), 0, "the number was a line");
-        assert_eq!(sparing.due(start + PERIOD * 2).len(), 1);
-        sparing.due(start + PERIOD * 3);
-        assert!(sparing.0.is_empty() && sparing.admits(CloseReason::Reset, start + PERIOD * 3));
+        assert_eq!(sparing.due(start + SECOND * 2).len(), 1);
+        sparing.due(start + SECOND * 3);
+        assert!(sparing.0.is_empty() && sparing.admits(reset, start + SECOND * 3));
+    }
+
+    #[test]
+    fn a_node_that_joins_in_a_loop_does_not_fill_the_log() {
+        let [looping, other] = ["looping", "other"].map(|name| Identity::s_unit(name, 7).unwrap());
+        let (mut sparing, start, mut lines, mut counted) = (Sparing::default(), Instant::now(), 0, 0);
+        let joined = |peer: &Identity| Line::of(&UnitEvent::Joined { peer: peer.clone() }).unwrap();
+        let left = |peer: &Identity| UnitEvent::Left { peer: peer.clone(), reason: CloseReason::Stopped };
+        // 200 times a second, for a minute.
+        for millis in (0..60_000).step_by(5) {
+            let now = start + Duration::from_millis(millis);
+            lines += usize::from(sparing.admits(joined(&looping), now));
+            lines += usize::from(sparing.admits(Line::of(&left(&looping)).unwrap(), now));
+            let due = sparing.due(now);
+            lines += due.len();
+            counted += due.iter().map(|(_, told)| told.left_out).sum::<u64>();
+        }
+        assert!(lines <= 2 * 4 * 6, "{lines} lines in a minute");
+        assert_eq!(counted + sparing.0.values().map(|told| told.left_out).sum::<u64>(), 24_000 - 2 * (4 + 5 * 3));
+        let admitted = (0..9).filter(|_| sparing.admits(joined(&other), start)).count();
+        assert_eq!(admitted, 4, "another node has lines of its own");
     }
 }
