@@ -3,7 +3,7 @@
 use cara_std::access::{Functions, OwnedRule, Rate, Verbs, Who};
 use cara_std::control::protocol::{Answer, ArgumentValue, Question};
 
-use crate::support::{Depot, argument, ask, call, refused};
+use crate::support::{Depot, argument, ask, call, refused, until};
 
 fn rules(operator: &[&str], verbs: Verbs) -> Vec<OwnedRule> {
     let names = operator.iter().map(|&name| name.to_owned()).collect();
@@ -64,6 +64,27 @@ fn the_operator_does_what_its_rule_allows_as_often_as_it_does() {
     assert_eq!(refused(&mut client, Question::Call(call(Some("agv"), "slow", vec![]))), "NotAllowed");
     let counted = depot.system.counters();
     assert!(counted.contains(&("OperatorForbidden", 2)), "each refusal is counted: {counted:?}");
+}
+
+#[test]
+fn no_rate_holds_off_a_stop_of_the_operator() {
+    let (depot, agv) = Depot::with_agv();
+    let nothing =
+        |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
+    let stops = cara_std::ServiceOptions::new().stops_all().priority(cara_std::Priority::Emergency);
+    agv.my_function_list().add_service(&"halt()".parse().unwrap(), stops, nothing).unwrap();
+    agv.publish_my_function_list().unwrap();
+    until("the manager knows it", || depot.system.nodes_offering("halt").len() == 1);
+    let mut table = rules(&["halt", "fail"], Verbs::CALL);
+    table[1].rate = Some(Rate::new(1, cara_std::Duration::from_secs(3600)));
+    depot.system.set_access(Some(table.into()));
+    let mut client = depot.client();
+    for _ in 0..4 {
+        assert_eq!(error(&ask(&mut client, Question::Call(call(Some("agv"), "halt", vec![]))).unwrap()), None);
+    }
+    let ask_fail = || Question::Call(call(Some("agv"), "fail", vec![]));
+    assert!(ask(&mut client, ask_fail()).is_ok());
+    assert_eq!(refused(&mut client, ask_fail()), "TooSoon", "of others it does");
 }
 
 #[test]
