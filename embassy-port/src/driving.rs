@@ -97,10 +97,12 @@ impl<T> Machine<T> {
         let Self { links, mail, pool, functions, reply, access, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         // There is one place for a reply. While a task has not taken the last one, a link that may bring another one is not read.
-        if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
+        let holds_back = reply.is_taken() && link.awaits_reply();
+        let session = link.session.as_mut()?;
+        if holds_back {
+            session.hold_back();
             return None;
         }
-        let session = link.session.as_mut()?;
         let peeked = mail.lines.get_mut(usize::from(index))?.peek(scratch);
         let lent = scratch.get_mut(..peeked)?;
         let access = access.0;

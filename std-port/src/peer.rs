@@ -23,7 +23,7 @@ use core::net::SocketAddr;
 use crate::builder;
 use crate::cancellable::Cancellable;
 #[cfg(feature = "control")]
-use crate::control::protocol::LinkInfo;
+use crate::control::protocol::{DatagramsInfo, LinkInfo};
 #[cfg(feature = "control")]
 use crate::engine::CallFuture;
 use crate::engine::details::{Canceller, OnProgress, Watch};
@@ -216,6 +216,14 @@ impl<T: Send + 'static> Peer<T> {
             calls: state.session.calls_in_flight(),
             calls_here: state.session.calls_held(),
             queued_bytes: state.session.bytes_queued(),
+            stream_ms: state.session.stream_silent_for(self.engine.now()).as_millis(),
+            datagrams: state.session.hears_datagrams().map(|hears| match (hears, state.session.is_heard()) {
+                (true, true) => DatagramsInfo::Pass,
+                (true, false) => DatagramsInfo::ToUnit,
+                (false, true) => DatagramsInfo::ToNode,
+                (false, false) => DatagramsInfo::None,
+            }),
+            segment: link.stream.segment(),
         })
     }
 

@@ -126,6 +126,7 @@ pub(super) fn order<T: Send + 'static>(own: u32, peer: &Peer<T>, function: &str)
         holder,
         left_ms: left.map(|left| left.as_millis()),
         inhibited: latch.map(|Latch { by, reason }| InhibitedInfo { by, reason }),
+        age_ms: peer.link_info().map(|link| link.stream_ms),
     }
 }
 

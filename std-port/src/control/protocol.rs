@@ -2,6 +2,7 @@
 //! of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered with
 //! `Failed`, and the next line is read. An empty line is a [`BEAT`] and not answered.
 
+use cara_core::config::SHORT_SEGMENT;
 use cara_core::distribution::function::Attributes;
 use std::collections::BTreeMap;
 
@@ -532,6 +533,50 @@ pub struct LinkInfo {
     pub calls_here: u16,
     /// Bytes for it that the network has not taken yet.
     pub queued_bytes: usize,
+    /// How long ago something of it came in the stream.
+    #[serde(default)]
+    pub stream_ms: u64,
+    /// Where datagrams pass; absent while that is not known.
+    #[serde(default)]
+    pub datagrams: Option<DatagramsInfo>,
+    /// Longest segment that the unit sends in the stream, in bytes.
+    #[serde(default)]
+    pub segment: Option<u32>,
+}
+
+impl LinkInfo {
+    /// What is wrong with the ways between the two, as far as it is known.
+    pub fn trouble(&self) -> Option<String> {
+        let datagrams = match self.datagrams {
+            None | Some(DatagramsInfo::Pass) => None,
+            Some(DatagramsInfo::ToUnit) => Some("datagrams to it do not pass".to_owned()),
+            Some(DatagramsInfo::ToNode) => Some("datagrams from it do not pass".to_owned()),
+            Some(DatagramsInfo::None) => Some("no datagrams pass".to_owned()),
+        };
+        let stream =
+            (self.stream_ms > QUIET_STREAM_MS).then(|| format!("stream silent for {} s", self.stream_ms / 1000));
+        let segments = self.segment.filter(|segment| *segment <= u32::from(SHORT_SEGMENT));
+        let segments = segments.map(|segment| format!("segments of {segment} bytes"));
+        let all: Vec<String> = [datagrams, stream, segments].into_iter().flatten().collect();
+        (!all.is_empty()).then(|| all.join(", "))
+    }
+}
+
+/// A stream in order brings something more often: it is probed every 4 s.
+pub const QUIET_STREAM_MS: u64 = 6_000;
+
+/// In which directions a link's datagrams pass, as either end has told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DatagramsInfo {
+    /// In both.
+    Pass,
+    /// To the unit; the node tells that none come there.
+    ToUnit,
+    /// To the node, as it tells; none come here.
+    ToNode,
+    /// In neither.
+    None,
 }
 
 /// A refusal.
@@ -586,6 +631,9 @@ pub struct OrderInfo {
     pub left_ms: Option<u64>,
     /// What keeps every order from beginning.
     pub inhibited: Option<InhibitedInfo>,
+    /// How long ago the node's stream brought something: what is told here is as old, or a little older.
+    #[serde(default)]
+    pub age_ms: Option<u64>,
 }
 
 /// What inhibits a function.

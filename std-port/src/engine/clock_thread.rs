@@ -95,7 +95,13 @@ impl<T: Send + 'static> Engine<T> {
         let Some(listener) = &self.sockets.listener else { return };
         for _ in 0..BATCH {
             match listener.accept() {
-                Accepted::Stream(stream, address) => self.accepted(stream, address),
+                Accepted::Stream(stream, address) => {
+                    if lock(&self.short_segments).contains(&address.ip()) {
+                        // The one that it was meant for is there.
+                        listener.limit_segments(false);
+                    }
+                    self.accepted(stream, address);
+                }
                 Accepted::WouldBlock => return,
                 Accepted::Exhausted => {
                     warn_seldom!("no file descriptors are left for a new connection: raise the limit (ulimit -n)");

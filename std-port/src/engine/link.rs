@@ -380,7 +380,11 @@ impl Mailman<SocketAddr> for StdMailman<'_> {
     }
 
     fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
-        self.datagrams.send_to(to, datagram)
+        // The peer knows this end by the address of the stream, which need not be the host's first one.
+        match self.stream.and_then(Stream::local_host) {
+            Some(from) => self.datagrams.send_from(from, to, datagram),
+            None => self.datagrams.send_to(to, datagram),
+        }
     }
 
     fn broadcast(&mut self, datagram: &[u8]) -> bool {

@@ -19,6 +19,7 @@ use super::Engine;
 use super::link::{LinkCell, LinkState, Linux, StdMailman};
 use super::reader::Cause;
 use crate::event::UnitEvent;
+use crate::locks::lock;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Interest;
@@ -38,6 +39,9 @@ pub(crate) struct HubCell {
 const KEPT_FOR_PROVEN: u64 = 24;
 /// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
 const KEPT_FOR_OPERATOR: u64 = 20;
+
+/// Hosts that are remembered for the size of their segments. Beyond them all are forgotten, and found again.
+const SHORTENED: usize = 256;
 
 /// The node that a link is dialled for, as far as it is known.
 struct Dialed<'i>(Option<&'i Identity>);
@@ -166,7 +170,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
-        let stream = Stream::connect(to).ok();
+        let stream = Stream::connect(to, lock(&self.short_segments).contains(&to.ip())).ok();
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
             self.hub().hub.node.dial_failed(self.now(), identity);
             let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
@@ -265,6 +269,7 @@ impl<T: Send + 'static> Engine<T> {
             state.registration.is_out = false;
             let _ = self.thread_pool().epoll.remove(&link.stream);
         }
+        self.note_segments(link, reason);
         self.retire(link);
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);
@@ -276,6 +281,26 @@ impl<T: Send + 'static> Engine<T> {
         self.links.remove(link);
         // The hub may have something to do earlier than before.
         self.wake_clock();
+    }
+
+    /// Where long packets do not arrive, as it seems, the next streams have short segments. A board cannot limit those of a stream
+    /// that it dials, so the next one that is accepted is limited here.
+    fn note_segments(&self, link: &LinkCell, reason: CloseReason) {
+        let state = link.lock();
+        let (host, dialed) = (state.session.address().ip(), state.session.dialed());
+        drop(state);
+        let mut hosts = lock(&self.short_segments);
+        if reason == (CloseReason::StreamDead { long: true }) {
+            if hosts.len() >= SHORTENED {
+                hosts.clear();
+            }
+            if hosts.insert(host) {
+                tracing::warn!(%host, "long packets seem not to arrive: the next streams to it have segments of 536 bytes");
+            }
+        }
+        if !dialed && hosts.contains(&host) {
+            self.sockets.listener.iter().for_each(|listener| listener.limit_segments(true));
+        }
     }
 
     /// Passes on what the hub wants done, to the link that it meant and to no other.

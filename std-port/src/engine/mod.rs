@@ -81,6 +81,8 @@ pub(crate) use tables::node_storage;
 pub(crate) use tasks::{GivenUp, Spawned};
 pub(crate) use worker::{arena, arena_bytes, room};
 
+use std::collections::HashSet;
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{self, AtomicU64};
 use std::sync::mpsc::SyncSender;
@@ -131,6 +133,8 @@ pub(crate) struct Engine<T: 'static> {
     /// Beside the hub, whose lock a session's datagram does not take.
     pub(crate) fleet: Fleet,
     sockets: Sockets,
+    /// Hosts to which long packets do not come.
+    short_segments: Mutex<HashSet<IpAddr>>,
     links: Links,
     hub: Mutex<HubCell>,
     peers: RwLock<Peers>,
@@ -184,6 +188,7 @@ impl<T: Send + 'static> Engine<T> {
             me: me.clone(),
             fleet: parts.hub.hub.node.fleet(),
             sockets: Sockets::new(parts.datagrams, parts.listener),
+            short_segments: Mutex::default(),
             links: Links::new(parts.maximum_links, parts.capacities),
             services: Services::new(parts.functions, parts.state, parts.hub.longest_message()),
             hub: Mutex::new(parts.hub),

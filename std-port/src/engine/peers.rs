@@ -294,7 +294,7 @@ pub(super) mod tests {
         };
         let config = SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
         let session = Session::new(Instant::START, config, Cipher::new(cara_core::config::Mode::Plain), storage);
-        Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
+        Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address, false).unwrap(), session, true))
     }
 
     fn ids(peers: &Peers) -> Vec<u32> {

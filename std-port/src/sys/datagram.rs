@@ -5,11 +5,13 @@
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use cara_core::error::Error;
+use nix::libc::{in_addr, in_pktinfo};
+use nix::sys::socket::{ControlMessage, MsgFlags, SockaddrIn, sendmsg};
 use rustix::io::Errno;
 use rustix::net::{
     AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, bind, recvfrom, sendto, socket_with, sockopt,
@@ -113,6 +115,27 @@ impl Datagrams {
     /// Sends one datagram to one address. `false` when the network refused it or has no room.
     pub fn send_to(&self, to: SocketAddr, datagram: &[u8]) -> bool {
         self.try_send_to(to, datagram).is_ok()
+    }
+
+    /// The same from an address of this host.
+    pub fn send_from(&self, from: Ipv4Addr, to: SocketAddr, datagram: &[u8]) -> bool {
+        let SocketAddr::V4(to) = to else { return self.send_to(to, datagram) };
+        let source = in_pktinfo {
+            ipi_ifindex: 0,
+            ipi_spec_dst: in_addr { s_addr: u32::from(from).to_be() },
+            ipi_addr: in_addr { s_addr: 0 },
+        };
+        let (vectors, source) = ([io::IoSlice::new(datagram)], [ControlMessage::Ipv4PacketInfo(&source)]);
+        let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_NOSIGNAL;
+        let to = SockaddrIn::from(to);
+        let sent = unless_earlier(|| {
+            sendmsg(self.own.as_raw_fd(), &vectors, &source, flags, Some(&to))
+                .map_err(|errno| Errno::from_raw_os_error(errno as i32))
+        });
+        if let Err(errno) = sent {
+            tracing::debug!(%errno, %from, %to, "a datagram could not be sent");
+        }
+        sent.is_ok()
     }
 
     fn try_send_to(&self, to: SocketAddr, datagram: &[u8]) -> rustix::io::Result<()> {
@@ -230,9 +253,13 @@ fn open_socket(address: Ipv4Addr, port: u16, shared: bool) -> rustix::io::Result
 
 fn send_datagram(socket: &OwnedFd, to: SocketAddr, datagram: &[u8]) -> rustix::io::Result<()> {
     let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
-    // A refusal that an earlier datagram met is reported by the next send, which itself was not tried.
+    unless_earlier(|| sendto(socket, datagram, flags, &to))
+}
+
+/// A refusal that an earlier datagram met is reported by the next send, which itself was not tried.
+fn unless_earlier(mut send: impl FnMut() -> rustix::io::Result<usize>) -> rustix::io::Result<()> {
     for _ in 0..3 {
-        match sendto(socket, datagram, flags, &to) {
+        match send() {
             Ok(_) => return Ok(()),
             Err(Errno::INTR | Errno::CONNREFUSED) => {}
             Err(errno) => return Err(errno),
@@ -325,6 +352,21 @@ mod tests {
         assert!(answerer.send_to(from, b"here"));
         assert_eq!(receive(&asker, Socket::Own, b"here").port(), answerer.own_port());
         assert_eq!(third.receive(Socket::Own, &mut [0; 64]), None);
+    }
+
+    #[test]
+    fn a_datagram_leaves_from_the_address_that_is_asked_for() {
+        let [unit, other] = units();
+        let (from, to) = (Ipv4Addr::new(127, 0, 0, 9), SocketAddr::from((Ipv4Addr::LOCALHOST, other.own_port())));
+        // A socket that is bound to one address sends from no other.
+        let wide = Datagrams::open(Interfaces::All, unit.discovery_port()).unwrap();
+        assert!(wide.send_from(from, to, b"alias"));
+        assert_eq!(receive(&other, Socket::Own, b"alias"), SocketAddr::from((from, wide.own_port())));
+        assert!(!wide.send_from(Ipv4Addr::new(192, 0, 2, 1), to, b"none"), "the host has no such address");
+        let gone = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap();
+        for _ in 0..10 {
+            assert!(wide.send_from(from, gone, b"lost"));
+        }
     }
 
     #[test]

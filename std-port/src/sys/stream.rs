@@ -4,9 +4,11 @@
 //! waits for the reply with one system call. All other calls are non-blocking, by a flag per call.
 
 use std::io::{self, IoSlice};
-use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
+use std::sync::OnceLock;
 
+use cara_core::config::SHORT_SEGMENT;
 use cara_core::error::CloseReason;
 use cara_core::time::Duration;
 use rustix::io::{Errno, fcntl_dupfd_cloexec, ioctl_fionbio, ioctl_fionread};
@@ -26,6 +28,9 @@ pub(crate) const UNSENT_BYTES: u32 = 16 * 1024;
 
 /// Connections that the kernel completes ahead of `accept`: a fleet that dials a restarted manager at once.
 const BACKLOG: i32 = 1024;
+
+/// What a closed stream has not sent after this is dropped.
+const FAREWELL: std::time::Duration = std::time::Duration::from_secs(10);
 
 /// Slices that one send passes on; more are sent by the next call.
 const SLICES: usize = 8;
@@ -57,17 +62,23 @@ pub(crate) enum Received {
 #[derive(Debug)]
 pub(crate) struct Stream {
     socket: OwnedFd,
+    /// This end's address, once it was asked for.
+    local: OnceLock<Option<Ipv4Addr>>,
 }
 
 impl Stream {
     /// Starts to connect to `to` and returns at once; the stream is writable when the attempt has ended, and
     /// [`finish_connect`](Self::finish_connect) tells how. Sending or receiving before that finds it closed or blocked.
-    pub(crate) fn connect(to: SocketAddr) -> Result<Self, CloseReason> {
+    /// With `short` neither end sends segments above [`SHORT_SEGMENT`].
+    pub(crate) fn connect(to: SocketAddr, short: bool) -> Result<Self, CloseReason> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = socket_with(AddressFamily::of(to), SocketType::STREAM, flags, None).map_err(dial_failed)?;
         set_options(&socket).map_err(dial_failed)?;
+        if short {
+            limit_segments(&socket, true);
+        }
         match connect(&socket, &to) {
-            Ok(()) | Err(Errno::INPROGRESS | Errno::INTR) => Ok(Self { socket }),
+            Ok(()) | Err(Errno::INPROGRESS | Errno::INTR) => Ok(Self::new(socket)),
             Err(errno) => Err(dial_failed(errno)),
         }
     }
@@ -91,7 +102,7 @@ impl Stream {
     /// The same stream behind the lowest descriptor that is free, if that is lower than its own.
     pub(crate) fn with_lowest_number(self) -> Self {
         match fcntl_dupfd_cloexec(&self.socket, 0) {
-            Ok(socket) if socket.as_raw_fd() < self.socket.as_raw_fd() => Self { socket },
+            Ok(socket) if socket.as_raw_fd() < self.socket.as_raw_fd() => Self::new(socket),
             _ => self,
         }
     }
@@ -102,9 +113,26 @@ impl Stream {
     }
 
     /// The address of this end; `None` when the stream is not connected.
-    #[cfg(test)]
     pub(crate) fn local_address(&self) -> Option<SocketAddr> {
         getsockname(&self.socket).ok()?.try_into().ok()
+    }
+
+    /// The host's address at this end of a connected stream, from which the link's datagrams leave as well.
+    pub(crate) fn local_host(&self) -> Option<Ipv4Addr> {
+        *self.local.get_or_init(|| match self.local_address()?.ip() {
+            IpAddr::V4(host) => Some(host),
+            IpAddr::V6(_) => None,
+        })
+    }
+
+    /// Longest segment that this end sends.
+    #[cfg(feature = "control")]
+    pub(crate) fn segment(&self) -> Option<u32> {
+        socket2::SockRef::from(&self.socket).tcp_mss().ok()
+    }
+
+    fn new(socket: OwnedFd) -> Self {
+        Self { socket, local: OnceLock::new() }
     }
 
     /// Sends what the kernel takes of `slices`, in order, without waiting; 0 when it has no room.
@@ -167,6 +195,9 @@ impl Stream {
     /// Ends both directions: what was sent still goes out, a thread that waits in a receive returns, and both ends
     /// find the stream closed.
     pub(crate) fn shutdown(&self) {
+        // What a dead path does not take need not stay in the kernel for minutes. While the link lives its end is the core's to find
+        // out: the kernel would count a peer that holds reading back as dead.
+        let _ = socket2::SockRef::from(&self.socket).set_tcp_user_timeout(Some(FAREWELL));
         // A stream that is not connected (any more) is closed already.
         let _ = shutdown(&self.socket, Shutdown::Both);
     }
@@ -174,13 +205,21 @@ impl Stream {
     /// A connected socket with the port's options, in blocking mode.
     fn accepted(socket: OwnedFd) -> rustix::io::Result<Self> {
         set_options(&socket)?;
-        Ok(Self { socket })
+        Ok(Self::new(socket))
     }
 }
 
 impl AsFd for Stream {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.socket.as_fd()
+    }
+}
+
+/// Neither end of a connection sends segments above [`SHORT_SEGMENT`], or as long as the network takes. Before it is opened.
+fn limit_segments(socket: &OwnedFd, limited: bool) {
+    let most = if limited { SHORT_SEGMENT.into() } else { 0 };
+    if let Err(error) = socket2::SockRef::from(socket).set_tcp_mss(most) {
+        tracing::warn!(%error, "the segments of connections could not be limited");
     }
 }
 
@@ -232,6 +271,11 @@ impl Listener {
     /// The port that it listens on.
     pub(crate) const fn port(&self) -> u16 {
         self.port
+    }
+
+    /// Connections that come from now on have [short segments](SHORT_SEGMENT), or not.
+    pub(crate) fn limit_segments(&self, limited: bool) {
+        limit_segments(&self.socket, limited);
     }
 
     /// Takes the next waiting connection, never waits for one.
@@ -301,7 +345,7 @@ mod tests {
 
     fn pair() -> (Stream, Stream) {
         let listener = Listener::open(Ipv4Addr::LOCALHOST, 0).unwrap();
-        let near = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, listener.port()).into()).unwrap();
+        let near = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, listener.port()).into(), false).unwrap();
         await_ready(&near, Interest::WRITE_ONCE);
         assert_eq!(near.finish_connect(), Ok(true));
         await_ready(&listener, Interest::READ_LEVEL);
@@ -309,6 +353,23 @@ mod tests {
         assert_eq!(Some(address), near.local_address());
         assert!(matches!(listener.accept(), Accepted::WouldBlock));
         (near, far)
+    }
+
+    #[test]
+    fn segments_are_limited_by_the_end_that_dials_or_by_the_one_that_listens() {
+        let listener = Listener::open(Ipv4Addr::LOCALHOST, 0).unwrap();
+        let to = SocketAddrV4::new(Ipv4Addr::LOCALHOST, listener.port()).into();
+        for (dials_short, accepts_short) in [(false, false), (true, false), (false, true), (false, false)] {
+            listener.limit_segments(accepts_short);
+            let near = Stream::connect(to, dials_short).unwrap();
+            await_ready(&near, Interest::WRITE_ONCE);
+            await_ready(&listener, Interest::READ_LEVEL);
+            let Accepted::Stream(far, _) = listener.accept() else { panic!("nobody was accepted") };
+            for end in [near, far] {
+                let mss = socket2::SockRef::from(&end.socket).tcp_mss().unwrap();
+                assert_eq!(mss <= SHORT_SEGMENT.into(), dials_short || accepts_short, "{mss}");
+            }
+        }
     }
 
     /// Receives exactly `count` bytes.
@@ -414,7 +475,7 @@ mod tests {
     #[test]
     fn a_port_where_nobody_listens_is_a_failed_dial() {
         let unused = Listener::open(Ipv4Addr::LOCALHOST, 0).unwrap().port();
-        let failed = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, unused).into()).and_then(|stream| {
+        let failed = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, unused).into(), false).and_then(|stream| {
             await_ready(&stream, Interest::WRITE_ONCE);
             stream.finish_connect()
         });
@@ -429,7 +490,7 @@ mod tests {
         bind(&full, &SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0)).unwrap();
         listen(&full, 0).unwrap();
         let to = SocketAddrV4::new(Ipv4Addr::LOCALHOST, local_port(&full).unwrap()).into();
-        let dials: Vec<_> = (0..4).map(|_| Stream::connect(to).unwrap()).collect();
+        let dials: Vec<_> = (0..4).map(|_| Stream::connect(to, false).unwrap()).collect();
         assert_eq!(dials.last().unwrap().finish_connect(), Ok(false));
     }
 

@@ -1,10 +1,10 @@
 //! A node that is connected: in order, or with something that will take its link away.
 
-use cara_std::control::protocol::NodeInfo;
+use cara_std::control::protocol::{DatagramsInfo, NodeInfo, QUIET_STREAM_MS};
 
 use super::causes::{duplicate, refusal, restarting};
 use super::evidence::Evidence;
-use super::finding::{Finding, Id};
+use super::finding::{Finding, Id, Severity};
 use super::running::Running;
 
 use std::time::Duration;
@@ -15,6 +15,8 @@ const SETTLED: Duration = Duration::from_secs(10);
 const WATCHED: Duration = Duration::from_secs(2);
 /// Missed signs of life below which nothing is said.
 const FEW_MISSES: u64 = 3;
+/// Segments of this size or less are used where longer ones do not pass.
+const SHORT_SEGMENT: u32 = 536;
 /// Missed signs of life per datagram received above which a link loses too much: one in fifty.
 const LOSSY: u64 = 50;
 
@@ -25,15 +27,18 @@ pub(crate) fn check(seen: &Evidence, unit: &Running, node: &NodeInfo) -> Vec<Fin
     let duplicates = duplicate(&name, &lives).or_else(|| refused_duplicate(unit, &name));
     let mut found: Vec<Finding> = duplicates.map(|finding| finding.certain(true)).into_iter().collect();
     found.extend(restarting(&name, &lives));
-    found.extend(lossy(unit, &name));
-    if !found.is_empty() {
+    found.extend(lossy(unit, node));
+    found.extend(ways(unit, node));
+    if found.iter().any(|finding| finding.severity != Severity::Info) {
         return found;
     }
     let address = node.address.as_deref().unwrap_or("an unknown address");
     let text = format!("{name} is connected to {} at {address}{}", unit.name(), since(node));
     let settled = node.connected_ms.is_some_and(|ms| Duration::from_millis(ms) >= SETTLED);
     let certain = settled && seen.listened >= WATCHED;
-    vec![Finding::info(Id::Connected, text, "nothing needs to be done").about(&name).certain(certain)]
+    let advice = if found.is_empty() { "nothing needs to be done" } else { "it is in order now" };
+    found.push(Finding::info(Id::Connected, text, advice).about(&name).certain(certain));
+    found
 }
 
 /// For how long.
@@ -52,7 +57,12 @@ fn refused_duplicate(unit: &Running, name: &str) -> Option<Finding> {
 }
 
 /// A link on which signs of life get lost.
-pub(crate) fn lossy(unit: &Running, node: &str) -> Option<Finding> {
+pub(crate) fn lossy(unit: &Running, node: &NodeInfo) -> Option<Finding> {
+    // Where they do not pass at all, that is the finding.
+    if node.link.and_then(|link| link.datagrams).is_some_and(|datagrams| datagrams != DatagramsInfo::Pass) {
+        return None;
+    }
+    let node = &format!("{}/{}", node.name, node.id);
     let missed = unit.counter(node, "KeepAlivesMissed")?;
     let received = unit.counter(node, "DatagramsReceived")?;
     (missed >= FEW_MISSES && missed.saturating_mul(LOSSY) >= received).then(|| {
@@ -63,8 +73,62 @@ pub(crate) fn lossy(unit: &Running, node: &str) -> Option<Finding> {
     })
 }
 
+/// Which way to a connected node is blocked, as far as either end knows.
+pub(crate) fn ways(unit: &Running, node: &NodeInfo) -> Vec<Finding> {
+    let name = format!("{}/{}", node.name, node.id);
+    let (own, address) = (unit.name(), node.address.as_deref().unwrap_or("an unknown address"));
+    let blocked = match node.link.and_then(|link| link.datagrams) {
+        None | Some(DatagramsInfo::Pass) => None,
+        Some(DatagramsInfo::ToUnit) => {
+            Some(format!("datagrams of {own} do not arrive at {name} ({address}); those of {name} do here"))
+        }
+        Some(DatagramsInfo::ToNode) => {
+            Some(format!("no datagrams of {name} ({address}) arrive at {own}; those of {own} do there"))
+        }
+        Some(DatagramsInfo::None) => {
+            Some(format!("no datagrams pass between {own} and {name} ({address}); the connection does"))
+        }
+    };
+    let blocked = blocked.map(|found| {
+        let advice = "let UDP through the firewalls and NATs between the two, from and to any port; until then signs of life and \
+                      best-effort calls go in the connection, and a stop has no second way";
+        Finding::warning(Id::DatagramsBlocked, found, advice).about(&name)
+    });
+    let silent = node.link.map(|link| link.stream_ms).filter(|silent| *silent > QUIET_STREAM_MS);
+    let died = unit.counter(&name, "StreamsDied").filter(|died| *died > 0);
+    let short = node.link.and_then(|link| link.segment).filter(|segment| *segment <= SHORT_SEGMENT);
+    let stream = match (silent, died) {
+        (Some(silent), _) => Some(format!(
+            "the connection to {name} has brought nothing for {} s, though it is heard by datagrams",
+            silent / 1000
+        )),
+        (None, Some(died)) => {
+            let times = if died == 1 { "once".to_owned() } else { format!("{died} times") };
+            Some(format!("the connection to {name} was dead {times} though {name} was heard, and was opened again"))
+        }
+        (None, None) => None,
+    };
+    let stream = stream.map(|found| {
+        let (more, advice) = match short {
+            Some(segment) => (
+                format!(", now with segments of {segment} bytes"),
+                "a part of the path seems to drop long packets: look at the MTU of its tunnels, switches and radios",
+            ),
+            None => (
+                String::new(),
+                "look for a firewall or a NAT between the two that drops TCP, or forgets sessions that are idle or older than its restart",
+            ),
+        };
+        let severity = if silent.is_some() { Severity::Warning } else { Severity::Info };
+        Finding { severity, ..Finding::warning(Id::StreamDead, found + &more, advice) }.about(&name)
+    });
+    blocked.into_iter().chain(stream).collect()
+}
+
 #[cfg(test)]
 mod tests {
+    use cara_std::control::protocol::LinkInfo;
+
     use super::super::evidence::samples::{evidence, life, node_info, running};
     use super::*;
 
@@ -95,6 +159,44 @@ mod tests {
             let expected = if lossy { vec![Id::LossyLink] } else { vec![Id::Connected] };
             assert_eq!(ids(&seen), expected, "{missed} of {received}");
         }
+    }
+
+    #[test]
+    fn the_way_that_is_blocked_is_told_and_no_more_than_is_known() {
+        let mut seen = connected();
+        let link = LinkInfo {
+            silent_ms: 100,
+            calls: 0,
+            calls_here: 0,
+            queued_bytes: 0,
+            stream_ms: 3_000,
+            datagrams: None,
+            segment: Some(1_448),
+        };
+        let mut told = |link: LinkInfo, died| {
+            seen.running[0].nodes[0].link = Some(link);
+            seen.running[0].count("agv/7", &[("StreamsDied", died)]);
+            let found = check(&seen, &seen.running[0], &seen.running[0].nodes[0]);
+            found.into_iter().map(|finding| (finding.id, finding.found)).collect::<Vec<_>>()
+        };
+        for datagrams in [None, Some(DatagramsInfo::Pass)] {
+            assert_eq!(told(LinkInfo { datagrams, ..link }, 0)[0].0, Id::Connected);
+        }
+        for (datagrams, text) in [
+            (DatagramsInfo::ToUnit, "datagrams of boss/1 do not arrive at agv/7"),
+            (DatagramsInfo::ToNode, "no datagrams of agv/7 (10.0.0.7:5000) arrive at boss/1"),
+            (DatagramsInfo::None, "no datagrams pass between boss/1 and agv/7"),
+        ] {
+            let found = told(LinkInfo { datagrams: Some(datagrams), ..link }, 0);
+            assert!(found.len() == 1 && found[0].0 == Id::DatagramsBlocked && found[0].1.contains(text), "{found:?}");
+        }
+        let silent = told(LinkInfo { stream_ms: 9_500, ..link }, 0);
+        assert!(silent.len() == 1 && silent[0].0 == Id::StreamDead && silent[0].1.contains("for 9 s"), "{silent:?}");
+        let died = told(link, 2);
+        assert_eq!([died[0].0, died[1].0], [Id::StreamDead, Id::Connected]);
+        assert!(died[0].1.contains("dead 2 times") && !died[0].1.contains("segments"), "{died:?}");
+        let short = told(LinkInfo { segment: Some(524), ..link }, 1);
+        assert!(short[0].1.contains("segments of 524 bytes"), "{short:?}");
     }
 
     #[test]

@@ -80,6 +80,10 @@ pub(crate) enum Id {
     AskItsManager,
     /// Signs of life get lost on the node's link.
     LossyLink,
+    /// The node's datagrams do not pass, in one direction or both.
+    DatagramsBlocked,
+    /// The stream of the node's link was dead though the node was heard.
+    StreamDead,
     /// Too few files may be open for the nodes that may connect.
     FewDescriptors,
     /// A unit's access table has a mistake, so that an earlier one is in force.
@@ -99,7 +103,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 38] = [
+    pub(crate) const ALL: [Self; 40] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -131,6 +135,8 @@ impl Id {
         Self::NotHeard,
         Self::AskItsManager,
         Self::LossyLink,
+        Self::DatagramsBlocked,
+        Self::StreamDead,
         Self::FewDescriptors,
         Self::AccessTable,
         Self::ForeignDatagrams,
@@ -174,6 +180,8 @@ impl Id {
             Self::NotHeard => "not-heard",
             Self::AskItsManager => "ask-its-manager",
             Self::LossyLink => "lossy-link",
+            Self::DatagramsBlocked => "datagrams-blocked",
+            Self::StreamDead => "stream-dead",
             Self::FewDescriptors => "few-descriptors",
             Self::AccessTable => "access-table",
             Self::ForeignDatagrams => "foreign-datagrams",

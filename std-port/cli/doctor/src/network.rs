@@ -9,7 +9,7 @@ use super::causes::{
     dial_of, duplicate, duplicate_managers, full, missing_manager, one_way, other_version, refusal, restarting,
     tcp_blocked, text_of,
 };
-use super::connected::lossy;
+use super::connected::{lossy, ways};
 use super::evidence::Evidence;
 use super::finding::{Finding, Id, Severity};
 use super::host;
@@ -138,7 +138,8 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
         .filter_map(|refused| refusal(&unit.name(), refused));
     found.extend(refusals.take(MOST).map(|finding| Finding { severity: Severity::Warning, ..finding }));
     let connected = unit.nodes.iter().filter(|node| node.connected);
-    found.extend(connected.filter_map(|node| lossy(unit, &format!("{}/{}", node.name, node.id))).take(MOST));
+    found.extend(connected.clone().filter_map(|node| lossy(unit, node)).take(MOST));
+    found.extend(connected.flat_map(|node| ways(unit, node)).take(MOST));
     found.extend(returns(unit));
     found.extend(left::all(seen, unit).into_iter().take(MOST));
     found

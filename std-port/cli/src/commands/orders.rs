@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use cara_std::control::protocol::{Answer, InhibitedInfo, OrderInfo, Question};
+use cara_std::control::protocol::{Answer, InhibitedInfo, OrderInfo, QUIET_STREAM_MS, Question};
 use serde_json::json;
 
 use crate::nodes;
@@ -41,12 +41,15 @@ pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Res
 
 fn table(orders: &[OrderInfo]) -> Rows {
     let mut rows = Rows::new(["NODE", "FUNCTION", "ORDER", "OF UNIT", "ENDS WITHIN", "INHIBITED"]);
-    for OrderInfo { node, id, function, order, holder, left_ms, inhibited } in orders {
+    for OrderInfo { node, id, function, order, holder, left_ms, inhibited, age_ms } in orders {
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
         let cells = [
             format!("{node}/{id}"),
             function.clone(),
-            order.clone(),
+            match age_ms.filter(|age| *age > QUIET_STREAM_MS) {
+                Some(age) => format!("{order}, {} s ago", age / 1000),
+                None => order.clone(),
+            },
             or_dash(holder.map(|holder| holder.to_string())),
             or_dash(left_ms.map(|left| format!("{left} ms"))),
             or_dash(inhibited.map(by_whom)),

@@ -101,7 +101,10 @@ fn joined(nodes: &[NodeInfo]) -> Rows {
                 node.name.clone(),
                 node.id.to_string(),
                 node.role.clone(),
-                state.into(),
+                match node.link.and_then(|link| link.trouble()) {
+                    Some(trouble) => format!("{state}, {trouble}"),
+                    None => state.into(),
+                },
                 or_dash(node.address.clone()),
                 or_dash(node.version.map(|version| version.to_string())),
                 node.functions.to_string(),

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use cara_std::control::protocol::{
-    ConstraintsInfo, InhibitedInfo, LimitsInfo, LinkInfo, NodeInfo, OrderInfo, RefusedInfo, UnitInfo,
+    ConstraintsInfo, DatagramsInfo, InhibitedInfo, LimitsInfo, LinkInfo, NodeInfo, OrderInfo, RefusedInfo, UnitInfo,
 };
 use cara_std::is_hidden;
 use ratatui::Terminal;
@@ -34,7 +34,15 @@ fn node(name: &str, id: u32) -> NodeInfo {
         left_reason: None,
         left_text: None,
         limits: Some(LimitsInfo { message_size: 32_768, chunk_size: 4_096, calls: 8, minimum_interval_us: 0 }),
-        link: Some(LinkInfo { silent_ms: 120, calls: 1, calls_here: 0, queued_bytes: 2_048 }),
+        link: Some(LinkInfo {
+            silent_ms: 120,
+            calls: 1,
+            calls_here: 0,
+            queued_bytes: 2_048,
+            stream_ms: 120,
+            datagrams: Some(DatagramsInfo::Pass),
+            segment: None,
+        }),
         functions: 2,
     }
 }
@@ -61,6 +69,7 @@ fn order(node: &str, id: u32, left_ms: Option<u64>, stopped_by: Option<u32>) -> 
         holder: Some(1),
         left_ms,
         inhibited: stopped_by.map(|by| InhibitedInfo { by, reason: 0 }),
+        age_ms: None,
     }
 }
 
