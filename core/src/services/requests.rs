@@ -127,14 +127,7 @@ impl<S: Storage> Requests<S> {
             release_unsent: false,
         };
         if self.in_flight >= self.pending.len() {
-            let free = self.urgent.iter().position(Option::is_none).filter(|_| is_urgent);
-            let Some(free) = free else { return Err(Error::Full(Limit::Calls)) };
-            let Some(id) = self.next_id() else { return Ok(None) };
-            if let Some(place) = self.urgent.get_mut(free) {
-                *place = Some(pending(id));
-            }
-            self.earliest = self.earliest.min(deadline);
-            return Ok(Some(id));
+            return if is_urgent { self.open_urgent(&pending(CallId(0))) } else { Err(Error::Full(Limit::Calls)) };
         }
         // The slot follows from the id, so an id whose slot is taken is passed over; one is free, so the loop ends.
         for _ in 0..self.pending.len() {
@@ -150,6 +143,18 @@ impl<S: Storage> Requests<S> {
         Err(Error::Full(Limit::Calls))
     }
 
+    /// A slot for an emergency beside a table that is full.
+    #[cold]
+    fn open_urgent(&mut self, pending: &Pending) -> Result<Option<CallId>, Error> {
+        let free = self.urgent.iter().position(Option::is_none).ok_or(Error::Full(Limit::Calls))?;
+        let Some(id) = self.next_id() else { return Ok(None) };
+        if let Some(place) = self.urgent.get_mut(free) {
+            *place = Some(Pending { id, ..*pending });
+        }
+        self.earliest = self.earliest.min(pending.deadline);
+        Ok(Some(id))
+    }
+
     /// Ends a call and frees its slot. `None` when it had ended already.
     pub(crate) fn close(&mut self, id: CallId) -> Option<Pending> {
         self.take(id, false)
@@ -162,6 +167,12 @@ impl<S: Storage> Requests<S> {
             self.in_flight = self.in_flight.saturating_sub(1);
             return Some(pending);
         }
+        self.take_urgent(id, release_unsent)
+    }
+
+    #[cold]
+    fn take_urgent(&mut self, id: CallId, release_unsent: bool) -> Option<Pending> {
+        let is_meant = |pending: &mut Pending| pending.id == id && pending.release_unsent == release_unsent;
         self.urgent.iter_mut().find_map(|place| place.take_if(is_meant))
     }
 
