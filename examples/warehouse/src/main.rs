@@ -27,9 +27,12 @@ enum Role {
 }
 
 fn main() -> Result<ExitCode> {
+    use std::io::Write;
     use tracing_subscriber::EnvFilter;
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    // A terminal that takes nothing holds up no thread that moves or stops something.
+    let lines = cara_std::LineQueue::new("log", |line, _| std::io::stderr().write_all(line))?;
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(move || lines.clone()).init();
     match Arguments::parse().role {
         Role::Run(options) => run::run(&options),
         Role::Vehicles(options) => host::run(&options).map(|()| ExitCode::SUCCESS),

@@ -62,7 +62,8 @@ fn a_manager_is_found_from_a_login_and_from_a_service_whichever_started_it() {
     let host = Host::new();
     let nowhere = host.cara(true, &["stop", "--all"]);
     assert_eq!(nowhere.code, 3, "{}", nowhere.everything());
-    for place in [host.of_login().join("cara"), host.temporary(), "/run/user/".into(), format!("{}cara-", "/tmp/").into()] {
+    for place in [host.of_login().join("cara"), host.temporary(), "/run/user/".into(), Path::new("/tmp").join("cara-")]
+    {
         nowhere.says(place.to_str().unwrap());
     }
     let vehicle = agv(host.stage.vehicle("agv", 21));
