@@ -44,6 +44,7 @@ impl Config {
     }
 
     /// An m_unit.
+    #[cfg(feature = "manager")]
     pub fn m_unit(name: &str, id: u32, security: Security) -> Result<Self, Error> {
         let unit = Self::new(Identity::m_unit(name, id)?, Target::Everybody, security);
         let port = unit.node.udp_port;

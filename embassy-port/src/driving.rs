@@ -13,6 +13,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::mailman::LinkId;
+use cara_core::host::port::Port as _;
 use cara_core::services::Context;
 use cara_core::services::lease::Lease;
 use cara_core::services::session::{Call, Event};
@@ -22,7 +23,7 @@ use core::task::{Context as TaskContext, Poll};
 
 use crate::event::{Name, UnitEvent};
 use crate::line::{Progress, address_of};
-use crate::machine::{LinkSession, Machine};
+use crate::machine::{Board, LinkSession, Machine};
 use crate::replies::ended;
 #[cfg(feature = "details")]
 use crate::replies::told;
@@ -163,11 +164,11 @@ impl<T> Machine<T> {
             None => {}
             Some(ClaimEvent::Keep(manager, tagged)) => self.unstored = Some((manager, tagged)),
             Some(ClaimEvent::Unkept(peer, claim)) => self.tell(UnitEvent::ClaimNotKept { peer, claim }),
-            Some(ClaimEvent::Raise(above)) => {
+            Some(ClaimEvent::Raise(above)) if Board::MANAGES => {
                 let claimant = self.proof.seed();
                 self.raise_claim(above.raised(claimant));
             }
-            Some(ClaimEvent::StepDown(by)) => {
+            Some(ClaimEvent::StepDown(by)) if Board::MANAGES => {
                 self.stop();
                 self.tell(UnitEvent::Fenced { claim: by.claim });
             }
@@ -216,6 +217,7 @@ impl<T> Machine<T> {
                     self.with(index, |session, cx| session.connected(cx));
                 }
                 Progress::Broken => self.disconnected(index, CloseReason::DialFailed),
+                Progress::Accepted(_) if !Board::MANAGES => self.hang_up(index),
                 Progress::Accepted(from) => match self.open(index, from, false) {
                     Some(()) => {
                         self.with(index, |session, cx| session.connected(cx));
@@ -227,8 +229,10 @@ impl<T> Machine<T> {
                 self.disconnected(index, CloseReason::Reset);
             }
         }
-        self.show_one_out(now);
-        self.listen();
+        if Board::MANAGES {
+            self.show_one_out(now);
+            self.listen();
+        }
     }
 
     /// Closes the oldest link without a proof, if no socket listens, because the stack then refuses dials; and if there

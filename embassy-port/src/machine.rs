@@ -41,6 +41,7 @@ impl Port for Board {
     type Storage = Lent;
     type Cipher = LinkCipher;
     type Endpoint = SocketAddrV4;
+    const MANAGES: bool = cfg!(feature = "manager");
 }
 
 pub(crate) type LinkSession = Session<Board>;
@@ -244,7 +245,7 @@ impl<T> Machine<T> {
 
     /// Takes connections with every socket that has nothing else to do, if the unit is one that is dialled.
     pub(crate) fn listen(&mut self) {
-        if self.hub.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
+        if Board::MANAGES && self.hub.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
             let port = self.tcp_port;
             self.mail.lines.iter_mut().for_each(|line| line.listen(port));
         }

@@ -13,6 +13,7 @@ use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::identity::Role;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
+use cara_core::host::port::Port as _;
 use cara_core::services::CallHead;
 use cara_core::services::hub::Hub;
 use cara_core::services::lease::Latch;
@@ -31,7 +32,7 @@ use crate::handle::Handle;
 use crate::handler::Listed;
 use crate::limits::Limits;
 use crate::line::Line;
-use crate::machine::{Link, Machine, Shared, Wakers};
+use crate::machine::{Board, Link, Machine, Shared, Wakers};
 use crate::mail::EmbassyMailman;
 use crate::replies::{ReplyBox, Waiter};
 use crate::runner::Runner;
@@ -254,7 +255,7 @@ impl<
         let (port, tcp_port) = (config.node.udp_port, config.node.tcp_port);
         let (seed, manager) = (config.node.seed, config.manager());
         let mut node = Node::new(now(), config.node, storage);
-        if node.identity().role() == Role::MUnit {
+        if Board::MANAGES && node.identity().role() == Role::MUnit {
             let claim = if config.claim == Claim::NONE { Claim::NONE.raised(seed) } else { config.claim };
             let identity = node.identity().clone();
             node.set_claim(claim.tagged(&identity, config.security.0.codes()).ok_or(Error::NoOwnKey)?);

@@ -13,6 +13,9 @@ pub trait Port: 'static {
     /// How nodes are addressed: [`SocketAddr`](core::net::SocketAddr) or the smaller [`SocketAddrV4`](core::net::SocketAddrV4)
     /// over IP.
     type Endpoint: Endpoint;
+    /// Whether its units may be m_units. Where none is, what only they do (answers to searches, links that are accepted, claims that
+    /// are raised) is left out of the program.
+    const MANAGES: bool = true;
 }
 
 /// Slices of a port's storage.

@@ -58,7 +58,7 @@ impl<P: Port> Node<P> {
         if hello.identity == self.config.identity {
             return Err(Refusal::DuplicateIdentity);
         }
-        match (self.config.identity.role(), hello.identity.role()) {
+        match (self.role(), hello.identity.role()) {
             (Role::SUnit, Role::SUnit) => Err(Refusal::Role),
             (Role::SUnit, Role::MUnit) if self.is_wanted(&hello.identity) => Ok(()),
             (Role::SUnit, Role::MUnit) => Err(Refusal::WrongManager),

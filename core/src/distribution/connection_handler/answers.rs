@@ -145,7 +145,7 @@ impl<P: Port> Node<P> {
                 self.note_of(now, to, &who, Refusal::NoKey);
             }
         }
-        if self.answers.broadcast.take_if(|at| *at <= now).is_some() {
+        if P::MANAGES && self.answers.broadcast.take_if(|at| *at <= now).is_some() {
             self.answers.last_broadcast = Some(now);
             self.send_announce(now, authenticator, 0, None, NodeCounter::AnnounceBroadcast, |datagram| {
                 mailman.broadcast(datagram)
@@ -189,7 +189,7 @@ impl<P: Port> Node<P> {
 
     /// How many nodes may answer or dial at once: those that still fit, of those that there are.
     pub(super) fn expected(&self) -> u16 {
-        match self.config.identity.role() {
+        match self.role() {
             Role::MUnit => self.room().min(self.known_nodes),
             Role::SUnit => 1,
         }
@@ -202,7 +202,7 @@ impl<P: Port> Node<P> {
 
     /// Of two m_units the smaller identity dials; an s_unit always does.
     pub(super) fn dials(&self, peer: &Identity) -> bool {
-        peer.role() == Role::MUnit && (self.config.identity.role() == Role::SUnit || self.config.identity < *peer)
+        peer.role() == Role::MUnit && (self.role() == Role::SUnit || self.config.identity < *peer)
     }
 
     /// A node that this unit dials has answered it: it is dialled at once, unless it is connected. While a dial to another

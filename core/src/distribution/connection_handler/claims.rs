@@ -227,7 +227,9 @@ impl<P: Port> Node<P> {
 
     /// What the port is to do about claims; one at a time, until there is none.
     pub fn take_claim_event(&mut self) -> Option<ClaimEvent> {
-        if let Some(event) = self.claims.event.take() {
+        if P::MANAGES
+            && let Some(event) = self.claims.event.take()
+        {
             return Some(event);
         }
         self.claims.obeyed.iter_mut().find_map(|(manager, obeyed)| match obeyed.keeping {
@@ -254,7 +256,7 @@ impl<P: Port> Node<P> {
     pub(crate) fn own_report(&self, now: Instant) -> Option<ClaimReport> {
         let tagged = self.claims.own;
         let since = self.claims.took_over.map_or(ClaimReport::NEVER, |at| millis(now.since(at)));
-        (tagged.claim != Claim::NONE).then_some(ClaimReport { tagged, since })
+        (P::MANAGES && tagged.claim != Claim::NONE).then_some(ClaimReport { tagged, since })
     }
 
     /// What this unit tells a manager of the claims of that one's identity.
@@ -272,7 +274,7 @@ impl<P: Port> Node<P> {
     }
 
     fn is_fence(&self, obeyed: Option<&ClaimReport>) -> bool {
-        self.config.identity.role() == Role::MUnit && claim_of(obeyed) > self.claims.own.claim
+        self.role() == Role::MUnit && claim_of(obeyed) > self.claims.own.claim
     }
 
     /// A node that has proven itself says which claim of this m_unit's identity it has obeyed. A higher one costs that node, and
@@ -348,11 +350,11 @@ impl<P: Port> Node<P> {
         false
     }
 
-    /// Another unit with this m_unit's identity has answered, to be heard only if it answers a question of this one.
+    /// Another m_unit with this one's identity has answered, to be heard only if it answers a question of this one.
     pub(super) fn another_answered(&mut self, now: Instant, announce: &Announce, authenticator: &dyn Authenticator) {
         let claims = &mut self.claims;
         let is_asked = announce.nonce != 0 && [self.search.nonce, claims.questions.nonce].contains(&announce.nonce);
-        if self.config.identity.role() != Role::MUnit || !is_asked {
+        if !is_asked {
             return;
         }
         claims.questions.unanswered = 0;
@@ -385,6 +387,10 @@ impl<P: Port> Node<P> {
         mailman: &mut dyn Mailman<P::Endpoint>,
         authenticator: &dyn Authenticator,
     ) {
+        if !P::MANAGES {
+            self.claims.questions.next = Instant::FAR_FUTURE;
+            return;
+        }
         if core::mem::replace(&mut self.claims.questions.polled, now) + PERIOD < now {
             (self.claims.questions.unanswered, self.claims.questions.asked) = (0, None);
         }

@@ -55,7 +55,7 @@ impl<P: Port> Node<P> {
             self.counters.count(NodeCounter::OwnIdentity);
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);
             self.duplicates.hear(now, from, epoch);
-            if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
+            if let Some(who_has) = question.filter(|_| self.role() == Role::MUnit) {
                 self.answer_later(now, from, identity, who_has.nonce);
                 // With a growing pause, so that two do not ask each other without end.
                 if who_has.tcp_port != 0 {

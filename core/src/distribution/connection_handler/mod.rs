@@ -233,6 +233,11 @@ impl<P: Port> Node<P> {
         &self.config.identity
     }
 
+    /// This unit's role. Where a port has s_units alone the compiler knows it.
+    const fn role(&self) -> Role {
+        if P::MANAGES { self.config.identity.role() } else { Role::SUnit }
+    }
+
     /// This unit's fleet.
     pub const fn fleet(&self) -> Fleet {
         self.config.fleet

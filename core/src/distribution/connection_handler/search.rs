@@ -178,7 +178,7 @@ impl<P: Port> Node<P> {
         self.search.waited = false;
         if let Some(listening) = listening {
             self.search.attempt = 0;
-            self.search.next = now + first_delay(self.config.identity.role(), listening, &mut self.random);
+            self.search.next = now + first_delay(self.role(), listening, &mut self.random);
         } else {
             self.plan_next(now);
         }
@@ -228,7 +228,7 @@ impl<P: Port> Node<P> {
             self.search.next = Instant::FAR_FUTURE;
             return;
         }
-        if self.config.identity.role() == Role::SUnit && self.waits_for_hints(now) {
+        if self.role() == Role::SUnit && self.waits_for_hints(now) {
             return;
         }
         // A unit that hears enough searches of others defers its own, since their answer reaches it as well; but a few times
@@ -289,10 +289,10 @@ impl<P: Port> Node<P> {
             return;
         }
         self.counters.count(NodeCounter::WhoHasHeard);
-        let here = self.config.identity.role() == Role::MUnit;
+        let here = self.role() == Role::MUnit;
         let counts = self.counts(now, from, who_has);
         match &who_has.wanted {
-            Some(manager) if manager.is(&self.config.identity) && self.is_wanted(&who_has.identity) => {
+            Some(manager) if here && manager.is(&self.config.identity) && self.is_wanted(&who_has.identity) => {
                 self.answer_seeker(now, from, who_has);
             }
             Some(manager) if self.manager() == Some(manager) => {
@@ -369,7 +369,7 @@ impl<P: Port> Node<P> {
         authenticator: &dyn Authenticator,
     ) {
         if self.is_own(now, from, &announce.identity, announce.epoch, None) {
-            if announce.epoch != self.config.epoch {
+            if self.role() == Role::MUnit && announce.epoch != self.config.epoch {
                 self.another_answered(now, announce, authenticator);
             }
             return;
@@ -412,7 +412,10 @@ impl<P: Port> Node<P> {
     /// An s_unit wants its manager, an m_unit its s_units and the m_units that it has chosen.
     pub(super) fn is_wanted(&self, identity: &Identity) -> bool {
         let is_chosen = || self.chosen.as_ref().is_none_or(|chosen| chosen.contains(identity));
-        self.manager().map_or_else(|| identity.role() == Role::SUnit || is_chosen(), |manager| manager.is(identity))
+        match self.manager() {
+            Some(manager) => manager.is(identity),
+            None => P::MANAGES && (identity.role() == Role::SUnit || is_chosen()),
+        }
     }
 
     fn is_connected(&self, identity: &Identity, epoch: Epoch) -> bool {

@@ -322,7 +322,7 @@ impl<P: Port> Session<P> {
 
     /// This unit opened the connection.
     pub const fn dialed(&self) -> bool {
-        self.dialed
+        !P::MANAGES || self.dialed
     }
 
     /// Both ends have accepted each other.
@@ -459,14 +459,14 @@ impl<P: Port> Session<P> {
     /// The connection is open: the one who dialed introduces itself first.
     pub fn connected(&mut self, cx: &mut Context<'_, P>) {
         self.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
-        if self.dialed {
+        if self.dialed() {
             self.send_hello(cx);
         }
     }
 
     /// The hub takes the peer. The link is live from here on, unless it ends here.
     fn accept(&mut self, cx: &mut Context<'_, P>) {
-        if !self.dialed {
+        if !self.dialed() {
             self.reply_to_hello(cx);
         }
         if self.phase != Phase::Deciding {

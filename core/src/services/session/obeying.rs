@@ -52,7 +52,8 @@ impl<P: Port> Session<P> {
     }
 
     pub(super) fn send_claim(&mut self, cx: &mut Context<'_, P>) {
-        if let Some(report) = self.obedience.raised
+        if P::MANAGES
+            && let Some(report) = self.obedience.raised
             && self.send_control(cx, &Control::Claimed { report })
         {
             self.obedience.raised = None;

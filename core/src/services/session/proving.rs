@@ -21,7 +21,8 @@ impl<P: Port> Session<P> {
     /// The end that was dialled begins: it is the first one to have both hellos, which the proof covers.
     fn prove(&mut self, cx: &mut Context<'_, P>, until: Instant) {
         let Some(credentials) = self.credentials(cx) else { return };
-        match self.link.cipher().prove(!self.dialed, credentials) {
+        let begins = !self.dialed();
+        match self.link.cipher().prove(begins, credentials) {
             Ok(message) => {
                 self.phase = Phase::Proving { until };
                 self.send_proof(cx, message.as_ref().map(|message| &message[..]));
@@ -42,7 +43,7 @@ impl<P: Port> Session<P> {
             Ok(hello) => hello,
             Err(error) => {
                 self.link.counters.count(LinkCounter::FramesRefused);
-                if matches!(error, HelloError::Version(_)) && !self.dialed {
+                if matches!(error, HelloError::Version(_)) && !self.dialed() {
                     // The other end learns our versions from our hello.
                     self.send_hello(cx);
                 }
@@ -59,7 +60,7 @@ impl<P: Port> Session<P> {
             self.limit_to_peer();
             return self.peer_known(cx);
         }
-        if !self.dialed {
+        if !self.dialed() {
             self.send_hello(cx);
         }
         if !matches!(self.phase, Phase::AwaitingHello { .. }) {
@@ -77,7 +78,7 @@ impl<P: Port> Session<P> {
             Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
             Err(_) => self.fail(cx),
         }
-        if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
+        if self.dialed() && matches!(self.phase, Phase::Proving { .. }) {
             self.send_confirmation(cx);
             self.publish(cx);
         }
@@ -115,7 +116,7 @@ impl<P: Port> Session<P> {
         self.link.counters.count(LinkCounter::FarewellsInClear);
         if reason == Some(CloseReason::BadProof) && matches!(self.phase, Phase::Proving { .. }) {
             self.link.counters.count(LinkCounter::ProofsFailed);
-            if !self.dialed {
+            if !self.dialed() {
                 return self.end(CloseReason::BadProof);
             }
         }

@@ -74,7 +74,7 @@ impl<P: Port> Session<P> {
         if self.mode() == Mode::Plain {
             return;
         }
-        let pause = if self.dialed { self.life_of_keys() } else { SHORTEST_HANDSHAKE_LIFE.divided_by(2) };
+        let pause = if self.dialed() { self.life_of_keys() } else { SHORTEST_HANDSHAKE_LIFE.divided_by(2) };
         self.renewal.step = Step::Resting { due: now + pause };
     }
 
@@ -93,12 +93,12 @@ impl<P: Port> Session<P> {
         }
         // Only the end that dialled begins: two handshakes at once on one link would each wait for the other's answer.
         if let Step::Resting { due } = self.renewal.step {
-            if self.dialed && (cx.now >= due || self.link.cipher().is_worn()) {
+            if self.dialed() && (cx.now >= due || self.link.cipher().is_worn()) {
                 self.begin_renewal(cx, &[0; PROOF_BYTES]);
             }
             return;
         }
-        match cx.now >= self.renewal.deadline(self.dialed) {
+        match cx.now >= self.renewal.deadline(self.dialed()) {
             // A peer that keeps the link alive and does not go on would leave it under worn keys for ever.
             true => self.close(cx, CloseReason::HelloTimeout),
             false => self.pump_renewal(cx),
@@ -108,7 +108,8 @@ impl<P: Port> Session<P> {
     /// Proves once more that this unit has the key of the pair; the end that was dialled answers the peer's `message`.
     fn begin_renewal(&mut self, cx: &mut Context<'_, P>, message: &[u8; PROOF_BYTES]) {
         let Some(credentials) = self.credentials(cx) else { return };
-        let told = match self.link.cipher().prove(self.dialed, credentials) {
+        let begins = self.dialed();
+        let told = match self.link.cipher().prove(begins, credentials) {
             Ok(None) => self.link.cipher().answer(message),
             told => told,
         };
@@ -125,7 +126,7 @@ impl<P: Port> Session<P> {
     pub(super) fn pump_renewal(&mut self, cx: &mut Context<'_, P>) {
         let sent = match self.renewal.step {
             Step::Resting { .. } | Step::Awaiting { .. } => return,
-            Step::Telling { message, .. } if self.dialed => self.link.send_frames(&[Frame::Proof(&message)]),
+            Step::Telling { message, .. } if self.dialed() => self.link.send_frames(&[Frame::Proof(&message)]),
             Step::Telling { message, .. } => self.send_turn(Some(&message)),
             Step::Confirming { .. } => self.send_turn(None),
             Step::Acknowledging => self.link.send_frames(&[Frame::ACKNOWLEDGEMENT]),
@@ -155,9 +156,9 @@ impl<P: Port> Session<P> {
         let message = self.link.view(place, lent);
         let understood = match (message.first_chunk(), self.renewal.step) {
             (None, _) if message.is_empty() => self.link.cipher().turned(),
-            (Some(_), Step::Awaiting { .. }) if self.dialed => return self.answered_anew(cx, place, lent),
+            (Some(_), Step::Awaiting { .. }) if self.dialed() => return self.answered_anew(cx, place, lent),
             // Not before it is due: a handshake costs a board much computing, which a peer could otherwise ask for at will.
-            (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed && message.len() == PROOF_BYTES => {
+            (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed() && message.len() == PROOF_BYTES => {
                 let first = *first;
                 self.begin_renewal(cx, &first);
                 return None;
@@ -184,7 +185,7 @@ impl<P: Port> Session<P> {
             return None;
         };
         let understood = match self.link.view(place, lent).is_empty() {
-            true if self.dialed => self.adopt_keys().map(|()| self.rest_until_renewal(cx.now)),
+            true if self.dialed() => self.adopt_keys().map(|()| self.rest_until_renewal(cx.now)),
             true => Err(CloseReason::Protocol),
             false => self.link.confirmed(place, lent).and_then(|()| self.confirmed_anew(cx, until)),
         };
@@ -197,7 +198,7 @@ impl<P: Port> Session<P> {
     /// The peer has turned and confirmed. Its confirmation also says that it has that of an end that was dialled.
     fn confirmed_anew(&mut self, cx: &mut Context<'_, P>, until: Instant) -> Result<(), CloseReason> {
         self.renewal.forget = cx.now + RENEWAL_TIMEOUT;
-        if self.dialed {
+        if self.dialed() {
             self.renewal.step = Step::Confirming { until };
         } else {
             self.adopt_keys()?;
