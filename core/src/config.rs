@@ -93,6 +93,11 @@ pub const STREAM_ONLY_LOSS: Duration = Duration::from_secs(3);
 pub const PROBE: Duration = Duration::from_secs(4);
 /// A stream is dead when what was written does not reach the peer, and nothing else does, for this long.
 pub const STREAM_DEAD: Duration = Duration::from_secs(8);
+/// And in this direction alone, while the other one gets on.
+pub const ONE_WAY_DEAD: Duration = Duration::from_secs(16);
+/// Both where a keep-alive was missed within the last minute: on a path that loses a tenth of all frames, a stack that resends after
+/// 1, 3, 7 and 15 s is stuck for more than 8 s every few hours.
+pub const LOSSY_DEAD: Duration = Duration::from_secs(60);
 /// The maximum segment size with which a stream is dialled again that died with more than this outstanding: the least that every
 /// IPv4 host takes (RFC 9293, section 3.7.1).
 pub const SHORT_SEGMENT: u16 = 536;

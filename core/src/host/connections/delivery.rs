@@ -4,7 +4,7 @@
 //! program at the other end: the peer's TCP, or a relay between the two, may acknowledge what never arrives, and bytes that
 //! come say nothing of those that go.
 
-use crate::config::{PROBE, SHORT_SEGMENT, STREAM_DEAD};
+use crate::config::{LOSSY_DEAD, ONE_WAY_DEAD, PROBE, SHORT_SEGMENT, STREAM_DEAD};
 use crate::time::{Duration, Instant};
 
 /// Reports without progress before the stream counts as dead, however much time has passed: after a suspension the first one may
@@ -68,8 +68,16 @@ impl Delivery {
         Probe { write: core::mem::replace(&mut self.sent, sent) == sent, ask }
     }
 
-    /// The peer told how much has come, when so much was `sent`. When the stream is dead: how many bytes are missing there.
-    pub(super) fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<u32> {
+    /// The peer told how much has come, when so much was `sent`, and something came from there at `heard` last, on a path that may be
+    /// `lossy`. When the stream is dead: how many bytes are missing there.
+    pub(super) fn reported(
+        &mut self,
+        now: Instant,
+        sent: u32,
+        report: Report,
+        heard: Instant,
+        lossy: bool,
+    ) -> Option<u32> {
         let stands = core::mem::replace(&mut self.received, report.received) == report.received;
         self.last_report = now;
         // More than was sent is a lie, and means nothing.
@@ -77,7 +85,12 @@ impl Delivery {
         match self.stuck_since.filter(|_| stands && !report.holds && missing > 0) {
             Some(since) => {
                 self.stale = self.stale.saturating_add(1);
-                (self.stale >= STALE_REPORTS && now >= since + STREAM_DEAD).then_some(missing)
+                // Progress of the other direction counts as well, but not for ever: long packets may vanish in this one alone.
+                let is_dead = match lossy {
+                    false => now >= since + ONE_WAY_DEAD || now >= since.max(heard) + STREAM_DEAD,
+                    true => now >= since + LOSSY_DEAD,
+                };
+                (self.stale >= STALE_REPORTS && is_dead).then_some(missing)
             }
             None => {
                 (self.stuck_since, self.stale) = ((missing > 0).then_some(now), 0);
@@ -108,9 +121,9 @@ mod tests {
     /// When a stream is found dead to which the peer reports so at each second.
     fn dead_at(seconds: impl IntoIterator<Item = (u64, u32, Report)>) -> Option<u64> {
         let mut delivery = Delivery::new(at(0));
-        seconds
-            .into_iter()
-            .find_map(|(second, sent, report)| delivery.reported(at(second * 1_000), sent, report).map(|_| second))
+        seconds.into_iter().find_map(|(second, sent, report)| {
+            delivery.reported(at(second * 1_000), sent, report, at(0), false).map(|_| second)
+        })
     }
 
     #[test]
@@ -128,6 +141,18 @@ mod tests {
     }
 
     #[test]
+    fn progress_the_other_way_puts_the_end_off_and_does_not_prevent_it() {
+        for (lossy, expected) in [(false, 17), (true, 61)] {
+            let mut delivery = Delivery::new(at(0));
+            let dead = (1..90).find(|second| {
+                let now = at(second * 1_000);
+                delivery.reported(now, 100, told(90), now, lossy).is_some()
+            });
+            assert_eq!(dead, Some(expected));
+        }
+    }
+
+    #[test]
     fn a_peer_that_holds_reading_back_is_slow() {
         let held = Report { holds: true, ..told(90) };
         assert_eq!(dead_at((1..600).map(|second| (second, 100, held))), None);
@@ -139,9 +164,9 @@ mod tests {
     #[test]
     fn one_report_after_a_suspension_ends_nothing() {
         let mut delivery = Delivery::new(at(0));
-        assert_eq!(delivery.reported(at(1_000), 100, told(90)), None);
-        assert_eq!(delivery.reported(at(3_600_000), 100, told(90)), None);
-        assert_eq!(delivery.reported(at(3_600_100), 100, told(100)), None);
+        assert_eq!(delivery.reported(at(1_000), 100, told(90), at(0), false), None);
+        assert_eq!(delivery.reported(at(3_600_000), 100, told(90), at(0), false), None);
+        assert_eq!(delivery.reported(at(3_600_100), 100, told(100), at(0), false), None);
     }
 
     #[test]
@@ -158,7 +183,7 @@ mod tests {
         for _ in 0..10 {
             let now = delivery.deadline();
             let probe = delivery.poll(now, 7);
-            delivery.reported(now, 7, told(7));
+            delivery.reported(now, 7, told(7), now, false);
             assert!(delivery.deadline() <= now + PROBE + SLACK);
             probes += u32::from(probe.write);
         }

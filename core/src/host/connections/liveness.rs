@@ -8,6 +8,9 @@ use crate::time::{Duration, Instant};
 /// the link is given up once in 600,000 times.
 const QUESTIONS_PER_PERIOD: u64 = 4;
 
+/// A path on which a keep-alive was missed counts as lossy for this long.
+const LOSSY: Duration = Duration::from_secs(60);
+
 /// Whether the peer is still there: any frame or datagram renews it, and each keep-alive period without one is counted.
 ///
 /// A peer that has missed a keep-alive is pinged repeatedly until something of it arrives: a live peer is heard despite
@@ -32,6 +35,8 @@ pub struct Liveness {
     /// Those of this unit arrive there.
     is_heard: bool,
     stream_heard: Instant,
+    /// When a datagram was last missed.
+    missed_at: Option<Instant>,
     delivery: Delivery,
 }
 
@@ -87,6 +92,7 @@ impl Liveness {
             hears: false,
             is_heard: false,
             stream_heard: now,
+            missed_at: None,
             delivery: Delivery::new(now),
         };
         liveness.note_due();
@@ -113,7 +119,8 @@ impl Liveness {
     /// than one segment is missing there.
     pub fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<bool> {
         self.is_heard = report.hears;
-        self.delivery.reported(now, sent, report).map(is_long)
+        let lossy = self.missed_at.is_some_and(|at| now < at + LOSSY);
+        self.delivery.reported(now, sent, report, self.stream_heard, lossy).map(is_long)
     }
 
     /// Whether datagrams of the peer come through.
@@ -162,6 +169,9 @@ impl Liveness {
         let lost = silent && self.silence.missed >= self.allowed();
         let no_datagram = !self.is_deaf() && self.datagrams.poll(now, self.period);
         let missed_datagram = no_datagram && self.hears;
+        if missed_datagram {
+            self.missed_at = Some(now);
+        }
         let deaf = no_datagram && self.is_deaf();
         self.hears &= !deaf;
         let mut ask = self.hears && !lost && (missed_datagram || now >= self.next_question);
@@ -204,7 +214,7 @@ mod tests {
     /// What one poll says of a stream into which something is always written, and arrives.
     fn poll(liveness: &mut Liveness, now: Instant) -> Look {
         let sent = now.as_micros() as u32;
-        liveness.delivery.reported(now, sent, Report { received: sent, ..Report::default() });
+        liveness.delivery.reported(now, sent, Report { received: sent, ..Report::default() }, now, false);
         liveness.poll(now, sent)
     }
 
@@ -268,7 +278,7 @@ mod tests {
                 liveness.heard(at(millis));
             }
             let look = poll(&mut liveness, at(millis));
-            assert!(!look.lost && !(look.ask && deaf_at.is_some()), "{millis} ms: {look:?}");
+            assert!(!look.lost && (!look.ask || deaf_at.is_none()), "{millis} ms: {look:?}");
             if look.deaf {
                 assert!(deaf_at.replace(millis).is_none(), "it is found once");
             }

@@ -5,7 +5,7 @@ use super::permitting::may_publish;
 use super::publishing::Told;
 use super::timing::sent_at_earliest;
 use super::{Event, Phase, Session, close_reason};
-use crate::config::{EMERGENCY_BYTES, Priority};
+use crate::config::{EMERGENCY_BYTES, Mode, Priority};
 use crate::distribution::function::{Attributes, Signature, VariableSpecs};
 use crate::distribution::function_list::{Function, Generation, Slot};
 use crate::distribution::items::{Items, Malformed};
@@ -146,7 +146,7 @@ impl<P: Port> Session<P> {
         body: &mut [u8],
     ) -> Option<Event> {
         // Under a seal the nonce and the seal tell whose it is, and its source may be another address of the host, or a NAT's.
-        let is_of_peer = self.link.cipher().is_sealing() || from.is_of_host(&self.peer_address);
+        let is_of_peer = self.mode() == Mode::Secured || from.is_of_host(&self.peer_address);
         if self.phase != Phase::Live || nonce != self.local.nonce || !is_of_peer {
             self.link.counters.count(LinkCounter::DatagramsDropped);
             return None;

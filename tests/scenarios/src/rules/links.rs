@@ -90,16 +90,16 @@ fn a_dead_stream_ends_the_link_though_datagrams_pass(world: &mut dyn World) {
     world.run_for(calm);
     let one_way = world.random(3);
     if one_way != 1 {
-        world.fault(Fault::FreezeStreams(&manager, &agv, secs(16)));
+        world.fault(Fault::FreezeStreams(&manager, &agv, secs(30)));
     }
     if one_way != 2 {
-        world.fault(Fault::FreezeStreams(&agv, &manager, secs(16)));
+        world.fault(Fault::FreezeStreams(&agv, &manager, secs(30)));
     }
     let cut = world.now();
-    world.wait("both notice", || manager.count(stream_dead) + agv.count(stream_dead) >= 2, secs(30));
+    world.wait("both notice", || manager.count(stream_dead) + agv.count(stream_dead) >= 2, secs(40));
     for unit in [&manager, &agv] {
         let lost = unit.when(stream_dead).expect("the loss is noticed").since(cut);
-        assert!(lost >= secs(8) && lost <= secs(15), "{} ms", lost.as_millis());
+        assert!(lost >= secs(7) && lost <= secs(25), "{} ms", lost.as_millis());
         world.measured("dead stream to loss", lost);
     }
     met(world, &manager, "agv", "note");
