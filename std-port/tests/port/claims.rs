@@ -5,8 +5,8 @@ use std::sync::mpsc::Receiver;
 
 use cara_std::control::Control;
 use cara_std::{
-    Call, Claim, CommunicationSystem, Definition, Error, Parameters, ParametersView, ServiceError, ServiceOptions,
-    StartError, Unit, UnitEvent,
+    Actuator, Call, Claim, CommunicationSystem, Definition, Error, Parameters, ParametersView, ServiceError,
+    ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, system, unit, until};
@@ -16,6 +16,10 @@ fn manager(fleet: u32, state: &Path, takes_over: bool) -> CommunicationSystem {
 }
 
 fn vehicle(fleet: u32, state: &Path) -> Unit {
+    vehicle_with_drive(fleet, state).0
+}
+
+fn vehicle_with_drive(fleet: u32, state: &Path) -> (Unit, Actuator) {
     let agv = unit("agv", 7, fleet).state_folder(state).build().unwrap();
     let drive = agv.my_function_list().actuator(|| ()).unwrap();
     let options = ServiceOptions::new().moves(&drive, std::time::Duration::from_secs(1));
@@ -23,7 +27,7 @@ fn vehicle(fleet: u32, state: &Path) -> Unit {
     agv.my_function_list().add_service(&Definition::parse("go()").unwrap(), options, go).unwrap();
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();
-    agv
+    (agv, drive)
 }
 
 /// Has the vehicle move, before which it stores the claim.
@@ -100,7 +104,8 @@ fn what_a_vehicle_has_obeyed_outlives_it_and_a_lost_claim_locks_no_manager_out()
     move_it(&manager);
 }
 
-/// It obeys the claim until its next start, and says so.
+/// It cannot say whether it was stopped, so it starts stopped. Once it is reset, it obeys the claim until its next start, and says
+/// so.
 #[test]
 fn a_vehicle_that_cannot_store_moves_all_the_same() {
     let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
@@ -108,8 +113,12 @@ fn a_vehicle_that_cannot_store_moves_all_the_same() {
     std::fs::write(&file, "").unwrap();
     let manager = manager(fleet, &folder.path().join("kept"), false);
     manager.start().unwrap();
-    let agv = vehicle(fleet, &file.join("state"));
+    let (agv, drive) = vehicle_with_drive(fleet, &file.join("state"));
     let events = agv.events();
+    let stopped = Err(Error::Inhibited { by: 0, reason: 0 });
+    let go = || manager.peer("agv").and_then(|agv| agv.block_request("go", &mut Parameters::new()));
+    until("it is stopped", || go() == stopped);
+    drive.reset();
     move_it(&manager);
     let not_kept = |event: UnitEvent| matches!(event, UnitEvent::ClaimNotKept { .. });
     assert!(std::iter::from_fn(|| events.recv_timeout(PATIENCE).ok()).any(not_kept));
