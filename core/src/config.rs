@@ -58,7 +58,7 @@ pub const DATAGRAM_BYTES: usize = 1400;
 /// The buffer that each link owns: partial frames and handshakes up to this length need no buffer of the pool.
 pub const LINK_BUFFER_BYTES: usize = 512;
 
-/// Managers whose highest claim a unit keeps. Costs 144 bytes each; the claim of a further one is not kept, which is counted.
+/// Managers whose highest claim a unit keeps. Costs 104 bytes each on a board; that of a further one is not kept, which is counted.
 pub const OBEYED_MANAGERS: usize = 4;
 
 /// Leases that one peer may hold here, and this unit at one peer. Costs 32 bytes each per link.

@@ -1,13 +1,14 @@
 //! Time, randomness, storage, errors.
 
 use cara_core::config::{Constraints, Priority};
-use cara_core::distribution::claim::Claim;
+use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::error::Error;
 use cara_core::random::Random;
 use cara_core::storage::{Buffers, Lent, Pool};
 use cara_core::time::{Duration, Instant};
 
 use crate::linkage::{keep, unknown, unknown_slice};
+use crate::secure::AnyCodes;
 
 entry!(instants, {
     let now = Instant::from_micros(*unknown());
@@ -31,7 +32,8 @@ entry!(random, {
 
 entry!(claims, {
     let (one, other) = (*unknown::<Claim>(), *unknown::<Claim>());
-    keep((one > other, one.raised(*unknown())));
+    keep((one > other, one.raised(*unknown()), one.tagged(unknown(), &AnyCodes)));
+    keep(unknown::<TaggedClaim>().is_genuine(unknown(), &AnyCodes));
 });
 
 entry!(pools, {

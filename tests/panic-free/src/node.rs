@@ -84,7 +84,7 @@ entry!(node_lists, {
     keep((node.s_unit(*unknown()), node.m_unit(*unknown()), node.node(identity()), node.node_of(*unknown())));
     keep((node.find(unknown_text()), node.find_id(*unknown())));
     let known: &Known<SocketAddrV4> = unknown();
-    keep((known.is_joined(), known.state(), known.link(), known.index()));
+    keep((known.is_joined(), known.state(), known.link(), known.index(), known.under()));
 });
 
 entry!(node_counters, {

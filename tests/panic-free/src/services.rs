@@ -133,6 +133,7 @@ entry!(session_asked, {
     keep((
         session.wants_to_write(),
         session.has_next_call(),
+        session.awaits_claim(),
         session.holds_received(),
         session.has_call_room(),
         session.is_acknowledged(*unknown()),
@@ -140,6 +141,7 @@ entry!(session_asked, {
     keep((session.constraints(), session.silent_for(*unknown()), session.bytes_queued()));
     keep((session.stream_silent_for(*unknown()), session.hears_datagrams(), session.is_heard()));
     session.hold_back();
+    self::session().announce_claim(context());
 });
 
 entry!(session_details, {
