@@ -144,8 +144,8 @@ fn store(claim: &StoredClaim) -> bool {
     true
 }
 
-/// A board stores the claim that it obeys before it moves under it, and refuses a lower one in its next life; a manager that hears a
-/// higher one steps down.
+/// A board stores the claim that it obeys before it moves under it, and refuses a lower one in its next life, until that one is
+/// raised because nobody answers for the higher one; a manager that hears a higher one steps down.
 #[test]
 fn a_board_obeys_the_highest_claim_and_fences_lower_ones() {
     let bench = Bench::new(21);
@@ -161,16 +161,28 @@ fn a_board_obeys_the_highest_claim_and_fences_lower_ones() {
         let agv = start(&board, agv_config(&bench).obeyed_claim(KEPT.get(), store));
         driving(&board, agv);
         agv.publish_my_function_list().unwrap();
-        agv
+        (board, agv)
     };
-    let ((first_board, first), agv) = (manager_of(5), agv_of());
+    let ((first_board, first), (agv_board, agv)) = (manager_of(5), agv_of());
     assert!(bench.run_until(|| knows(first, "agv", "go_to"), LONG));
     assert_eq!(KEPT.get(), NOTHING, "not at joining");
     assert_eq!(ask(&bench, &first_board, first, "agv", "go_to", 1), Ok(1));
     assert_eq!((KEPT.get().tagged.claim, agv.claim()), (claim(5), claim(5)));
-    let (_, second) = manager_of(6);
+    let (second_board, second) = manager_of(6);
     assert!(bench.run_until(|| agv.claim() == claim(6) && second.is_connected(), LONG));
     assert!(!first.is_connected(), "it has stepped down");
+    assert!(bench.run_until(|| knows(second, "agv", "go_to"), LONG));
+    assert_eq!(KEPT.get().tagged.claim, claim(5), "nothing has moved under it");
+    assert_eq!(ask(&bench, &second_board, second, "agv", "go_to", 1), Ok(1));
+    assert_eq!(KEPT.get().tagged.claim, claim(6));
+
+    [first_board, second_board, agv_board].iter().for_each(Board::cut_power);
+    let ((_, third), (_, agv)) = (manager_of(5), agv_of());
+    assert_eq!(agv.claim(), claim(6), "it is stored");
+    assert!(!bench.run_until(|| third.is_connected(), Duration::from_secs(2)), "it is refused");
+    assert!(bench.run_until(|| third.is_connected(), LONG), "it is raised");
+    assert!(third.claim() > claim(6), "{} and {}", third.claim(), agv.claim());
+    assert!(bench.run_until(|| agv.claim() == third.claim(), SHORT), "{} and {}", third.claim(), agv.claim());
 }
 
 /// The access table of a board.
