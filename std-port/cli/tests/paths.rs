@@ -299,7 +299,10 @@ fn behind_a_nat_that_changes_ports_a_vehicle_is_connected() {
         fleet
             .there
             .network
-            .within(|| Ok(assert!(Command::new("nft").arg(nat).env("PATH", paths()).status()?.success())))
+            .within(|| {
+                assert!(Command::new("nft").arg(nat).env("PATH", paths()).status()?.success());
+                Ok(())
+            })
             .unwrap();
         fleet.start(Some("10.91.3.1:7000"));
         fleet
