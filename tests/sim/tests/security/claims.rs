@@ -6,7 +6,7 @@ use cara_core::distribution::datagram::{Announce, Datagram, SEARCH_BYTES};
 use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::Epoch;
 use cara_core::time::Duration;
-use cara_sim::World;
+use cara_sim::{UnitEvent, World};
 
 use super::Tally;
 use super::discovery::{FLEET, Unit, agv, at, codes, depot, host, made_up};
@@ -117,6 +117,35 @@ fn the_key_of_a_vehicle_ends_no_manager_and_raises_no_claim() {
         }
         world.run_for(Duration::from_secs(90));
         tally.note(manager.claim() != claim || !manager.is_running() || !vehicle.is_connected("depot"));
+    }
+    tally.close();
+}
+
+/// Genuine claims, of earlier starts of this manager and of one on another host, that the thief of one or of ten vehicles' keys replays:
+/// it is raised above a higher one, once, and neither the manager nor another vehicle ends anything.
+#[test]
+fn a_claim_of_long_ago_that_stolen_keys_replay_ends_nothing() {
+    let mut tally = Tally::new("true claims of earlier starts that a holder of one or of ten vehicles' keys replays");
+    for (seed, kept) in (0..3).flat_map(|seed| [0, 3, 4, 5, 40].map(|kept| (seed, kept))) {
+        for thieves in [1, 10] {
+            let mut earlier = World::secured(100 + seed);
+            let before = earlier.m_unit("depot", 1).kept_term(kept).start();
+            earlier.run_for(Duration::from_secs(10));
+            let old = before.tagged_claim();
+            assert_eq!(old.claim.term, kept + 1);
+            let mut world = World::secured(seed);
+            let manager = world.m_unit("depot", 1).kept_term(4).start();
+            let vehicle = world.s_unit("agv", 7).joins("depot", 1).start();
+            assert!(world.run_until(|_| vehicle.is_connected("depot"), Duration::from_secs(20)));
+            for id in 20..20 + thieves {
+                let _thief = world.s_unit("agv", id).joins("depot", 1).has_obeyed("depot", 1, old).start();
+            }
+            world.run_for(Duration::from_secs(90));
+            let left = vehicle.count(|event| matches!(event, UnitEvent::Left { .. }));
+            let highest = (old.claim.term + 1).max(5);
+            tally.note(!manager.is_running() || left > 0 || manager.claim().term > highest);
+            assert_eq!((vehicle.is_connected("depot"), vehicle.claim()), (true, manager.claim()));
+        }
     }
     tally.close();
 }
