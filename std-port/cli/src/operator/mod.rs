@@ -86,9 +86,9 @@ impl Way {
 type Each<'e> = &'e mut dyn FnMut(Answer) -> anyhow::Result<bool>;
 
 /// There is no unit to ask; `ways` says what can be done.
-fn none_runs(ways: &str) -> anyhow::Error {
+fn none_runs(global: &Global, ways: &str) -> anyhow::Error {
     let others = running::not_meant();
-    let of_others = running::of_others(None);
+    let of_others = running::of_others(None, global.fleet);
     if others.is_empty() && !of_others.is_empty() {
         return Ended::no_unit(of_others);
     }
@@ -100,7 +100,7 @@ impl Operator {
     pub(crate) fn open(global: &Global, need: &Need) -> anyhow::Result<Self> {
         let ways = "Start a manager (`cara node --name NAME --id ID`), or be one for the time of this command: --as NAME/ID \
                     with the fleet's --fleet NUMBER";
-        Self::open_if_any(global, need)?.ok_or_else(|| none_runs(ways))
+        Self::open_if_any(global, need)?.ok_or_else(|| none_runs(global, ways))
     }
 
     /// As [`open`](Self::open), for a question that is answered also where all connections of a unit are in use.
@@ -120,7 +120,7 @@ impl Operator {
             return Err(Ended::usage(format!("{why_not}: leave out --as")));
         }
         let running = Self::open_if_any(global, &Need::Nothing)?;
-        running.ok_or_else(|| none_runs("This verb is for a manager that runs (`cara node --name NAME --id ID`)"))
+        running.ok_or_else(|| none_runs(global, "This verb is for a manager that runs (`cara node --name NAME --id ID`)"))
     }
 
     /// The unit that the options choose; `None` if they choose none and none runs.

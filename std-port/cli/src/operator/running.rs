@@ -39,7 +39,7 @@ pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option
     let meant: Vec<_> = all.iter().collect();
     match (meant.as_slice(), wanted) {
         ([], None) => Ok(None),
-        ([], Some(wanted)) => Err(Ended::no_unit(match of_others(Some(&wanted)).as_str() {
+        ([], Some(wanted)) => Err(Ended::no_unit(match of_others(Some(&wanted), global.fleet).as_str() {
             "" => format!("{wanted} does not run on this host{} (looked in {})", not_meant(), looked_in()),
             others => others.to_owned(),
         })),
@@ -55,9 +55,13 @@ pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option
     }
 }
 
-/// Units of this host, or the one that is wanted, that another user runs, and how they are asked; empty if there are none.
-pub(super) fn of_others(wanted: Option<&str>) -> String {
-    let all = elsewhere().into_iter().filter(|unit| wanted.is_none_or(|wanted| wanted == unit.unit));
+/// Units of this host, or those of the unit and the fleet that are wanted, whose sockets are in other folders, such as another
+/// user's, and how they are asked; empty if there are none.
+pub(super) fn of_others(wanted: Option<&str>, fleet: Option<u32>) -> String {
+    let is_wanted = |unit: &Elsewhere| {
+        wanted.is_none_or(|wanted| wanted == unit.unit) && fleet.is_none_or(|fleet| fleet == unit.fleet)
+    };
+    let all = elsewhere().into_iter().filter(is_wanted);
     let told = all.take(SHOWN).map(|Elsewhere { unit, fleet, path, owner }| {
         let folder = path.parent().unwrap_or(&path).display().to_string();
         let (user, sudo) = match owner {
