@@ -120,7 +120,8 @@ impl Operator {
             return Err(Ended::usage(format!("{why_not}: leave out --as")));
         }
         let running = Self::open_if_any(global, &Need::Nothing)?;
-        running.ok_or_else(|| none_runs(global, "This verb is for a manager that runs (`cara node --name NAME --id ID`)"))
+        running
+            .ok_or_else(|| none_runs(global, "This verb is for a manager that runs (`cara node --name NAME --id ID`)"))
     }
 
     /// The unit that the options choose; `None` if they choose none and none runs.
