@@ -69,7 +69,8 @@ fn one_in(random: &mut Random, count: u64) -> bool {
 
 /// Runs the fleet of a seed. Whatever breaks a rule panics, and the world prints the seed.
 pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
-    let mut world = if seed % 8 == 7 { World::secured(seed) } else { World::new(seed) };
+    let is_secured = seed % 8 == 7;
+    let mut world = if is_secured { World::secured(seed) } else { World::new(seed) };
     // CARA_SIM_SEED may say otherwise.
     let seed = world.seed();
     let mut random = Random::new(seed ^ 0x0DE5_F1EE);
@@ -86,7 +87,7 @@ pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
     let constraints = Constraints { maximum_nodes: size.vehicles as u16 + 8, ..Constraints::M_UNIT };
     let start = |(number, identity): (usize, &Identity)| {
         let is_crane = number < cranes;
-        watch.borrow_mut().add_vehicle(!is_crane);
+        watch.borrow_mut().add_vehicle(!is_crane, is_secured);
         let (watch, seed) = (Rc::clone(&watch), random.bits());
         let unit = if is_crane {
             world.m_unit(identity.name(), identity.id()).constraints(constraints)
@@ -422,6 +423,7 @@ fn told(unit: &UnitHandle, event: &UnitEvent, watch: &mut Watch, process: usize,
             watch.give_up(n, unit.now(), true);
         }
         UnitEvent::Fenced { .. } => watch.reach("fenced"),
+        UnitEvent::Raised { claim } => watch.raised(process, *claim),
         _ => {}
     }
 }

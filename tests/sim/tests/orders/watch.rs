@@ -64,7 +64,8 @@ struct Call {
 /// One life of a caller.
 struct Process {
     id: u32,
-    term: Claim,
+    /// The claims that it has had, the newest last.
+    claims: Vec<Claim>,
     /// When it ran last.
     pulse: Instant,
 }
@@ -85,6 +86,9 @@ struct Moved {
 struct Vehicle {
     /// Obeys terms.
     is_s_unit: bool,
+    /// Keeps what it obeys across restarts, from the first call under it that moves something on; none does in plain mode.
+    stores: bool,
+    stored: Claim,
     executed: Claim,
     moved: [Moved; 2],
 }
@@ -150,8 +154,9 @@ pub(crate) struct Watch {
 }
 
 impl Watch {
-    pub(crate) fn add_vehicle(&mut self, is_s_unit: bool) {
-        self.vehicles.push(Vehicle { is_s_unit, executed: Claim::NONE, moved: Default::default() });
+    pub(crate) fn add_vehicle(&mut self, is_s_unit: bool, stores: bool) {
+        let (stored, executed) = (Claim::NONE, Claim::NONE);
+        self.vehicles.push(Vehicle { is_s_unit, stores, stored, executed, moved: Default::default() });
     }
 
     pub(crate) fn reach(&mut self, what: &'static str) {
@@ -160,9 +165,14 @@ impl Watch {
 
     // --- what callers do
 
-    pub(crate) fn process(&mut self, id: u32, term: Claim, now: Instant) -> usize {
-        self.processes.push(Process { id, term, pulse: now });
+    pub(crate) fn process(&mut self, id: u32, claim: Claim, now: Instant) -> usize {
+        self.processes.push(Process { id, claims: vec![claim], pulse: now });
         self.processes.len() - 1
+    }
+
+    pub(crate) fn raised(&mut self, process: usize, claim: Claim) {
+        self.reach("claim raised");
+        self.processes[process].claims.push(claim);
     }
 
     pub(crate) fn pulse(&mut self, process: usize, now: Instant) {
@@ -236,7 +246,7 @@ impl Watch {
     }
 
     pub(crate) fn newest_term(&self) -> u64 {
-        self.processes.iter().map(|process| process.term.term).max().unwrap_or(0)
+        self.processes.iter().flat_map(|process| &process.claims).map(|claim| claim.term).max().unwrap_or(0)
     }
 
     /// The last time at which the caller of a call can have wanted it.
@@ -256,9 +266,10 @@ impl Watch {
 
     // --- what happens at vehicles
 
-    /// A life of a vehicle begins: what stopped it is forgotten with all else.
+    /// A life of a vehicle begins: what stopped it is forgotten with all else, but for the claim that it has stored.
     pub(crate) fn started(&mut self, vehicle: usize) {
-        self.vehicles[vehicle].moved = Default::default();
+        let vehicle = &mut self.vehicles[vehicle];
+        (vehicle.moved, vehicle.executed) = (Default::default(), vehicle.stored);
     }
 
     /// The handler of a call starts. `order` is its hold of what it moves.
@@ -266,7 +277,7 @@ impl Watch {
         let made = self.calls[n].made.clone();
         assert_eq!(made.vehicle, vehicle, "a call runs where it was sent");
         assert!(!std::mem::replace(&mut self.calls[n].has_started, true), "call {n} runs twice");
-        self.executes(n);
+        self.executes(n, seen);
         let moves = if let Does::Move(actuator) = made.does { Some(actuator) } else { None };
         for actuator in [DRIVE, FORK].into_iter().filter(|actuator| moves != Some(*actuator)) {
             self.look_at_open(n, actuator, seen.live[actuator]);
@@ -278,16 +289,20 @@ impl Watch {
         }
     }
 
-    /// What is executed is of terms that never decrease.
-    fn executes(&mut self, n: usize) {
-        let Made { by, vehicle, .. } = self.calls[n].made;
-        let (term, vehicle) = (self.processes[by].term, &mut self.vehicles[vehicle]);
+    /// What is executed is of claims that never decrease.
+    fn executes(&mut self, n: usize, seen: Seen) {
+        let Made { by, vehicle, does, .. } = self.calls[n].made;
+        let (claims, vehicle, obeyed) = (&self.processes[by].claims, &mut self.vehicles[vehicle], seen.term);
         if !vehicle.is_s_unit {
             return;
         }
-        let before = std::mem::replace(&mut vehicle.executed, term);
-        assert!(before <= term, "call {n} of term {term} runs after one of {before}");
-        if before != Claim::NONE && term > before {
+        assert!(claims.contains(&obeyed), "call {n} of claims {claims:?} runs, and {obeyed} is obeyed");
+        let before = std::mem::replace(&mut vehicle.executed, obeyed);
+        assert!(before <= obeyed, "call {n} runs under {obeyed} after one under {before}");
+        if vehicle.stores && matches!(does, Does::Move(_)) {
+            vehicle.stored = obeyed;
+        }
+        if before != Claim::NONE && obeyed > before {
             self.reach("newer term obeyed");
         }
     }
@@ -295,9 +310,9 @@ impl Watch {
     /// A live order is of the term that its vehicle obeys.
     fn term_is_obeyed(&self, n: usize, seen: Seen) {
         let Made { by, vehicle, .. } = self.calls[n].made;
-        let (term, obeyed) = (self.processes[by].term, seen.term);
-        let is_obeyed = !self.vehicles[vehicle].is_s_unit || term == obeyed;
-        assert!(is_obeyed, "call {n} of term {term} is live, and {obeyed} is obeyed");
+        let (claims, obeyed) = (&self.processes[by].claims, seen.term);
+        let is_obeyed = !self.vehicles[vehicle].is_s_unit || claims.contains(&obeyed);
+        assert!(is_obeyed, "call {n} of claims {claims:?} is live, and {obeyed} is obeyed");
     }
 
     /// A handler starts while another order has an actuator.
