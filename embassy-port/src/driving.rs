@@ -4,14 +4,15 @@
 //! The large functions are kept apart: merged into their callers, the frames of all of them would lie on the stack at
 //! once, though only one runs at a time.
 
+use cara_core::config::Mode;
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::claim::{Claim, StoredClaim};
 use cara_core::distribution::connection_handler::{ClaimEvent, Command, NodeCounter};
 use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::Slot;
-use cara_core::distribution::identity::Identity;
+use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{CloseReason, Refusal};
+use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::port::Port as _;
 use cara_core::services::Context;
@@ -182,6 +183,27 @@ impl<T> Machine<T> {
             let stored = self.store.zip(key).is_some_and(|(store, key)| store(&StoredClaim { tagged, key }));
             self.hub.node.claim_kept(&manager, tagged.claim, stored);
         }
+    }
+
+    /// The claim of an m_unit, and what a vehicle has stored; [`Error::NoOwnKey`] for an m_unit that has no key with itself.
+    #[inline(never)]
+    pub(crate) fn begin_claims(
+        &mut self,
+        claim: Claim,
+        manager: Option<&Identity>,
+        obeyed: &StoredClaim,
+    ) -> Result<(), Error> {
+        if Board::MANAGES && self.hub.node.identity().role() == Role::MUnit {
+            let tagged = claim.tagged(self.hub.node.identity(), self.proof.codes()).ok_or(Error::NoOwnKey)?;
+            self.hub.node.set_claim(tagged);
+        }
+        if let Some(manager) = manager.filter(|_| self.store.is_some() && self.proof.mode() == Mode::Secured) {
+            if self.proof.has_key(manager, &obeyed.key) && obeyed.tagged.claim != Claim::NONE {
+                self.hub.node.keep_obeyed(now(), manager, obeyed.tagged);
+            }
+            self.hub.node.store_claims();
+        }
+        Ok(())
     }
 
     /// An m_unit's claim is stored, and counts from then on.

@@ -7,13 +7,11 @@ use core::net::SocketAddrV4;
 use cara_core::config::{HANDSHAKE_LIFE, LINK_BUFFER_BYTES, Mode};
 use cara_core::counters::Counters;
 use cara_core::distribution::claim::Claim;
-use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeStorage, Order};
+use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order};
 use cara_core::distribution::datagram::SEARCH_BYTES;
 use cara_core::distribution::function_list::{Entry, FunctionList};
-use cara_core::distribution::identity::Role;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
-use cara_core::host::port::Port as _;
 use cara_core::services::CallHead;
 use cara_core::services::hub::Hub;
 use cara_core::services::lease::Latch;
@@ -254,25 +252,6 @@ impl<
         };
         let (port, tcp_port) = (config.node.udp_port, config.node.tcp_port);
         let (seed, manager) = (config.node.seed, config.manager());
-        let mut node = Node::new(now(), config.node, storage);
-        if Board::MANAGES && node.identity().role() == Role::MUnit {
-            let claim = if config.claim == Claim::NONE { Claim::NONE.raised(seed) } else { config.claim };
-            let identity = node.identity().clone();
-            node.set_claim(claim.tagged(&identity, config.security.0.codes()).ok_or(Error::NoOwnKey)?);
-        }
-        if let Some(manager) = manager.filter(|_| config.store.is_some() && config.security.0.mode() == Mode::Secured) {
-            if config.security.0.has_key(&manager, &config.obeyed.key) && config.obeyed.tagged.claim != Claim::NONE {
-                node.keep_obeyed(now(), &manager, config.obeyed.tagged);
-            }
-            node.store_claims();
-        }
-        let functions = FunctionList::new(
-            self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
-            self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
-        );
-        if let Some(reason) = config.starts_stopped {
-            functions.stopped().inhibit(now(), Latch { by: 0, reason });
-        }
         let pool = self.pool.write([const { None }; BUFFERS]);
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
@@ -280,7 +259,7 @@ impl<
         let machine =
             Machine {
                 hub: Hub {
-                    node,
+                    node: node(config.node, storage),
                     publications: Publications::new(
                         self.to_all.write([false; OWN]).as_mut_slice(),
                         self.to_one.write([const { [const { None }; OWN] }; LINKS]).as_flattened_mut(),
@@ -291,7 +270,10 @@ impl<
                 store_own: config.store_own,
                 store: config.store,
                 unstored: None,
-                functions,
+                functions: FunctionList::new(
+                    self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
+                    self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
+                ),
                 pool: Pool::new(&mut pool[..]),
                 links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
                 mail: EmbassyMailman {
@@ -325,6 +307,13 @@ impl<
                 wakers: Wakers::new(),
             };
         let shared = self.shared.write(Shared { machine: RefCell::new(machine), state: RefCell::new(state) });
+        // In its place: changed before it is moved there, it would lie on the stack more than once.
+        let machine = shared.machine.get_mut();
+        let claim = if config.claim == Claim::NONE { Claim::NONE.raised(seed) } else { config.claim };
+        machine.begin_claims(claim, manager.as_ref(), &config.obeyed)?;
+        if let Some(reason) = config.starts_stopped {
+            machine.functions.stopped().inhibit(now(), Latch { by: 0, reason });
+        }
         let runner = Runner {
             shared,
             scratch,
@@ -334,6 +323,12 @@ impl<
         };
         Ok((Handle { shared }, runner))
     }
+}
+
+/// Kept apart: merged into its caller, what it makes would lie on the stack several times.
+#[inline(never)]
+fn node(config: NodeConfig<SocketAddrV4>, storage: NodeStorage<Board>) -> Node<Board> {
+    Node::new(now(), config, storage)
 }
 
 impl<const OWN: usize, const THEIR: usize, const CALLS: usize> SessionMemory<OWN, THEIR, CALLS> {
