@@ -143,17 +143,38 @@ fn a_name_of_several_nodes_is_refused() {
     clinic.doctor(&["agv/7"]).is(&["connected"], 0);
 }
 
+/// Of two that hear each other one steps down. This second one hears nothing, as behind a switch that passes one way only.
 #[test]
 fn of_two_managers_with_one_name_is_told_first() {
     let clinic = Clinic::new();
     let _first = clinic.manager("boss", 64);
-    // Its socket is another one's, as of a manager in a container.
+    let second = clinic.search("boss", 1, 1).of_m_unit();
+    while_running(
+        || second.send(),
+        || {
+            clinic.doctor(&["boss"]).is(&["duplicate"], 4);
+            assert_eq!(clinic.doctor(&["agv", "--listen", "4s"]).ids()[0], "duplicate");
+            clinic.doctor(&["--listen", "3s"]).is(&["duplicate"], 4);
+        },
+    );
+}
+
+/// Two that hear each other: the lower claim steps down, and the doctor hears one. That it refused the other one is told.
+#[test]
+fn of_two_managers_that_hear_each_other_one_is_left() {
+    let clinic = Clinic::new();
+    let first = clinic.manager("boss", 64);
     let second = clinic.system("boss").control(cara_std::control::Control::Off).beside_another();
     let second = second.build().unwrap();
+    let [of_first, of_second] = [first.events(), second.events()];
     second.start().unwrap();
-    clinic.doctor(&["boss"]).is(&["duplicate"], 4);
-    assert_eq!(clinic.doctor(&["agv", "--listen", "4s"]).ids()[0], "duplicate");
-    clinic.doctor(&["--listen", "3s"]).is(&["duplicate"], 4);
+    let is_fenced = |events: &std::sync::mpsc::Receiver<cara_std::UnitEvent>| {
+        events.try_iter().any(|event| matches!(event, cara_std::UnitEvent::Fenced { .. }))
+    };
+    until("one has stepped down", || is_fenced(&of_first) || is_fenced(&of_second));
+    let told = clinic.doctor(&["--listen", "3s"]);
+    let is_live = |at: usize| told.ids()[at] == "fenced" || told.found(at).starts_with("two live nodes ");
+    assert!(!(0..told.ids().len()).any(is_live), "{told:?}");
 }
 
 #[test]

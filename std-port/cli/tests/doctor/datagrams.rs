@@ -20,6 +20,7 @@ pub(crate) struct Search {
     name: &'static str,
     id: u8,
     epoch: u8,
+    role: u8,
     key: DiscoveryKey,
     /// A unit sends from one port for all its life.
     socket: UdpSocket,
@@ -29,7 +30,12 @@ impl Search {
     pub(crate) fn new(fleet: u32, port: u16, key: DiscoveryKey, name: &'static str, id: u8, epoch: u8) -> Self {
         let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
         socket.set_broadcast(true).unwrap();
-        Self { version: 2, fleet, port, name, id, epoch, key, socket }
+        Self { version: 2, fleet, port, name, id, epoch, role: 1, key, socket }
+    }
+
+    /// An m_unit's: with the name of `boss`, that of a second one that asks for its own identity.
+    pub(crate) fn of_m_unit(self) -> Self {
+        Self { role: 0, ..self }
     }
 
     pub(crate) fn of_version(self, version: u8) -> Self {
@@ -42,12 +48,12 @@ impl Search {
     }
 
     fn bytes(&self) -> Vec<u8> {
-        let (who_has, codes, m_unit_wanted, s_unit) = (1, 1, b"boss", 1);
+        let (who_has, codes, m_unit_wanted) = (1, 1, b"boss");
         let mut bytes = vec![0x43, 0x41, 0x52, 0x73, self.version, who_has, self.version, codes];
         bytes.extend(self.fleet.to_le_bytes());
         let (sequence, nonce, tcp_port, expected, id_of_boss) = (1, 5, 0, 1, 1);
         let name = self.name.as_bytes();
-        bytes.extend(item(1, &[&[self.id, name.len() as u8], name, &[s_unit, self.epoch]].concat()));
+        bytes.extend(item(1, &[&[self.id, name.len() as u8], name, &[self.role, self.epoch]].concat()));
         bytes.extend(item(2, &[&[m_unit_wanted.len() as u8], &m_unit_wanted[..], &[id_of_boss]].concat()));
         bytes.extend(item(5, &[sequence, nonce, tcp_port, expected]));
         bytes.extend(item(0, &vec![0; LEAST - CODE - bytes.len() - 4]));
