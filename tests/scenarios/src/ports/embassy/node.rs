@@ -1,6 +1,6 @@
 //! One unit on its board, in all its lives.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
@@ -39,6 +39,8 @@ pub(super) struct BoardNode {
     orders: RefCell<BTreeMap<String, Vec<LeaseWatch>>>,
     events: Rc<RefCell<Vec<(Instant, Seen)>>>,
     losses: Rc<RefCell<Vec<Instant>>>,
+    /// The claim of the last life, which a manager stores.
+    claim: Cell<Claim>,
 }
 
 impl BoardNode {
@@ -54,6 +56,7 @@ impl BoardNode {
             orders: RefCell::default(),
             events: Rc::default(),
             losses: Rc::default(),
+            claim: Cell::default(),
         });
         node.begin();
         node
@@ -126,7 +129,10 @@ impl BoardNode {
             SpecRole::Manager => Config::m_unit(&name, id, security)?,
             SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, security)?,
         };
-        let config = if self.spec.takes_over { config.claim(Claim { term: 2, claimant: 1 }, |_| true) } else { config };
+        let above = if self.spec.takes_over { 1 } else { 0 };
+        let last = self.claim.get().max(Claim { term: above, claimant: 0 });
+        self.claim.set(last.raised(self.bench.random(u64::MAX)));
+        let config = config.claim(self.claim.get(), |_| true);
         let epoch = self.bench.random(u64::MAX);
         Ok(config.fleet(fleet).constraints(constraints).epoch(epoch))
     }
