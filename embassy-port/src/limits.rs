@@ -20,7 +20,7 @@ use crate::security::OVERHEAD;
 /// struct Agv;
 /// const LIMITS: Limits = Limits { message_size: 512, ..Limits::S_UNIT };
 /// type AgvResources = resources!(Agv, LIMITS);
-/// const { assert!(AgvResources::BYTES <= 24 * 1024) };
+/// const { assert!(AgvResources::BYTES <= 26 * 1024) };
 ///
 /// // Only for a unit that wants others than these.
 /// const CONSTRAINTS: Constraints =
@@ -38,7 +38,7 @@ use crate::security::OVERHEAD;
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Connections: one for an s_unit; for an m_unit one more than its nodes, so that it can refuse a node by name. 6,200
+    /// Connections: one for an s_unit; for an m_unit one more than its nodes, so that it can refuse a node by name. 7,100
     /// bytes each, and twice `stream`. While all are in use, a unit that dials is not answered, and tries again.
     pub links: usize,
     /// Longest message received, in bytes of its block of parameters. 1 byte for each buffer, and 4 with `datagram` and
@@ -49,12 +49,12 @@ pub struct Limits {
     pub message_buffers: usize,
     /// Bytes that TCP keeps in each direction of each link. When they are full, the sender waits.
     pub stream: usize,
-    /// Functions of this unit. 208 bytes each, 64 of them for its signature; a list shares those. One more is
+    /// Functions of this unit. 216 bytes each, 64 of them for its signature; a list shares those. One more is
     /// [`Error::Full`].
     pub functions: usize,
     /// Functions kept of each peer's list. 104 bytes each, for each link. Others are skipped, which an event tells.
     pub their_functions: usize,
-    /// Calls in flight to one peer, and calls of one peer that run; one is kept for an emergency. 104 bytes each, for
+    /// Calls in flight to one peer, and calls of one peer that run; one is kept for an emergency. 112 bytes each, for
     /// each link. One more is [`Error::Full`]; one more of the peer's waits.
     pub calls: usize,
     /// Calls of one peer that wait for those that run. They lie in message buffers, of which 2 are left free: with
