@@ -30,6 +30,7 @@ use cara_std::{
     BuildError, Builder, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer,
     ServiceOptions, Unit as SUnit, UnitEvent,
 };
+use tempfile::TempDir;
 
 use super::keys::Keys;
 use super::relay::{Relay, Way};
@@ -82,6 +83,9 @@ struct LinuxNode {
     /// Of the calls of each service.
     orders: Mutex<BTreeMap<String, Vec<LeaseWatch>>>,
     readings: Mutex<Readings>,
+    /// Where a manager keeps its claim from one life to the next. Without it, the vehicles that obeyed the last one fence every
+    /// second life for seconds.
+    state: TempDir,
 }
 
 /// By peer and stream.
@@ -203,6 +207,7 @@ impl World for LinuxWorld {
             leases: Mutex::default(),
             orders: Mutex::default(),
             readings: Mutex::default(),
+            state: tempfile::tempdir().expect("a folder can be made"),
         });
         node.start();
         self.units.push(Arc::clone(&node));
@@ -316,7 +321,7 @@ impl LinuxNode {
             SpecRole::Manager => {
                 let builder = self.with_spec(CommunicationSystem::builder(name, *id)?);
                 let builder = if self.spec.beside_another { builder.beside_another() } else { builder };
-                let builder = builder.take_over(self.spec.takes_over);
+                let builder = builder.take_over(self.spec.takes_over).state_folder(self.state.path());
                 let builder = match &self.spec.m_units {
                     Some(m_units) => builder.m_units(m_units.iter().copied())?,
                     None => builder,
