@@ -219,7 +219,9 @@ impl<P: Port> Session<P> {
     /// The peer is told that a call has no caller any more. In the stream alone, and at most once: what such a call moves is
     /// released as well, which is not lost.
     pub(super) fn send_cancel(&mut self, cx: &mut Context<'_, P>, pending: &Pending) {
-        if self.phase == Phase::Live {
+        // A stop is not taken back: its handler runs, however late it comes.
+        let stops = self.theirs.function(pending.slot).is_some_and(|function| function.attributes.stop);
+        if self.phase == Phase::Live && !stops {
             let body = SessionBody::cancel(&Release { call: pending.id.0, class: pending.class });
             self.link.send_frame(&Frame::Session(&body));
             self.flush(cx);
