@@ -12,14 +12,9 @@ use crate::board::LONG;
 use crate::manager::{self, ANNOUNCE, INSIST, Manager, sends};
 
 impl EmulatedBoard {
-    /// A manager drives and is frozen, another one takes over. The first goes on, and wants the vehicle to drive: in every second
-    /// fault the other one is gone by then, so that it is the vehicle that fences it.
-    pub(super) fn manager_is_fenced(&self, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
-        let folder = self.keys.folder().join("state");
-        if !folder.exists() {
-            // One that has kept no term would claim again where it is alone.
-            drop(self.takes_over(&folder)?);
-        }
+    /// A manager drives and is frozen, another one of another host takes over. The first goes on, and wants the vehicle to drive.
+    pub(super) fn manager_is_fenced(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let [folder, other] = ["state", "other"].map(|name| self.keys.folder().join(name));
         let line = self.board.line();
         let mut first =
             Process::start("manager", &std::env::current_exe()?, manager::command(&self.keys, Some(&folder)))?;
@@ -31,13 +26,12 @@ impl EmulatedBoard {
         first.send(ANNOUNCE)?;
         first.expect("announced", LONG)?;
         first.freeze()?;
-        let second = self.takes_over(&folder)?;
+        let second = self.takes_over(&other)?;
         let (behind, stop) = self.stopped(line)?;
         let agv = second.meet(&self.who)?;
         self.lost_once(line)?;
         self.stands(&agv, line, behind)?;
         let behind = self.commands(&second)?;
-        let second = number.is_multiple_of(2).then_some(second);
         first.send(INSIST)?;
         first.thaw()?;
         let ended = first.wait(LONG).with_context(|| format!("the board logged{}", self.log(line)))?;

@@ -75,7 +75,7 @@ impl Target for EmulatedBoard {
             Failing::Bumper => self.stops_itself(dice),
             Failing::Loop => self.loop_hangs(dice),
             Failing::Guard => self.guard_is_dropped(dice),
-            Failing::Fenced => self.manager_is_fenced(number, dice),
+            Failing::Fenced => self.manager_is_fenced(dice),
             Failing::StateHeld | Failing::SecondManager | Failing::Held | Failing::NoRight => {
                 bail!("only processes of Linux fail so")
             }
