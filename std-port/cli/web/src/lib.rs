@@ -58,6 +58,7 @@ pub struct Arguments {
     host_name: Vec<String>,
     /// Where browsers see the page if a proxy stands before it, as https://fleet.example/hall/. Can be repeated.
     #[arg(long, value_name = "URL")]
+    #[allow(rustdoc::bare_urls, reason = "the text is help of the command line as well")]
     origin: Vec<guard::Outside>,
     /// A MovingAI map (`.map`) to draw below the vehicles: cell (x, y) is column x of row y, both from 0.
     #[arg(long, value_name = "MAP")]
