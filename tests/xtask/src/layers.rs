@@ -172,7 +172,7 @@ fn core_sources() -> Result<Vec<(PathBuf, String)>> {
 }
 
 /// Files that are compiled for tests only, with the files below them.
-fn test_files(sources: &[(PathBuf, String)]) -> HashSet<PathBuf> {
+pub(crate) fn test_files(sources: &[(PathBuf, String)]) -> HashSet<PathBuf> {
     let mut roots = Vec::new();
     for (file, text) in sources {
         let folder = children_folder(file);
@@ -193,7 +193,7 @@ fn children_folder(file: &Path) -> PathBuf {
 }
 
 /// The module that a file holds, as segments below the crate.
-fn module_of(file: &Path) -> Vec<String> {
+pub(crate) fn module_of(file: &Path) -> Vec<String> {
     let mut segments: Vec<String> = children_folder(file)
         .components()
         .filter_map(|component| match component {
@@ -227,7 +227,7 @@ fn wrong_arrows(file: &Path, text: &str) -> Vec<Wrong> {
 }
 
 /// The path below the crate that `segments` means inside `module`; `None` for paths of other crates and of locals.
-fn resolve(module: &[String], segments: &[&str]) -> Option<Vec<String>> {
+pub(crate) fn resolve(module: &[String], segments: &[&str]) -> Option<Vec<String>> {
     let (first, mut rest) = segments.split_first()?;
     let mut base = match *first {
         "crate" | "cara_core" => Vec::new(),

@@ -17,6 +17,7 @@ mod figures;
 mod firmware;
 mod fleet;
 mod groups;
+mod house;
 mod hygiene;
 mod install;
 mod instructions;
@@ -98,6 +99,12 @@ enum Task {
         #[arg(long)]
         write: bool,
     },
+    /// Counts what there is to read and to learn: lines, ways to call, public items, conditions, circles, words.
+    House {
+        /// Also writes the figures here.
+        #[arg(long, value_name = "FILE")]
+        json: Option<PathBuf>,
+    },
     /// Repeats the paper's experiments against raw sockets, interleaved with a control, and draws its figures.
     Bench(bench::Options),
     /// Builds the other systems that `bench` measures beside CARA, and says which are absent and what brings them.
@@ -154,6 +161,7 @@ fn main() -> ExitCode {
         Task::Sizes { board, json, write } => firmware::sizes(board.as_deref(), json.as_deref(), write),
         Task::Versions { revisions } => later::versions(&revisions).map(|()| ExitCode::SUCCESS),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
+        Task::House { json } => house::run(json.as_deref()),
         Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),
         Task::Fleet { nodes, processes, json } => fleet::run(nodes, processes, json.as_deref()),

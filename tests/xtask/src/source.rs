@@ -18,17 +18,22 @@ pub(crate) struct Path<'t> {
 
 /// The tokens of `text` outside of comments, character and text literals.
 pub(crate) fn tokens(text: &str) -> Vec<Token<'_>> {
+    let mut tokens = tokens_and_literals(text);
+    tokens.retain(|token| skipped(token.text).is_none());
+    tokens
+}
+
+/// The tokens of `text` outside of comments; a character or text literal is one.
+pub(crate) fn tokens_and_literals(text: &str) -> Vec<Token<'_>> {
     let mut tokens = Vec::new();
     let (mut rest, mut line) = (text, 1);
     while let Some(first) = rest.chars().next() {
-        let length = match skipped(rest) {
-            Some(length) => length,
-            None => {
-                let length = token_length(rest, first);
-                tokens.push(Token { text: &rest[..length], line });
-                length
-            }
-        };
+        let skipped = skipped(rest);
+        let length = skipped.unwrap_or_else(|| token_length(rest, first));
+        let is_blank = rest.starts_with(char::is_whitespace) || rest.starts_with("//") || rest.starts_with("/*");
+        if !is_blank {
+            tokens.push(Token { text: &rest[..length], line });
+        }
         line += rest[..length].matches('\n').count();
         rest = &rest[length..];
     }
