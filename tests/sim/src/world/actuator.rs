@@ -37,12 +37,19 @@ struct Moved {
     safe: Box<dyn Fn(&UnitHandle)>,
     /// It was stopped, and the unit has not looked yet which of its links had the order.
     stopped: Cell<bool>,
+    /// When it was stopped last, on the unit's clock.
+    stopped_at: Cell<Option<Instant>>,
 }
 
 impl Actuator {
     /// `safe` runs once for each order that ends without being replaced or finished, before anything else the unit does.
     pub fn new(safe: impl Fn(&UnitHandle) + 'static) -> Self {
-        Self(Rc::new(Moved { word: Lease::new(), safe: Box::new(safe), stopped: Cell::new(false) }))
+        Self(Rc::new(Moved {
+            word: Lease::new(),
+            safe: Box::new(safe),
+            stopped: Cell::default(),
+            stopped_at: Cell::default(),
+        }))
     }
 
     /// Whether it may move now, on behalf of whichever order has it.
@@ -67,6 +74,11 @@ impl Actuator {
         self.word().latch()
     }
 
+    /// When it was stopped last, in virtual time. The handler of the call that stops it may have waited since.
+    pub fn stopped_at(&self, unit: &UnitHandle) -> Option<Instant> {
+        self.0.stopped_at.get().map(|at| unit.now() - unit.clock().since(at))
+    }
+
     pub(super) fn word(&self) -> &Lease {
         &self.0.word
     }
@@ -78,6 +90,7 @@ impl Actuator {
     pub(super) fn stop(&self, now: Instant, latch: Latch) {
         self.word().inhibit(now, latch);
         self.0.stopped.set(true);
+        self.0.stopped_at.set(Some(now));
     }
 
     /// Whether it was stopped since this was asked last.

@@ -258,7 +258,8 @@ fn race(world: &World, mut caller: Caller, vehicles: &[UnitHandle]) {
 fn seen(unit: &UnitHandle, actuators: &[Actuator; 2]) -> Seen {
     let latched = [DRIVE, FORK].map(|actuator| actuators[actuator].latch().is_some());
     let live = [DRIVE, FORK].map(|actuator| actuators[actuator].is_live(unit));
-    Seen { now: unit.now(), term: unit.claim(), live, latched }
+    let stopped = [DRIVE, FORK].map(|actuator| actuators[actuator].stopped_at(unit));
+    Seen { now: unit.now(), term: unit.claim(), live, latched, stopped }
 }
 
 /// One life of a vehicle.

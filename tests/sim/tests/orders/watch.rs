@@ -79,6 +79,8 @@ struct Moved {
     is_unsafe: bool,
     /// When it was stopped last, and whether a reset that was made later has run.
     latched: Option<(Instant, bool)>,
+    /// When the latest reset was made of those that have run.
+    reset_made: Option<Instant>,
     /// Calls that have stopped it.
     stops: Vec<usize>,
 }
@@ -102,6 +104,8 @@ pub(crate) struct Seen {
     pub(crate) live: [bool; 2],
     /// Whether they say that they are stopped.
     pub(crate) latched: [bool; 2],
+    /// When they were stopped last.
+    pub(crate) stopped: [Option<Instant>; 2],
 }
 
 /// Counts what a run has come to.
@@ -379,10 +383,13 @@ impl Watch {
         let vehicle = self.calls[n].made.vehicle;
         for actuator in actuators {
             let moved = &mut self.vehicles[vehicle].moved[*actuator];
-            assert!(seen.latched[*actuator], "{n} stops, and latches nothing");
-            let open = moved.open.as_ref().map(|(open, _)| *open);
+            // The stop has counted since the call came: a reset made later may have run before its handler.
+            let since = seen.stopped[*actuator].expect("what stops is noted");
+            let lifted = moved.reset_made.is_some_and(|made| since < made);
+            assert!(seen.latched[*actuator] || lifted, "{n} stops, and latches nothing");
+            let open = moved.open.as_ref().map(|(open, _)| *open).filter(|_| !lifted);
             assert_eq!(open, None, "{n} stops before the safe hook of what moves has run");
-            moved.latched = Some((seen.now, false));
+            moved.latched = Some((since, lifted));
             moved.stops.push(n);
         }
         self.reach(if actuators.len() == 1 { "stopped in part" } else { "stopped" });
@@ -408,7 +415,9 @@ impl Watch {
 
     fn reset_made(&mut self, vehicle: usize, actuators: &[usize], at: Instant) {
         for actuator in actuators {
-            let Some((since, lifted)) = &mut self.vehicles[vehicle].moved[*actuator].latched else { continue };
+            let moved = &mut self.vehicles[vehicle].moved[*actuator];
+            moved.reset_made = moved.reset_made.max(Some(at));
+            let Some((since, lifted)) = &mut moved.latched else { continue };
             let is_later = *since < at;
             *lifted |= is_later;
             self.reach(if is_later { "reset" } else { "reset too old" });
