@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::keys::{FleetKeys, Store, place};
 use cara_std::{
-    BuildError, Builder, Call, CloseReason, CommunicationSystem, Fleet, Identity, Interfaces, MUnit, Parameters,
-    ParametersView, Refusal, SUnit, ServiceError, StartError, Unit, UnitEvent,
+    BuildError, Builder, Call, CloseReason, CommunicationSystem, Definition, Fleet, Identity, Interfaces, MUnit,
+    Parameters, ParametersView, Refusal, SUnit, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -279,6 +279,47 @@ fn an_unknown_vehicle_that_dials_saves_no_revoked_one() {
     unknown.start().unwrap();
     until("the revoked one is gone", || manager.number_of_s_units() == 1);
     assert!(manager.s_units().iter().all(|peer| peer.is_connected() == (peer.identity() == &agv(8))));
+}
+
+/// Whatever is stored with the old key is worth nothing once that has gone, so it is stored anew with the new one.
+#[test]
+fn a_claim_that_is_obeyed_outlives_a_change_of_keys() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let mut store = Store::create(&folder.path().join("keys"), keys(fleet, &[7])).unwrap();
+    store.save().unwrap();
+    let [office, board] = ["office", "board"].map(|name| folder.path().join(name));
+    let manager = started_manager(manager(fleet).key_file(store.file_of(&depot())).state_folder(&office));
+    let start = |store: &Store| {
+        let agv = vehicle(fleet, 7).key_file(store.file_of(&agv(7))).state_folder(&board).build().unwrap();
+        agv.renew_keys_every(cara_std::Duration::from_secs(1));
+        let drive = agv.my_function_list().actuator(|| ()).unwrap();
+        let go = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let options = ServiceOptions::new().moves(&drive, Duration::from_secs(1));
+        agv.my_function_list().add_service(&Definition::parse("go()").unwrap(), options, go).unwrap();
+        serving(agv)
+    };
+    let first = start(&store);
+    let moves = || manager.peer("agv").is_ok_and(|agv| agv.block_request("go", &mut Parameters::new()).is_ok());
+    until("it moves", moves);
+    let claim = manager.claim();
+    let kept_with = |store: &Store| {
+        let key = store.keys().ring(&agv(7)).unwrap().pair(&depot()).unwrap().fingerprint();
+        let key: String = key.iter().map(|byte| format!("{byte:02x}")).collect();
+        let files = std::fs::read_dir(&board).unwrap().map(|file| file.unwrap().path());
+        let claims = files.filter(|path| path.extension().is_some_and(|extension| extension == "claims"));
+        claims.map(|path| std::fs::read_to_string(path).unwrap()).collect::<String>().contains(&key)
+    };
+    assert!(kept_with(&store));
+    for step in [FleetKeys::rotate, FleetKeys::switch] {
+        step(store.keys_mut()).unwrap();
+        store.save().unwrap();
+    }
+    assert!(!kept_with(&store), "the key is another one");
+    until("it is stored with the new key", || kept_with(&store));
+    store.keys_mut().finish().unwrap();
+    store.save().unwrap();
+    drop(first);
+    assert_eq!(start(&store).claim(), claim, "it counts after the next start");
 }
 
 #[test]

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
 use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::distribution::connection_handler::ClaimEvent;
@@ -33,6 +34,10 @@ pub(crate) enum TakeOver {
     Forced,
 }
 
+/// A manager that steps down waits at most so long for its disk, and looks this often.
+const STORING: std::time::Duration = std::time::Duration::from_secs(2);
+const LOOK: std::time::Duration = std::time::Duration::from_millis(5);
+
 /// What is stored, and by whom.
 pub(super) struct Claims {
     folder: Option<PathBuf>,
@@ -55,6 +60,8 @@ struct Writer {
 enum Job {
     Keep(Identity, TaggedClaim),
     Raise(Claim),
+    /// Of a manager that steps down.
+    Heard(Claim),
 }
 
 impl Claims {
@@ -204,6 +211,12 @@ impl<T: Send + 'static> Engine<T> {
             };
             match job {
                 Job::Keep(manager, tagged) => self.keep_obeyed(kept, manager, tagged),
+                Job::Heard(claim) => {
+                    kept.own = kept.own.max(claim);
+                    if let Err(error) = self.store(&kept) {
+                        tracing::error!(%error, "the claim that was heard is not stored");
+                    }
+                }
                 Job::Raise(above) => {
                     kept.own = above.raised(random());
                     match self.store(&kept) {
@@ -219,8 +232,12 @@ impl<T: Send + 'static> Engine<T> {
         let ring = self.keys().ring().map(|live| live.ring());
         let key = ring.as_ref().and_then(|ring| ring.pair(&manager)).map(|key| key.fingerprint());
         let Some(key) = key else { return self.failed(&Job::Keep(manager, tagged)) };
+        let obeyed = KeptObeyed { manager: manager.clone(), tagged, key };
+        if kept.obeyed.contains(&obeyed) {
+            return self.hub().hub.node.claim_kept(&manager, tagged.claim, true);
+        }
         kept.obeyed.retain(|obeyed| obeyed.manager != manager);
-        kept.obeyed.push(KeptObeyed { manager: manager.clone(), tagged, key });
+        kept.obeyed.push(obeyed);
         match self.store(&kept) {
             Ok(()) => {
                 tracing::info!(claim = %tagged.claim, manager = manager.name(), "a claim is obeyed, and stored");
@@ -237,19 +254,24 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The raised claim is stored: it counts, and all peers hear of it.
     fn raised(&self, kept: KeptClaims) {
-        let (identity, _) = self.identity();
         let claim = kept.own;
-        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
         tracing::warn!(%claim, "no other manager of this identity answers: its claim is raised above the one that vehicles obeyed");
         lock(&self.claims.writer).kept = kept;
+        self.announce_claim(claim);
+        self.tell(UnitEvent::Raised { claim });
+        self.broadcast();
+    }
+
+    /// Tells all peers this manager's claim, with a tag of the keys as they are now.
+    pub(super) fn announce_claim(&self, claim: Claim) {
+        let (identity, _) = self.identity();
+        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
         self.hub().hub.node.set_claim(tagged);
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.announce_claim(cx));
             self.settle(&link, state);
         }
-        self.tell(UnitEvent::Raised { claim });
-        self.broadcast();
     }
 
     /// A live manager of this identity has a higher claim. Stopping ends the links, and with them all that this one ordered. What
@@ -263,12 +285,13 @@ impl<T: Send + 'static> Engine<T> {
         // A thread of the unit would wait for itself.
         let stop = move || {
             me.stop();
-            me.tell(UnitEvent::Fenced { claim });
-            let mut kept = lock(&me.claims.writer).kept.clone();
-            kept.own = kept.own.max(claim);
-            if let Err(error) = me.store(&kept) {
-                tracing::error!(%error, "the claim that was heard is not stored");
+            // Before the application hears of it and ends; a hung disk does not keep it from ending.
+            me.leave_to_writer(Job::Heard(claim));
+            let until = Instant::now() + STORING;
+            while lock(&me.claims.writer).runs && Instant::now() < until {
+                std::thread::sleep(LOOK);
             }
+            me.tell(UnitEvent::Fenced { claim });
         };
         if let Err(error) = std::thread::Builder::new().name("cara-fenced".into()).spawn(stop) {
             tracing::error!(%error, "no thread is left to step down with: tries again when the other one is heard again");

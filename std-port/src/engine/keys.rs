@@ -3,8 +3,9 @@
 use std::sync::{Arc, Mutex, OnceLock};
 
 use cara_core::config::Mode;
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::hello::Hello;
-use cara_core::distribution::identity::Identity;
+use cara_core::distribution::identity::{Identity, Role};
 use cara_core::services;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keyring::{Codes, Keyring};
@@ -186,8 +187,16 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn watch_keys(&self) -> Instant {
         let (ring, due) = self.key_watch.look(self.now());
         if let Some(ring) = ring {
-            self.hub().hub.node.expect(ring.nodes());
+            let claim = {
+                let mut cell = self.hub();
+                cell.hub.node.expect(ring.nodes());
+                cell.hub.node.claim()
+            };
             self.end_links_without_keys(&ring);
+            // Its tag is of the keys before.
+            if self.identity().0.role() == Role::MUnit && claim != Claim::NONE {
+                self.announce_claim(claim);
+            }
         }
         due
     }

@@ -62,7 +62,11 @@ fn a_manager_that_takes_over_gets_the_vehicle_and_the_other_one_steps_down() {
     let second = manager(fleet, &there, true);
     second.start().unwrap();
     assert!(second.claim() > first.claim());
-    assert_eq!(stepped_down(&events), second.claim());
+    let claim = stepped_down(&events);
+    assert_eq!(claim, second.claim());
+    let kept = std::fs::read_dir(&here).unwrap().map(|file| std::fs::read_to_string(file.unwrap().path()).unwrap());
+    let line = format!("own {} {}", claim.term, claim.claimant);
+    assert!(kept.collect::<String>().contains(&line), "what it has heard is stored before it says that it has stopped");
     assert_eq!(first.start(), Err(Error::NotRunning.into()), "it has stopped");
     until("it has joined the second", || second.number_of_s_units() == 1 && agv.claim() == second.claim());
 

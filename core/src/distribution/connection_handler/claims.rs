@@ -37,8 +37,8 @@ const FENCES: usize = 4;
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ClaimEvent {
-    /// A moving call waits until this claim of this manager is stored, with the fingerprint of the pair key. The port answers with
-    /// [`Node::claim_kept`], and then polls its sessions. A board stores while nothing moves.
+    /// This claim of this manager is to be stored with the fingerprint of the pair key, unless both are stored already; a moving call
+    /// may wait for it. The port answers with [`Node::claim_kept`], and then polls its sessions. A board stores while nothing moves.
     Keep(Identity, TaggedClaim),
     /// This claim is obeyed until this unit's next start: it could not be stored, or not in time.
     Unkept(Identity, Claim),
@@ -57,6 +57,8 @@ enum Keeping {
     /// A moving call waits, since then; whether the port has been told.
     Wanted(Instant, bool),
     Kept,
+    /// The same, and the port is to look whether the pair key is still the one that the claim was stored with.
+    KeptBefore,
     /// Too late, or it failed; whether the port has been told.
     Failed(bool),
 }
@@ -68,6 +70,15 @@ struct Obeyed {
     keeping: Keeping,
     /// When that manager was last connected, at the latest.
     heard: Instant,
+}
+
+impl Obeyed {
+    /// The pair key may be another one than the claim was stored with.
+    fn look_again(&mut self) {
+        if self.keeping == Keeping::Kept {
+            self.keeping = Keeping::KeptBefore;
+        }
+    }
 }
 
 /// A genuine claim above this manager's.
@@ -233,6 +244,10 @@ impl<P: Port> Node<P> {
             return Some(event);
         }
         self.claims.obeyed.iter_mut().find_map(|(manager, obeyed)| match obeyed.keeping {
+            Keeping::KeptBefore => {
+                obeyed.keeping = Keeping::Kept;
+                Some(ClaimEvent::Keep(manager.clone(), obeyed.tagged))
+            }
             Keeping::Wanted(since, false) => {
                 obeyed.keeping = Keeping::Wanted(since, true);
                 Some(ClaimEvent::Keep(manager.clone(), obeyed.tagged))
@@ -305,8 +320,11 @@ impl<P: Port> Node<P> {
         let Some(tagged) = claim.map(|report| report.tagged) else { return };
         match self.claims.of_mut(manager) {
             Some(obeyed) if tagged.claim < obeyed.tagged.claim => {}
-            Some(obeyed) if obeyed.tagged == tagged => obeyed.heard = now,
-            // Also the same claim with another tag: the key was changed.
+            Some(obeyed) if tagged.claim == obeyed.tagged.claim => {
+                // Its tag is another one where the manager's keys are.
+                (obeyed.tagged, obeyed.heard) = (tagged, now);
+                obeyed.look_again();
+            }
             Some(obeyed) => *obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: now },
             None => {
                 let obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: now };
@@ -317,13 +335,23 @@ impl<P: Port> Node<P> {
         }
     }
 
+    /// A connected manager has proven itself anew.
+    pub(crate) fn proven_anew(&mut self, manager: &Identity) {
+        if let Some(obeyed) = self.claims.of_mut(manager) {
+            obeyed.look_again();
+        }
+    }
+
     /// A connected manager has raised its claim.
     pub(crate) fn claim_raised(&mut self, now: Instant, manager: &Identity, claim: &ClaimReport) {
         self.obey(now, manager, Some(claim));
     }
 
-    /// The link of a manager has ended.
+    /// The link of a manager has ended. A claim without a tag, as in plain mode, is not kept: the manager's next start may be lower.
     pub(super) fn manager_left(&mut self, now: Instant, manager: &Identity) {
+        self.claims
+            .obeyed
+            .retain(|(identity, obeyed)| identity != manager || obeyed.tagged.tag != TaggedClaim::NONE.tag);
         if let Some(obeyed) = self.claims.of_mut(manager) {
             obeyed.heard = now;
         }
@@ -336,7 +364,7 @@ impl<P: Port> Node<P> {
         }
         let Some(obeyed) = self.claims.of_mut(manager) else { return true };
         match obeyed.keeping {
-            Keeping::Kept | Keeping::Failed(_) => return true,
+            Keeping::Kept | Keeping::KeptBefore | Keeping::Failed(_) => return true,
             Keeping::Unasked => obeyed.keeping = Keeping::Wanted(now, false),
             Keeping::Wanted(since, _) if now < since + STORING => {}
             Keeping::Wanted(..) => {

@@ -185,7 +185,7 @@ impl<P: Port> Session<P> {
             return None;
         };
         let understood = match self.link.view(place, lent).is_empty() {
-            true if self.dialed() => self.adopt_keys().map(|()| self.rest_until_renewal(cx.now)),
+            true if self.dialed() => self.adopt_keys(cx).map(|()| self.rest_until_renewal(cx.now)),
             true => Err(CloseReason::Protocol),
             false => self.link.confirmed(place, lent).and_then(|()| self.confirmed_anew(cx, until)),
         };
@@ -201,7 +201,7 @@ impl<P: Port> Session<P> {
         if self.dialed() {
             self.renewal.step = Step::Confirming { until };
         } else {
-            self.adopt_keys()?;
+            self.adopt_keys(cx)?;
             self.renewal.step = Step::Acknowledging;
         }
         self.pump_renewal(cx);
@@ -209,8 +209,11 @@ impl<P: Port> Session<P> {
     }
 
     /// The peer has the key of this end's datagrams.
-    fn adopt_keys(&mut self) -> Result<(), CloseReason> {
+    fn adopt_keys(&mut self, cx: &mut Context<'_, P>) -> Result<(), CloseReason> {
         self.link.cipher().acknowledged()?;
+        if let Some(peer) = self.identity() {
+            cx.hub.enter(&mut |hub| hub.node.proven_anew(peer));
+        }
         self.link.counters.count(LinkCounter::KeysRenewed);
         debug!("link {} has new keys", self.link.id().0);
         Ok(())
