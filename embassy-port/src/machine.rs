@@ -14,6 +14,7 @@ use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
+use core::task::Context as TaskContext;
 use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
@@ -201,7 +202,10 @@ impl<T> Machine<T> {
 
     /// Lets the node do what is due.
     #[inline(never)]
-    pub(crate) fn poll_node(&mut self) -> Option<Command<SocketAddrV4>> {
+    pub(crate) fn poll_node(&mut self, context: &mut TaskContext<'_>) -> Option<Command<SocketAddrV4>> {
+        if Board::MANAGES && self.mail.udp.poll_recv_ready(context).is_ready() {
+            self.hub.node.left_unread();
+        }
         self.hub.node.poll(now(), &mut self.mail, self.proof.codes())
     }
 

@@ -104,7 +104,7 @@ impl<T> Runner<T> {
         self.answer_again(machine);
         machine.look_at_lines();
         if is_due && !machine.stopped {
-            if let Some(command) = machine.poll_node() {
+            if let Some(command) = machine.poll_node(context) {
                 machine.act(command);
                 return Step::Again;
             }
