@@ -213,9 +213,9 @@ impl<T> Machine<T> {
     #[inline(never)]
     pub(crate) fn open(&mut self, index: u16, address: SocketAddrV4, dialed: bool) -> Option<()> {
         let storage = self.link_mut(index)?.storage.take()?;
-        let local = self.hub.node.hello(now(), LinkId(index));
+        let nonce = self.hub.node.nonce();
         let constraints = *self.hub.node.constraints();
-        let config = SessionConfig { link: LinkId(index), dialed, address, local, constraints };
+        let config = SessionConfig { link: LinkId(index), dialed, address, nonce, constraints };
         let cipher = self.proof.cipher();
         let mut session = Session::new(now(), config, cipher, storage);
         session.renew_every(self.renews_every);

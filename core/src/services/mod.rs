@@ -133,8 +133,8 @@
 //! #     let storage = NodeStorage { nodes: slice(4), order: slice(4), links: slice(1), findings: slice(4) };
 //! #     let mut node = Node::new(now, config, storage);
 //! #     let address = SocketAddrV4::new(Ipv4Addr::new(192, 0, 2, 1), 7000);
-//! #     let local = node.hello(now, LinkId(0));
-//! #     let config = SessionConfig { link: LinkId(0), dialed, address, local, constraints };
+//! #     let nonce = node.nonce();
+//! #     let config = SessionConfig { link: LinkId(0), dialed, address, nonce, constraints };
 //! #     let storage = SessionStorage {
 //! #         small: slice(512), pending: slice(4), running: slice(4), publications: slice(4),
 //! #         their_functions: (0..4).map(|_| Entry::empty()).collect(), their_signatures: slice(256),

@@ -48,8 +48,8 @@ impl SUnit {
         }
         let Some(storage) = self.spare.take() else { return };
         let constraints = *self.hub.node.constraints();
-        let local = self.hub.node.hello(now, LINK);
-        let config = SessionConfig { link: LINK, dialed: true, address: to, local, constraints };
+        let nonce = self.hub.node.nonce();
+        let config = SessionConfig { link: LINK, dialed: true, address: to, nonce, constraints };
         self.session = Some(Session::new(now, config, Plain, storage));
         self.is_dialing = true;
         self.hub.node.dialing(identity, LINK);

@@ -86,7 +86,7 @@ impl<T: Send + 'static> Engine<T> {
         let id = LinkId(u16::try_from(index).ok()?);
         let now = self.now();
         let storage = self.session_storage();
-        let (serial, local, constraints) = {
+        let (serial, nonce, constraints) = {
             let mut cell = self.hub();
             cell.serial = cell.serial.wrapping_add(1);
             let serial = cell.serial;
@@ -95,10 +95,10 @@ impl<T: Send + 'static> Engine<T> {
             if let Some(Dialed(identity)) = dialed {
                 node.dialing(identity, id);
             }
-            (serial, node.hello(now, id), *node.constraints())
+            (serial, node.nonce(), *node.constraints())
         };
         let dialed = dialed.is_some();
-        let config = SessionConfig { link: id, dialed, address, local, constraints };
+        let config = SessionConfig { link: id, dialed, address, nonce, constraints };
         let mut session = Session::new(now, config, self.keys().cipher(), storage);
         let capacities = &self.links.capacities;
         session.let_list_grow(capacities.their_functions, capacities.their_signature_bytes);

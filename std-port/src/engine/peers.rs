@@ -248,8 +248,7 @@ impl Peers {
 
 #[cfg(test)]
 pub(super) mod tests {
-    use cara_core::distribution::hello::{Hello, Limits};
-    use cara_core::distribution::identity::{Epoch, Fleet};
+
     use cara_core::host::mailman::LinkId;
     use cara_core::services::session::{Session, SessionConfig, SessionStorage};
     use cara_core::time::Instant;
@@ -275,24 +274,8 @@ pub(super) mod tests {
             their_functions: filled_with(1, cara_core::distribution::function_list::Entry::empty),
             their_signatures: filled(64, 0),
         };
-        let local = Hello {
-            versions: cara_core::config::VERSIONS,
-            capabilities: 0,
-            fleet: Fleet(0),
-            identity: Identity::m_unit("manager", 1).unwrap(),
-            wanted: None,
-            epoch: Epoch(1),
-            claim: None,
-            obeyed: None,
-            nonce: 1,
-            limits: Limits { message_size: 0, chunk_size: 0, calls: 0, minimum_interval: 0 },
-            link: 0,
-            udp_port: 0,
-            keep_alive: 0,
-            stamp: 0,
-            skipped: 0,
-        };
-        let config = SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
+        let config =
+            SessionConfig { link: LinkId(0), dialed: true, address, nonce: 1, constraints: Constraints::M_UNIT };
         let session = Session::new(Instant::START, config, Cipher::new(cara_core::config::Mode::Plain), storage);
         Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address, false).unwrap(), session, true))
     }

@@ -128,8 +128,8 @@ impl Discovery {
             findings: memory.findings.as_mut_slice(),
         };
         let publications = Publications::new(memory.to_all.as_mut_slice(), memory.to_one.as_mut_slice());
-        let mut hub = Hub { node: Node::new(Instant::START, config, storage), publications };
-        let mut hello = hub.node.hello(Instant::START, LinkId(0));
+        let hub = Hub { node: Node::new(Instant::START, config, storage), publications };
+        let mut hello = hub.node.hello(Instant::START, LinkId(0), 1);
         hello.wanted = Manager::new(DEPOT, 1).ok();
         let connected = (NODES - SPARE) as u16;
         let spare = SessionStorage {
@@ -234,8 +234,8 @@ impl Discovery {
         let (mut hello, mut bytes) = ([0; 320], [0; 324]);
         let length = self.hello.encode(Mode::Plain, &mut hello).expect("room for it");
         let length = frame::encode(&Frame::Hello(&hello[..length]), 0, &mut bytes);
-        let (local, constraints) = (self.hub.node.hello(self.now, link), *self.hub.node.constraints());
-        let config = SessionConfig { link, dialed: false, address, local, constraints };
+        let (nonce, constraints) = (self.hub.node.nonce(), *self.hub.node.constraints());
+        let config = SessionConfig { link, dialed: false, address, nonce, constraints };
         let mut session: Session<Bench> =
             Session::new(self.now, config, Plain, self.spare.take().expect("it was given back"));
         let mut cx = Context {

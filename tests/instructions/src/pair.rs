@@ -9,7 +9,7 @@ use cara_core::config::{Constraints, LINK_BUFFER_BYTES};
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{Entry, FunctionList};
-use cara_core::distribution::hello::{Hello, Manager};
+use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::CloseReason;
@@ -131,7 +131,7 @@ impl<const BUFFER: usize> SideMemory<BUFFER> {
             link: LinkId(0),
             dialed: !caller,
             address: SocketAddrV4::new(Ipv4Addr::LOCALHOST, 7_000),
-            local: hello(&constraints, caller),
+            nonce: if caller { 0x1234_5678 } else { 0x8765_4321 },
             constraints,
         };
         Side {
@@ -375,25 +375,5 @@ fn node_config(constraints: Constraints, caller: bool) -> NodeConfig<SocketAddrV
         udp_port: 0,
         constraints,
         seed: 1,
-    }
-}
-
-fn hello(constraints: &Constraints, caller: bool) -> Hello {
-    Hello {
-        versions: cara_core::config::VERSIONS,
-        capabilities: 0,
-        fleet: Fleet(1),
-        identity: identity(caller),
-        wanted: (!caller).then(depot),
-        epoch: Epoch(1),
-        claim: None,
-        obeyed: None,
-        nonce: if caller { 0x1234_5678 } else { 0x8765_4321 },
-        limits: constraints.into(),
-        link: 0,
-        udp_port: 0,
-        stamp: 0,
-        keep_alive: constraints.keep_alive.as_millis() as u32,
-        skipped: 0,
     }
 }

@@ -10,7 +10,7 @@ use cara_core::time::Instant;
 use crate::side::Vectors;
 
 /// The hub of the unit that `own` introduces, which takes `maximum` peers.
-pub(crate) fn hub(own: &Hello, maximum: u16) -> Hub<Vectors> {
+pub(crate) fn hub(own: &Hello, constraints: Constraints, maximum: u16) -> Hub<Vectors> {
     let config = NodeConfig {
         identity: own.identity.clone(),
         fleet: own.fleet,
@@ -18,7 +18,7 @@ pub(crate) fn hub(own: &Hello, maximum: u16) -> Hub<Vectors> {
         target: own.wanted.clone().map_or(Target::Everybody, Target::Manager),
         tcp_port: 0,
         udp_port: own.udp_port,
-        constraints: Constraints { maximum_nodes: maximum, ..Constraints::M_UNIT },
+        constraints: Constraints { maximum_nodes: maximum, ..constraints },
         seed: 1,
     };
     let storage = NodeStorage {

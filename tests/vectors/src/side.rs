@@ -93,12 +93,12 @@ impl Side {
             minimum_interval: Duration::from_micros(u64::from(hello.limits.minimum_interval)),
             ..Constraints::S_UNIT
         };
-        let hub = membership::hub(&hello, maximum);
+        let hub = membership::hub(&hello, constraints, maximum);
         let config = SessionConfig {
             link: LinkId(hello.link),
             dialed,
             address: SocketAddr::from(([192, 0, 2, 1], 50_000)),
-            local: hello,
+            nonce: hello.nonce,
             constraints,
         };
         let mut side = Self {

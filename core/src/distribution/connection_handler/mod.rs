@@ -284,8 +284,13 @@ impl<P: Port> Node<P> {
         self.known_nodes = nodes;
     }
 
-    /// The hello for a new link, with a fresh nonce.
-    pub fn hello(&mut self, now: Instant, link: LinkId) -> Hello {
+    /// A nonce for a new link, of which this unit tells the peer in its hello.
+    pub fn nonce(&mut self) -> u64 {
+        self.random.bits()
+    }
+
+    /// The hello for a link with this nonce.
+    pub fn hello(&self, now: Instant, link: LinkId, nonce: u64) -> Hello {
         let constraints = &self.config.constraints;
         Hello {
             versions: VERSIONS,
@@ -296,7 +301,7 @@ impl<P: Port> Node<P> {
             epoch: self.config.epoch,
             claim: self.own_report(now),
             obeyed: self.peer_of(link).and_then(|peer| self.obeyed_report(now, peer)),
-            nonce: self.random.bits(),
+            nonce,
             limits: constraints.into(),
             link: link.0,
             udp_port: self.config.udp_port,

@@ -147,12 +147,12 @@ impl<P: Port> Session<P> {
     ) -> Option<Event> {
         // Under a seal the nonce and the seal tell whose it is, and its source may be another address of the host, or a NAT's.
         let is_of_peer = self.mode() == Mode::Secured || from.is_of_host(&self.peer_address);
-        if self.phase != Phase::Live || nonce != self.local.nonce || !is_of_peer {
+        if self.phase != Phase::Live || nonce != self.nonce || !is_of_peer {
             self.link.counters.count(LinkCounter::DatagramsDropped);
             return None;
         }
         let version = self.remote.as_ref()?.version;
-        let header = datagram::session_header(self.mode(), version, self.local.fleet, self.link.id().0, nonce);
+        let header = datagram::session_header(self.mode(), version, self.fleet, self.link.id().0, nonce);
         let body = match self.link.cipher().open_datagram(&header, body) {
             Ok(body) => &*body,
             Err(error) => {

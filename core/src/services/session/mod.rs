@@ -44,7 +44,7 @@ use crate::config::{Constraints, HELLO_TIMEOUT, LEASES, LINK_BUFFER_BYTES, Mode,
 use crate::counters::Counters;
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::Hello;
-use crate::distribution::identity::{Epoch, Identity};
+use crate::distribution::identity::{Epoch, Fleet, Identity};
 use crate::distribution::message::LONGEST_HEADER_BYTES;
 use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Error, Refusal};
@@ -81,8 +81,8 @@ pub struct SessionConfig<E> {
     pub dialed: bool,
     /// The other end of the stream.
     pub address: E,
-    /// This unit's hello, with a nonce that is fresh.
-    pub local: Hello,
+    /// [`Node::nonce`](crate::distribution::connection_handler::Node::nonce)
+    pub nonce: u64,
     /// This unit's constraints.
     pub constraints: Constraints,
 }
@@ -214,7 +214,10 @@ pub struct Session<P: Port> {
     dialed: bool,
     /// The hub has taken the peer.
     joined: bool,
-    local: Hello,
+    nonce: u64,
+    fleet: Fleet,
+    /// The pause between keep-alives, in milliseconds, that this unit's hello has named.
+    told_keep_alive: u32,
     constraints: Constraints,
     remote: Option<Remote<P::Endpoint>>,
     peer_address: P::Endpoint,
@@ -255,7 +258,7 @@ impl<P: Port> Session<P> {
         cipher: P::Cipher,
         storage: SessionStorage<P::Storage>,
     ) -> Self {
-        let SessionConfig { link, dialed, address, local, constraints } = config;
+        let SessionConfig { link, dialed, address, nonce, constraints } = config;
         let chunk_limit = usize::from(constraints.chunk_size);
         debug_assert!(storage.small.len() >= LINK_BUFFER_BYTES);
         let proven = cipher.is_sealing();
@@ -269,7 +272,9 @@ impl<P: Port> Session<P> {
             phase: Phase::AwaitingHello { until: now + HELLO_TIMEOUT },
             dialed,
             joined: false,
-            local,
+            nonce,
+            fleet: Fleet(0),
+            told_keep_alive: 0,
             constraints,
             remote: None,
             peer_address: address,
@@ -378,7 +383,7 @@ impl<P: Port> Session<P> {
 
     /// The nonce that the peer's session datagrams carry.
     pub const fn nonce(&self) -> u64 {
-        self.local.nonce
+        self.nonce
     }
 
     /// What the peer has published to this unit.
@@ -541,14 +546,17 @@ impl<P: Port> Session<P> {
     }
 
     fn send_hello(&mut self, cx: &mut Context<'_, P>) {
-        self.local.stamp = cx.now.as_micros();
-        if let Some(remote) = &self.remote {
-            let (now, obeyed) = (cx.now, &mut self.local.obeyed);
-            cx.hub.enter(&mut |hub| *obeyed = hub.node.obeyed_report(now, &remote.hello.identity));
-        }
-        let mut bytes = [0; HELLO_BYTES];
-        let mode = self.mode();
-        let length = self.local.encode(mode, &mut bytes).unwrap_or(0);
+        let (mut bytes, mut length) = ([0; HELLO_BYTES], 0);
+        let (now, mode, link) = (cx.now, self.mode(), self.link.id());
+        let (nonce, remote, fleet, told) = (self.nonce, &self.remote, &mut self.fleet, &mut self.told_keep_alive);
+        cx.hub.enter(&mut |hub| {
+            let mut hello = hub.node.hello(now, link, nonce);
+            if let Some(remote) = remote {
+                hello.obeyed = hub.node.obeyed_report(now, &remote.hello.identity);
+            }
+            (*fleet, *told) = (hello.fleet, hello.keep_alive);
+            length = hello.encode(mode, &mut bytes).unwrap_or(0);
+        });
         let bytes = bytes.get(..length).unwrap_or(&[]);
         self.link.cipher().introduce(bytes);
         self.send_frame(&Frame::Hello(bytes));

@@ -24,16 +24,12 @@ pub(super) struct Obedience {
     gives_way: Option<(Instant, Instant)>,
     pub(super) next: Instant,
     /// This unit's own claim was raised, which the peer has not been told.
-    raised: Option<ClaimReport>,
+    pub(super) has_news: bool,
 }
 
 impl Obedience {
     pub(super) const fn new() -> Self {
-        Self { may_move: false, waits: false, gives_way: None, next: Instant::FAR_FUTURE, raised: None }
-    }
-
-    pub(super) const fn has_news(&self) -> bool {
-        self.raised.is_some()
+        Self { may_move: false, waits: false, gives_way: None, next: Instant::FAR_FUTURE, has_news: false }
     }
 
     pub(super) const fn gives_way(&self) -> bool {
@@ -44,20 +40,17 @@ impl Obedience {
 impl<P: Port> Session<P> {
     /// This unit's claim is another one: the peer is told.
     pub fn announce_claim(&mut self, cx: &mut Context<'_, P>) {
-        let (now, mut report) = (cx.now, None);
-        cx.hub.enter(&mut |hub| report = hub.node.own_report(now));
-        self.local.claim = report;
-        self.obedience.raised = report;
+        self.obedience.has_news = true;
         self.pump(cx);
     }
 
     pub(super) fn send_claim(&mut self, cx: &mut Context<'_, P>) {
-        if P::MANAGES
-            && let Some(report) = self.obedience.raised
-            && self.send_control(cx, &Control::Claimed { report })
-        {
-            self.obedience.raised = None;
+        if !P::MANAGES || !self.obedience.has_news {
+            return;
         }
+        let (now, mut report) = (cx.now, None);
+        cx.hub.enter(&mut |hub| report = hub.node.own_report(now));
+        self.obedience.has_news = report.is_some_and(|report| !self.send_control(cx, &Control::Claimed { report }));
     }
 
     /// The peer has raised its claim.

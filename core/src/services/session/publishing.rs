@@ -284,7 +284,7 @@ impl<P: Port> Session<P> {
     /// Whether something waits for room.
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
-        let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty() && !self.obedience.has_news();
+        let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty() && !self.obedience.has_news;
         #[cfg(feature = "streams")]
         let told = told && !self.streaming.has_news();
         publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !told

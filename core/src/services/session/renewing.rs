@@ -81,7 +81,7 @@ impl<P: Port> Session<P> {
     /// Links that began together have nonces of their own.
     fn life_of_keys(&self) -> Duration {
         let eighth = self.renewal.every.divided_by(8).as_micros();
-        let less = (eighth >> 8).saturating_mul(self.local.nonce & 0xff);
+        let less = (eighth >> 8).saturating_mul(self.nonce & 0xff);
         Duration::from_micros(self.renewal.every.as_micros().saturating_sub(less))
     }
 

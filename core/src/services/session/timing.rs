@@ -258,7 +258,7 @@ impl<P: Port> Session<P> {
 
     fn send_keep_alive(&mut self, cx: &mut Context<'_, P>) {
         // The peer counts by what it was told in the hello.
-        let told = Duration::from_millis(u64::from(self.local.keep_alive));
+        let told = Duration::from_millis(self.told_keep_alive.into());
         self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
         self.publishing.actuators_due = true;
         self.pump(cx);
@@ -306,8 +306,7 @@ impl<P: Port> Session<P> {
         if remote.datagrams.port() == 0 {
             return None;
         }
-        let header =
-            datagram::session_header(mode, remote.version, self.local.fleet, remote.hello.link, remote.hello.nonce);
+        let header = datagram::session_header(mode, remote.version, self.fleet, remote.hello.link, remote.hello.nonce);
         Some((remote.datagrams, header))
     }
 }

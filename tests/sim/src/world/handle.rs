@@ -272,7 +272,7 @@ impl UnitHandle {
     pub fn tagged_claim(&self) -> TaggedClaim {
         let claim = self.with(|inner| {
             let machine = inner.units[self.host.index()].machine.as_mut()?;
-            machine.links.hub.node.hello(Instant::START, LinkId(u16::MAX)).claim
+            machine.links.hub.node.hello(Instant::START, LinkId(u16::MAX), 0).claim
         });
         claim.map_or(TaggedClaim::NONE, |report| report.tagged)
     }

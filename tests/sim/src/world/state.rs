@@ -190,7 +190,7 @@ impl Machine {
     ) -> Option<u16> {
         let index = self.links.free_index()?;
         let now = network.clock(self.links.host());
-        let hello = self.links.hub.node.hello(now, LinkId(index));
+        let nonce = self.links.hub.node.nonce();
         let calls = CALLS.max(usize::from(self.constraints.calls_per_peer));
         let storage = SessionStorage {
             small: Boxed::slice(cara_core::config::LINK_BUFFER_BYTES),
@@ -201,7 +201,7 @@ impl Machine {
             their_signatures: Boxed::slice(functions * SIGNATURE_BYTES),
         };
         let link = LinkId(index);
-        let config = SessionConfig { link, dialed, address: peer, local: hello, constraints: self.constraints };
+        let config = SessionConfig { link, dialed, address: peer, nonce, constraints: self.constraints };
         let mut session = Session::new(now, config, self.links.keys.cipher(), storage);
         if let Some(span) = self.links.keys.renews_every {
             session.renew_every(span);

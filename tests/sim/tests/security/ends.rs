@@ -7,7 +7,7 @@ use cara_core::config::{Constraints, Mode, Priority};
 use cara_core::distribution::connection_handler::{NodeConfig, Target};
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{Entry, FunctionList};
-use cara_core::distribution::hello::{Hello, Limits, Manager};
+use cara_core::distribution::hello::{Hello, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::CloseReason;
@@ -131,30 +131,8 @@ pub(crate) fn key() -> PairKey {
 }
 
 fn config_of(identity: Identity, target: Target<SocketAddr>) -> NodeConfig<SocketAddr> {
-    let constraints = Constraints::M_UNIT;
-    NodeConfig { identity, fleet: FLEET, epoch: Epoch(1), target, tcp_port: 0, udp_port: 0, constraints, seed: 1 }
-}
-
-fn hello(agv: bool, run: u8) -> Hello {
-    let [manager, vehicle] = names();
-    let limits = Limits { message_size: 1_024, chunk_size: 1_024, calls: 4, minimum_interval: 0 };
-    Hello {
-        versions: cara_core::config::VERSIONS,
-        capabilities: 0,
-        fleet: FLEET,
-        identity: if agv { vehicle } else { manager },
-        wanted: agv.then(|| Manager::new("depot", 1).expect("a name")),
-        epoch: Epoch(1),
-        claim: None,
-        obeyed: None,
-        nonce: 0x1_0000 + u64::from(run) * 2 + u64::from(agv),
-        limits,
-        link: u16::from(agv),
-        udp_port: 7_001,
-        stamp: 0,
-        keep_alive: 1_000,
-        skipped: 0,
-    }
+    let constraints = Constraints { message_size: 1_024, chunk_size: 1_024, calls_per_peer: 4, ..Constraints::M_UNIT };
+    NodeConfig { identity, fleet: FLEET, epoch: Epoch(1), target, tcp_port: 0, udp_port: 7_001, constraints, seed: 1 }
 }
 
 impl End {
@@ -172,7 +150,7 @@ impl End {
             link: LinkId(u16::from(agv)),
             dialed: agv,
             address: SocketAddr::from(([10, 0, 0, 1], 7_001)),
-            local: hello(agv, run),
+            nonce: 0x1_0000 + u64::from(run) * 2 + u64::from(agv),
             constraints,
         };
         let now = Instant::START + Duration::from_secs(5);

@@ -110,7 +110,7 @@ fn a_vehicle_obeys_the_highest_claim_and_refuses_lower_ones() {
         let mut node = vehicle(obeyed);
         assert_eq!(admit(&mut node, 0, &of_claim(refused)), FENCED, "{refused:?}");
         assert_eq!((node.claim(), node.counters.value(NodeCounter::RefusedFenced)), (obeyed, 1));
-        let hello = node.hello(at(9_000), LinkId(0));
+        let hello = node.hello(at(9_000), LinkId(0), 1);
         assert_eq!(hello.obeyed, report(obeyed, 9_000), "a manager hears what fences it, and how old it is");
     }
     let without = Hello { claim: None, ..of_claim(obeyed) };
@@ -175,7 +175,7 @@ fn a_claim_without_a_tag_is_forgotten_with_its_link() {
     assert_eq!(admit(&mut node, 0, &plain(6)), Admission::Accept);
     assert_eq!(node.claim(), claim(6));
     node.left(at(3_000), LinkId(0), CloseReason::Reset);
-    assert_eq!((node.claim(), node.hello(at(3_000), LinkId(1)).obeyed), (Claim::NONE, None));
+    assert_eq!((node.claim(), node.hello(at(3_000), LinkId(1), 1).obeyed), (Claim::NONE, None));
     assert_eq!(admit_at(&mut node, at(3_001), 1, &plain(4)), Admission::Accept);
 }
 
@@ -319,7 +319,7 @@ fn an_answer_starts_the_count_again() {
 fn a_manager_that_takes_over_raises_until_it_was_the_highest_once() {
     let mut node = managed(5);
     node.take_over(at(900));
-    assert_eq!(node.hello(at(1_000), LinkId(9)).claim, report(claim(5), 100));
+    assert_eq!(node.hello(at(1_000), LinkId(9), 1).claim, report(claim(5), 100));
     assert_eq!(admit(&mut node, 0, &agv(2, forged(claim(80)))), FENCED);
     assert_eq!(watch(&mut node, at(1_000), at(1_100)).0, vec![]);
     assert_eq!(admit_at(&mut node, at(1_200), 0, &agv(3, report(claim(7), 0))), FENCED);

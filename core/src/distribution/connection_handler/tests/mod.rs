@@ -129,7 +129,7 @@ pub(super) fn depot() -> Node<InMemory> {
 
 /// The hello of a unit, as its node would make it.
 pub(super) fn hello_of(config: &NodeConfig<SocketAddr>) -> Hello {
-    node(config.clone()).hello(Instant::START, LinkId(0))
+    node(config.clone()).hello(Instant::START, LinkId(0), 1)
 }
 
 pub(super) fn search_of(config: &NodeConfig<SocketAddr>, sequence: u32) -> WhoHas {

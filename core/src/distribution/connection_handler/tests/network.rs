@@ -229,9 +229,9 @@ impl Network {
             node.left(now, LinkId(0), CloseReason::DialFailed);
             return self.work(from);
         };
-        let ours = server.hello(now, link);
+        let ours = server.hello(now, link, 1);
         let dialler = self.units[from].node.as_mut().unwrap();
-        let theirs = dialler.hello(now, LinkId(0));
+        let theirs = dialler.hello(now, LinkId(0), 2);
         assert_eq!(dialler.admit(now, LinkId(0), Self::address_of(to, 7_000), &ours), Admission::Accept);
         self.units[from].joined = Some(now);
         let server = self.units[to].node.as_mut().unwrap();

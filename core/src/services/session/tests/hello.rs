@@ -26,7 +26,7 @@ fn a_refusal_tells_the_reason_to_both() {
     for side_refuses in [true, false] {
         let mut pair = Pair::connected(&Setup::default());
         let refuses = if side_refuses { &mut pair.manager } else { &mut pair.agv };
-        refuses.hub.hub = setup::hub(!side_refuses, "another");
+        refuses.hub.hub = setup::hub(!side_refuses, "another", *refuses.session.constraints(), false);
         pair.settle();
         let closed = Event::Closed(CloseReason::Refused(Refusal::WrongManager));
         assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
@@ -39,11 +39,20 @@ fn a_claim_that_is_fenced_is_told_to_both() {
     let tagged = |term| TaggedClaim { claim: Claim { term, claimant: 1 }, ..TaggedClaim::NONE };
     let (over, newer) = (tagged(5), tagged(6));
     for manager_refuses in [true, false] {
-        let mut pair = Pair::of_claims(&Setup::default(), over, newer);
-        // One that does not look what the vehicle has obeyed is refused by it.
-        pair.manager.hub.hub.node.set_claim(if manager_refuses { over } else { newer });
-        let manager = pair.manager.hub.hub.node.identity().clone();
-        pair.agv.hub.hub.node.keep_obeyed(Instant::START, &manager, newer);
+        let obeys = |pair: &mut Pair| {
+            let manager = pair.manager.hub.hub.node.identity().clone();
+            pair.agv.hub.hub.node.keep_obeyed(Instant::START, &manager, newer);
+        };
+        let mut pair = Pair::prepared(&Setup::default(), |pair| {
+            pair.manager.hub.hub.node.set_claim(over);
+            if manager_refuses {
+                obeys(pair);
+            }
+        });
+        // The vehicle's hello, which has been sent, did not say so: the vehicle refuses.
+        if !manager_refuses {
+            obeys(&mut pair);
+        }
         pair.settle();
         let closed = Event::Closed(CloseReason::Refused(Refusal::Fenced));
         assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);

@@ -146,8 +146,8 @@ impl End {
     }
 
     fn open(&mut self, now: Instant, address: Line, dialed: bool) {
-        let local = self.hub.node.hello(now, LinkId(0));
-        let config = SessionConfig { link: LinkId(0), dialed, address, local, constraints: Constraints::S_UNIT };
+        let nonce = self.hub.node.nonce();
+        let config = SessionConfig { link: LinkId(0), dialed, address, nonce, constraints: Constraints::S_UNIT };
         self.session = Some(Session::new(now, config, Plain, setup::storage(4, 4)));
         self.with(now, |session, cx| session.connected(cx));
     }

@@ -5,8 +5,6 @@ use std::vec::Vec;
 use super::net::Net;
 use super::setup::Setup;
 use super::side::{Side, context};
-use crate::distribution::claim::TaggedClaim;
-use crate::distribution::hello::ClaimReport;
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::services::Context;
@@ -22,19 +20,14 @@ pub(super) struct Pair {
 impl Pair {
     /// Two ends whose connection is open, and nothing sent yet.
     pub(super) fn connected(setup: &Setup) -> Self {
-        Self::open(setup, None, None)
+        Self::prepared(setup, |_| ())
     }
 
-    /// The same where the hellos say what the manager claims and the AGV has obeyed.
-    pub(super) fn of_claims(setup: &Setup, manager: TaggedClaim, agv: TaggedClaim) -> Self {
-        let report = |tagged| Some(ClaimReport { tagged, since: ClaimReport::NEVER });
-        Self::open(setup, report(manager), report(agv))
-    }
-
-    fn open(setup: &Setup, manager: Option<ClaimReport>, agv: Option<ClaimReport>) -> Self {
+    /// The same after something was done to the two ends.
+    pub(super) fn prepared(setup: &Setup, prepare: impl FnOnce(&mut Self)) -> Self {
         let mut pair =
             Self { manager: Side::new(setup, false, 1), agv: Side::new(setup, true, 2), elapsed: Duration::ZERO };
-        (pair.manager.session.local.claim, pair.agv.session.local.obeyed) = (manager, agv);
+        prepare(&mut pair);
         pair.manager.session.connected(context!(pair.manager));
         pair.agv.session.connected(context!(pair.agv));
         pair

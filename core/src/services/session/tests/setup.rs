@@ -7,11 +7,11 @@ use std::vec;
 use super::super::{Publication, SessionStorage, buffer_bytes};
 use super::net::DATAGRAM_PORT;
 use super::side::Tested;
-use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority, VERSIONS};
+use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority};
 use crate::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
 use crate::distribution::function::{Attributes, Definition};
 use crate::distribution::function_list::{Entry, FunctionList};
-use crate::distribution::hello::{Hello, Manager};
+use crate::distribution::hello::Manager;
 use crate::distribution::identity::{Epoch, Fleet, Identity};
 use crate::distribution::parameters::ParametersView;
 use crate::error::Error;
@@ -102,38 +102,24 @@ pub(super) fn attributes(definition: &Definition, lease_millis: u64) -> Attribut
     Attributes { lease, priority, ..Attributes::default() }
 }
 
-pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> Hello {
-    Hello {
-        versions: VERSIONS,
-        capabilities: 0,
-        fleet: Fleet(1),
-        identity: if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit("manager", 1) }.unwrap(),
-        wanted: agv.then(|| Manager::new("manager", 1).unwrap()),
-        epoch: Epoch(1),
-        claim: None,
-        obeyed: None,
-        nonce: if agv { 0xA61 } else { 0x3A6A6E2 },
-        limits: constraints.into(),
-        link: u16::from(agv),
-        udp_port: if datagrams { DATAGRAM_PORT } else { 0 },
-        stamp: 0,
-        keep_alive: constraints.keep_alive.as_millis() as u32,
-        skipped: 0,
-    }
+pub(super) fn nonce(agv: bool) -> u64 {
+    if agv { 0xA61 } else { 0x3A6A6E2 }
 }
 
 /// The hub of an end whose manager has this name.
-pub(super) fn hub(agv: bool, manager: &str) -> Hub<Tested> {
+pub(super) fn hub(agv: bool, manager: &str, constraints: Constraints, datagrams: bool) -> Hub<Tested> {
     let target = if agv { Target::Manager(Manager::new(manager, 1).unwrap()) } else { Target::Everybody };
     let identity = if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit(manager, 1) }.unwrap();
+    // What decides whether a peer is taken is the hub's, and what its hello says of limits the link's.
+    let constraints = Constraints { maximum_nodes: Constraints::M_UNIT.maximum_nodes, ..constraints };
     let config = NodeConfig {
         identity,
         fleet: Fleet(1),
         epoch: Epoch(1),
         target,
         tcp_port: 0,
-        udp_port: 0,
-        constraints: Constraints::M_UNIT,
+        udp_port: if datagrams { DATAGRAM_PORT } else { 0 },
+        constraints,
         seed: 1,
     };
     let storage = NodeStorage {

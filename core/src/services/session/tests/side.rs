@@ -134,7 +134,7 @@ impl Side {
             link: LinkId(address.into()),
             dialed: agv,
             address: SocketAddr::new(IpAddr::V4(Ipv4Addr::new(10, 0, 0, 3_u8.wrapping_sub(address))), DATAGRAM_PORT),
-            local: setup::hello(&constraints, agv, setup.datagrams),
+            nonce: setup::nonce(agv),
             constraints,
         };
         Self {
@@ -147,7 +147,7 @@ impl Side {
             happened: Vec::new(),
             ran: Vec::new(),
             held: Vec::new(),
-            hub: Lobby { hub: setup::hub(agv, "manager"), waits: false, entered: 0 },
+            hub: Lobby { hub: setup::hub(agv, "manager", constraints, setup.datagrams), waits: false, entered: 0 },
             inbox: Vec::new(),
             holds_back: false,
             received: 0,

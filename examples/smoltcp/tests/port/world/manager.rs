@@ -295,7 +295,7 @@ impl Manager {
     fn open(&mut self, now: Instant, index: usize) {
         let link = LinkId(index as u16);
         let SocketAddr::V4(address) = self.net.stream(index).remote_endpoint().unwrap().into() else { return };
-        let local = self.hub.node.hello(now, link);
+        let nonce = self.hub.node.nonce();
         let storage = SessionStorage {
             small: Boxed::slice(LINK_BUFFER_BYTES),
             pending: Boxed::slice(CALLS),
@@ -304,7 +304,7 @@ impl Manager {
             their_functions: Boxed::slice(FUNCTIONS),
             their_signatures: Boxed::slice(FUNCTIONS * 96),
         };
-        let config = SessionConfig { link, dialed: false, address, local, constraints: Constraints::M_UNIT };
+        let config = SessionConfig { link, dialed: false, address, nonce, constraints: Constraints::M_UNIT };
         let mut session = Session::new(now, config, Plain, storage);
         session.connected(context!(self, now));
         self.sessions[index] = Some(session);
