@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 
 use cara_core::distribution::claim::{Claim, TaggedClaim};
 use cara_core::distribution::connection_handler::ClaimEvent;
@@ -119,14 +119,17 @@ impl<T: Send + 'static> Engine<T> {
         let mut kept = file.as_ref().map(ClaimFile::read).unwrap_or_default();
         let codes = self.keys().codes();
         if identity.role() == Role::MUnit {
+            if file.is_none() {
+                tracing::info!("no folder of state is set (CARA_STATE): the claim of this manager is not stored");
+                // By the clock it is above that of its last start, mostly; otherwise vehicles fence it until it raises its claim.
+                let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+                kept.own.term = since.map_or(0, |since| since.as_secs());
+            }
             kept.own = kept.own.max(heard).raised(random());
             let Some(tagged) = kept.own.tagged(&identity, &codes) else {
                 return Err(StartError::NoOwnKey { identity });
             };
             self.store(&kept).map_err(StartError::Claim)?;
-            if file.is_none() {
-                tracing::info!("no folder of state is set (CARA_STATE): the claim of this manager is not stored");
-            }
             let mut cell = self.hub();
             cell.hub.node.set_claim(tagged);
             if self.claims.take_over != TakeOver::No {

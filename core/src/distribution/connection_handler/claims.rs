@@ -347,11 +347,8 @@ impl<P: Port> Node<P> {
         self.obey(now, manager, Some(claim));
     }
 
-    /// The link of a manager has ended. A claim without a tag, as in plain mode, is not kept: the manager's next start may be lower.
+    /// The link of a manager has ended.
     pub(super) fn manager_left(&mut self, now: Instant, manager: &Identity) {
-        self.claims
-            .obeyed
-            .retain(|(identity, obeyed)| identity != manager || obeyed.tagged.tag != TaggedClaim::NONE.tag);
         if let Some(obeyed) = self.claims.of_mut(manager) {
             obeyed.heard = now;
         }

@@ -163,22 +163,6 @@ fn a_claim_is_stored_before_the_first_moving_call() {
     assert!(forgetful.may_move(at(2_000), &manager));
 }
 
-/// Where nothing proves a claim, it counts for as long as its manager's link: that one's next start may have a lower claim.
-#[test]
-fn a_claim_without_a_tag_is_forgotten_with_its_link() {
-    let plain = |term| {
-        let bare = TaggedClaim { claim: claim(term), tag: TaggedClaim::NONE.tag };
-        let report = ClaimReport { tagged: bare, since: ClaimReport::NEVER };
-        Hello { claim: Some(report), ..hello_of(&m_unit(MANAGER, MANAGER_ID)) }
-    };
-    let mut node = node(s_unit("agv", 1));
-    assert_eq!(admit(&mut node, 0, &plain(6)), Admission::Accept);
-    assert_eq!(node.claim(), claim(6));
-    node.left(at(3_000), LinkId(0), CloseReason::Reset);
-    assert_eq!((node.claim(), node.hello(at(3_000), LinkId(1), 1).obeyed), (Claim::NONE, None));
-    assert_eq!(admit_at(&mut node, at(3_001), 1, &plain(4)), Admission::Accept);
-}
-
 /// With the key of one vehicle, or by accident: whatever claim it says it has obeyed, the manager loses that vehicle only.
 #[test]
 fn a_fence_costs_a_manager_that_vehicle_and_nothing_else() {
