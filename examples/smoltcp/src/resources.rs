@@ -154,7 +154,7 @@ impl Resources {
 
 /// What a board must have: the page says so.
 #[cfg(target_pointer_width = "32")]
-const _: () = assert!(size_of::<Resources>() <= 24 * 1024 && size_of::<crate::SUnit>() <= 6 * 1024 + 768);
+const _: () = assert!(size_of::<Resources>() <= 24 * 1024 && size_of::<crate::SUnit>() <= 6 * 1024 + 512);
 
 impl Default for Resources {
     fn default() -> Self {
