@@ -5,6 +5,7 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use cara_core::config::Constraints;
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::Function;
@@ -165,6 +166,14 @@ impl<T: Send + 'static> Peer<T> {
     /// How long ago it left, and why; `None` while it is connected.
     pub fn left(&self) -> Option<(Duration, CloseReason)> {
         self.cell.left().map(|(ago, reason)| (ago.into(), reason))
+    }
+
+    /// The claim of the manager of this unit's name that it obeys instead, and where the node is: it refuses this unit until this one's
+    /// claim is the higher one. `None` otherwise.
+    pub fn under(&self) -> Option<(Claim, SocketAddr)> {
+        let cell = self.engine.hub();
+        let known = cell.hub.node.node(self.identity())?;
+        known.under().map(|claim| (claim, *known.address()))
     }
 
     /// Which of its runs is connected: it differs after each start of the node.

@@ -14,7 +14,7 @@ use super::protocol::{
     RefusedInfo, UnitInfo,
 };
 use crate::keys::LiveRing;
-use crate::{CommunicationSystem, Interface, Limits, Peer, TheirFunction, UnitEvent};
+use crate::{CommunicationSystem, Interface, Limits, Peer, Refusal, TheirFunction, UnitEvent};
 
 pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitInfo {
     let identity = system.identity();
@@ -55,6 +55,7 @@ fn interface(interface: &Interface) -> InterfaceInfo {
 
 pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInfo {
     let (limits, left) = (peer.limits(), peer.left());
+    let under = under(peer);
     NodeInfo {
         name: peer.name().to_owned(),
         id: peer.id(),
@@ -66,12 +67,17 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInf
         epoch: peer.epoch().map(epoch),
         connected_ms: peer.connected_for().map(Duration::as_millis),
         left_ms: left.map(|(ago, _)| ago.as_millis()),
-        left_reason: left.map(|(_, reason)| name_of(&reason)),
-        left_text: left.map(|(_, reason)| reason.to_string()),
+        left_reason: under.as_ref().map(|_| name_of(&Refusal::Fenced)).or(left.map(|(_, reason)| name_of(&reason))),
+        left_text: under.or(left.map(|(_, reason)| reason.to_string())),
         limits: limits.map(self::limits),
         link: peer.link_info(),
         functions: peer.their_function_list().len(),
     }
+}
+
+/// That a node obeys another manager of this unit's name.
+pub(super) fn under<T: Send + 'static>(peer: &Peer<T>) -> Option<String> {
+    peer.under().map(|(claim, address)| format!("under another manager: claim {claim}, address {address}"))
 }
 
 fn limits(limits: Limits) -> LimitsInfo {

@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::ops::ControlFlow;
 
 use super::answering::{End, Sink, send};
+use super::describe;
 use super::protocol::{Answer, Failure};
 use crate::{CommunicationSystem, Peer};
 
@@ -32,9 +33,18 @@ pub(super) fn call<T: Send + 'static>(
     missed.clone().try_for_each(|peer| send(sink, missing(peer, function)))
 }
 
+/// Why a call of all skipped a node.
+pub(super) fn not_called<T: Send + 'static>(peer: &Peer<T>, lacks: Option<&str>) -> Failure {
+    let failure = Failure::not_called(lacks);
+    match describe::under(peer) {
+        Some(under) => failure.and(under),
+        None => failure,
+    }
+}
+
 fn missing<T: Send + 'static>(peer: &Peer<T>, function: &str) -> Answer {
     let lacks_it = peer.is_connected() && !peer.their_function_list().contains(function);
-    let failure = Failure::not_called(lacks_it.then_some(function));
+    let failure = not_called(peer, lacks_it.then_some(function));
     let (node, id) = (peer.name().to_owned(), peer.id());
     let (results, functions) = (Vec::new(), Vec::new());
     Answer::Called { node, id, results, call: None, error: Some(failure), took_us: 0, functions }

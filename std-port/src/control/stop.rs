@@ -11,6 +11,7 @@ use cara_core::services::access::Verb;
 
 use super::answering::{End, Sink, permit, send};
 use super::call::{News, block_all, called, prepare};
+use super::everybody::not_called;
 use super::protocol::{Answer, CallQuestion, Failure};
 use super::select;
 use crate::{CommunicationSystem, Delivery, Identity, Peer, RequestOptions};
@@ -136,7 +137,7 @@ fn everybody<T: Send + 'static>(system: &CommunicationSystem<T>, which: Which) -
 /// The names of the functions that are called; why there are none.
 fn functions<T: Send + 'static>(peer: &Peer<T>, which: Which) -> Result<Vec<String>, Failure> {
     if !peer.is_connected() {
-        return Err(Failure::not_called(None));
+        return Err(not_called(peer, None));
     }
     let list = peer.their_function_list();
     let meant = list.iter().filter(|function| which.has(&function.attributes));

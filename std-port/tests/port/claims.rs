@@ -108,6 +108,33 @@ fn what_a_vehicle_has_obeyed_outlives_it_and_a_lost_claim_locks_no_manager_out()
     move_it(&manager);
 }
 
+/// Its manager cannot raise its claim, which cannot be stored, and shows whom the vehicle is under.
+#[test]
+fn a_vehicle_under_another_manager_is_shown_with_its_claim_and_address() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let [board, first, second] = ["board", "first", "second"].map(|name| folder.path().join(name));
+    let agv = vehicle(fleet, &board);
+    let claim = {
+        // The second life's claim is above that of a manager that starts for the first time.
+        let _ = manager(fleet, &first, false).start();
+        let manager = manager(fleet, &first, false);
+        manager.start().unwrap();
+        move_it(&manager);
+        manager.claim()
+    };
+    let manager = manager(fleet, &second, false);
+    manager.start().unwrap();
+    std::fs::remove_dir_all(&second).unwrap();
+    std::fs::write(&second, "").unwrap();
+    assert!(manager.claim() < claim);
+    let identity = agv.identity().clone();
+    let under = || manager.roster().iter().find(|peer| *peer.identity() == identity).and_then(|peer| peer.under());
+    until("it is under another one", || under().is_some());
+    let (shown, address) = under().unwrap();
+    assert_eq!((shown, address.ip().is_loopback()), (claim, true));
+    assert_eq!(manager.number_of_s_units(), 0);
+}
+
 /// It cannot say whether it was stopped, so it starts stopped. Once it is reset, it obeys the claim until its next start, and says
 /// so.
 #[test]

@@ -89,6 +89,11 @@ impl<E> Known<E> {
         self.under
     }
 
+    /// Where it was heard last.
+    pub const fn address(&self) -> &E {
+        &self.address
+    }
+
     /// The node's link, while it is connected.
     pub const fn link(&self) -> Option<LinkId> {
         match self.state {

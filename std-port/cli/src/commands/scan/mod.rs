@@ -115,9 +115,10 @@ fn joined(nodes: &[NodeInfo]) -> Rows {
     rows
 }
 
-fn state(node: &NodeInfo) -> (Style, &'static str) {
+fn state(node: &NodeInfo) -> (Style, &str) {
     match (node.connected, node.expected, node.left_ms) {
         (true, ..) => (PLAIN, "connected"),
+        _ if node.left_reason.as_deref() == Some("Fenced") => (BAD, node.left_text.as_deref().unwrap_or("left")),
         (false, true, None) => (BAD, "absent"),
         (false, true, Some(_)) => (BAD, "left"),
         (false, false, _) => (FAINT, "left"),
