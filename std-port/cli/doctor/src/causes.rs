@@ -87,13 +87,13 @@ fn fenced(seen: &Evidence, name: &str, lives: &[Life]) -> Option<Finding> {
 }
 
 /// Taking over moves vehicles from a manager that may be the one that is meant: the advice does not begin there.
-const FENCED_ADVICE: &str = "find out which manager of this name and id is to command. If it is the one with the higher claim, stop \
+pub(crate) const FENCED_ADVICE: &str = "find out which manager of this name and id is to command. If it is the one with the higher claim, stop \
                              the other one and leave it stopped. If not, stop the one with the higher claim first, and see that its \
                              process has ended, also where it hangs or is cut off; then start the other one again: it claims a \
                              higher one by itself";
 
-const DUPLICATE_MANAGERS: &str =
-    "stop one of the two, or give each a name and id of its own: as it is, each has some of the nodes";
+const DUPLICATE_MANAGERS: &str = "find out which of the two is to command, and stop the other one: where they hear each other, the one with the lower claim \
+     steps down by itself, with exit code 6";
 
 /// A node that has come with one epoch after the other.
 pub(crate) fn restarting(node: &str, lives: &[Life]) -> Option<Finding> {

@@ -88,6 +88,8 @@ pub(crate) enum Id {
     FewDescriptors,
     /// A unit's access table has a mistake, so that an earlier one is in force.
     AccessTable,
+    /// A claim is obeyed, and not stored.
+    ClaimNotStored,
     /// Something else is sent to the port of broadcasts.
     ForeignDatagrams,
     /// Units of this host cannot be asked.
@@ -103,7 +105,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 40] = [
+    pub(crate) const ALL: [Self; 41] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -139,6 +141,7 @@ impl Id {
         Self::StreamDead,
         Self::FewDescriptors,
         Self::AccessTable,
+        Self::ClaimNotStored,
         Self::ForeignDatagrams,
         Self::ControlRefused,
         Self::SeveralUnits,
@@ -184,6 +187,7 @@ impl Id {
             Self::StreamDead => "stream-dead",
             Self::FewDescriptors => "few-descriptors",
             Self::AccessTable => "access-table",
+            Self::ClaimNotStored => "claim-not-stored",
             Self::ForeignDatagrams => "foreign-datagrams",
             Self::ControlRefused => "control-refused",
             Self::SeveralUnits => "several-units",

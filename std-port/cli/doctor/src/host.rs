@@ -172,6 +172,17 @@ pub(crate) fn access_table(unit: &Running) -> Option<Finding> {
     })
 }
 
+/// After its next start it obeys an earlier manager again.
+pub(crate) fn claim_not_stored(unit: &Running) -> Option<Finding> {
+    let failed = unit.own_counter("ClaimsNotKept").is_some_and(|failed| failed > 0);
+    failed.then(|| {
+        let found = "it obeys a manager whose claim it could not store, or not within two seconds, and forgets it when it ends";
+        let advice = "look at its folder of state (CARA_STATE): whether there is space, who may write there, and whether the disk hangs; \
+                      the unit's log has the error";
+        Finding::warning(Id::ClaimNotStored, found, advice).about(unit.name())
+    })
+}
+
 fn descriptors(running: &Running, open: u64, limit: u64, finding: fn(Id, String, String) -> Finding) -> Finding {
     let maximum = running.unit.constraints.maximum_nodes;
     let found = format!(
@@ -276,5 +287,9 @@ mod tests {
         unit.counters = count(1);
         let found = access_table(&unit).unwrap();
         assert_eq!((found.id, found.about.as_deref()), (Id::AccessTable, Some("manager/1")));
+        assert_eq!(claim_not_stored(&unit), None);
+        unit.counters[0].counters = vec![("ClaimsNotKept".into(), 1)];
+        let found = claim_not_stored(&unit).unwrap();
+        assert_eq!((found.id, found.about.as_deref()), (Id::ClaimNotStored, Some("manager/1")));
     }
 }

@@ -32,10 +32,15 @@ pub(crate) fn all(seen: &Evidence, unit: &Running) -> Vec<Finding> {
         others.any(|other| (&other.name, other.id) == (&node.name, node.id))
             || seen.ours().any(|(_, identity)| (identity.name(), identity.id()) == (node.name.as_str(), node.id))
     };
-    let mut left: Vec<&NodeInfo> = unit.nodes.iter().filter(|node| !node.connected && !is_there(node)).collect();
+    let mut left: Vec<&NodeInfo> =
+        unit.nodes.iter().filter(|node| !node.connected && (is_fenced(node) || !is_there(node))).collect();
     left.sort_by_key(|node| node.left_ms);
     let severity = |node: &NodeInfo| if was_stopped(node) { Severity::Info } else { Severity::Warning };
     left.iter().filter_map(|node| Some(Finding { severity: severity(node), ..finding(unit, node)? })).collect()
+}
+
+fn is_fenced(node: &NodeInfo) -> bool {
+    node.left_reason.as_deref() == Some("Fenced")
 }
 
 fn was_stopped(node: &NodeInfo) -> bool {
@@ -44,6 +49,10 @@ fn was_stopped(node: &NodeInfo) -> bool {
 
 fn finding(unit: &Running, node: &NodeInfo) -> Option<Finding> {
     let name = format!("{}/{}", node.name, node.id);
+    if let Some(under) = node.left_text.as_ref().filter(|_| is_fenced(node)) {
+        let found = format!("{} refuses {}: it is {under}", name, unit.name());
+        return Some(Finding::error(Id::Fenced, found, super::causes::FENCED_ADVICE).about(name));
+    }
     let ago = span(node.left_ms.filter(|_| !node.connected)? / 1000);
     let (why, advice) = match node.left_reason.as_deref() {
         Some("Silent") => ("nothing was heard from it any more", HUNG),
@@ -99,6 +108,22 @@ mod tests {
         assert_eq!(severities(&seen), [Severity::Info]);
         seen.heard = vec![searching("agv", 7, "boss")];
         assert_eq!(severities(&seen), []);
+    }
+
+    #[test]
+    fn a_node_under_another_manager_is_no_lost_one() {
+        let mut seen = lost();
+        seen.running[0].nodes[0] = NodeInfo {
+            left_reason: Some("Fenced".into()),
+            left_text: Some("under another manager: claim 3.86d7, address 10.0.0.7:7000".into()),
+            left_ms: None,
+            ..node_info("agv", 7, false)
+        };
+        // It answers searches, as it is well.
+        seen.heard = vec![searching("agv", 7, "boss")];
+        let found = all(&seen, &seen.running[0]);
+        assert_eq!(found.iter().map(|finding| finding.id).collect::<Vec<_>>(), [Id::Fenced]);
+        assert!(found[0].found.contains("claim 3.86d7, address 10.0.0.7:7000"), "{}", found[0].found);
     }
 
     #[test]

@@ -122,6 +122,7 @@ fn versions(seen: &Evidence) -> Vec<Finding> {
 /// What a unit of this host has met.
 fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     let mut found: Vec<Finding> = host::few_descriptors(unit).into_iter().chain(host::access_table(unit)).collect();
+    found.extend(host::claim_not_stored(unit));
     found.extend(host::unit_refused(seen, unit));
     found.extend(secured::failed_proofs(unit));
     if unit.is_full() {
