@@ -42,7 +42,7 @@ entry!(node_asked, {
 entry!(node_set, {
     node().set_constraints(*unknown());
     node().set_maximum_nodes(*unknown());
-    keep(node().nonce(), node().hello(*unknown(), *unknown(), *unknown()));
+    keep((node().nonce(), node().hello(*unknown(), *unknown(), *unknown())));
     node().choose(unknown_slice());
     node().expect(*unknown());
 });
