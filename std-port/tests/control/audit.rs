@@ -52,18 +52,27 @@ impl Audited {
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     }
 
-    /// Waits until there are so many; what each asked, of what, and its outcome.
-    fn told(&self, count: usize) -> Vec<[String; 3]> {
-        until("it is told", || self.lines().len() >= count);
+    /// What each asked, of what, and its outcome.
+    fn all(&self) -> Vec<[String; 3]> {
         let word = |value: &Value| value.as_str().unwrap_or("-").to_owned();
         self.lines().iter().map(|line| ["ask", "function", "outcome"].map(|key| word(&line[key]))).collect()
     }
 
-    /// The same without resets that came too early.
+    /// The same, once there are so many.
+    fn told(&self, count: usize) -> Vec<[String; 3]> {
+        until("it is told", || self.lines().len() >= count);
+        self.all()
+    }
+
+    /// The same without resets that came too early, which count for none.
     fn done(&self, count: usize) -> Vec<[String; 3]> {
-        let mut told = self.told(count);
-        told.retain(|line| *line != ["reset", "free", "Inhibited"]);
-        told
+        let done = || {
+            let mut all = self.all();
+            all.retain(|line| *line != ["reset", "free", "Inhibited"]);
+            all
+        };
+        until("it is told", || done().len() >= count);
+        done()
     }
 
     fn call(&self, function: &str, options: &RequestOptions) -> Result<(), Error> {
