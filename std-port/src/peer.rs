@@ -13,7 +13,7 @@ use cara_core::distribution::hello::Limits;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
-use cara_core::services::lease::{ActuatorState, OrderOutcome};
+use cara_core::services::lease::{ActuatorState, OrderOutcome, trace_id};
 use cara_core::services::requests::CallId;
 #[cfg(feature = "control")]
 use cara_core::services::requests::Made;
@@ -459,6 +459,13 @@ impl<T: Send + 'static> Peer<T> {
         let outcome =
             order.zip(self.actuator_state(function)).map(|((link, call), state)| state.outcome_of(link, call.0));
         outcome.unwrap_or(OrderOutcome::Unknown)
+    }
+
+    /// The trace id of this unit's newest call of a leased function, as [`LastOrder::trace`](crate::LastOrder::trace) has it in the
+    /// node's [state](Self::actuator_state): for the program's own record, by which it knows its orders again after a start.
+    /// `None` before the first. Calls of [operators](RequestOptions::operator) do not count.
+    pub fn trace_of(&self, function: &str) -> Option<u64> {
+        self.cell.last_order(function).map(|(link, call)| trace_id(link, call.0))
     }
 
     /// The state of what a function of the node moves: what inhibits it, and the order that it has or had last, as the node

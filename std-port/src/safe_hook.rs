@@ -278,8 +278,16 @@ mod tests {
     use crate::testing::until;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
-    const CLAIM: Claim =
-        Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0, made: Instant::START };
+    const CLAIM: Claim = Claim {
+        holder: 1,
+        replaces: None,
+        takes_over: true,
+        operator: false,
+        link: 0,
+        call: 0,
+        under: cara_core::distribution::claim::Claim::NONE,
+        made: Instant::START,
+    };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
         safe.begin(clock.now() + length, &CLAIM).expect("the order before has ended")

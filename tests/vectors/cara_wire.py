@@ -175,7 +175,8 @@ def read_fields(reader, fields):
         elif encoding == "order":
             how, holder, link, call = (reader.varint(32) for _ in range(4))
             end = None if how < 2 else LEASE_ENDS[how - 2] if how - 2 < len(LEASE_ENDS) else "expired"
-            value[name] = {"holder": holder, "link": link, "call": call, "end": end} if how else None
+            order = {"holder": holder, "link": link, "call": call, "claim": [reader.varint(64), reader.varint(64)], "end": end}
+            value[name] = order if how else None
         elif encoding == "tag":
             value[name] = reader.fixed("16s")[0].hex()
         elif encoding == "bytes":
@@ -200,9 +201,9 @@ def write_fields(value, fields):
             latch = value[name] or {"by": 0, "reason": -1}
             out += varint(latch["reason"] + 1) + varint(latch["by"])
         elif encoding == "order":
-            order = value[name] or {"holder": 0, "link": 0, "call": 0, "end": None}
+            order = value[name] or {"holder": 0, "link": 0, "call": 0, "claim": [0, 0], "end": None}
             how = LEASE_ENDS.index(order["end"]) + 2 if order["end"] else int(value[name] is not None)
-            out += b"".join(varint(number) for number in (how, order["holder"], order["link"], order["call"]))
+            out += b"".join(varint(number) for number in (how, order["holder"], order["link"], order["call"], *order["claim"]))
         elif encoding == "tag":
             out += bytes.fromhex(value[name])
         elif encoding == "bytes":

@@ -1,6 +1,7 @@
 //! Control messages: what two units tell each other beside requests and replies. One table has them all: it makes the enum
 //! and both directions of its encoding, an [item](super::items) each.
 
+use super::claim::Claim;
 use super::compact::{Reader, Writer};
 use super::hello::ClaimReport;
 use super::items::{Item, Malformed};
@@ -199,8 +200,28 @@ pub struct LastOrder {
     pub link: u32,
     /// Its caller's id of the call on that link; 0 for other units than its caller.
     pub call: u32,
+    /// The claim that its caller had; none for other units than its caller, and for a caller without one.
+    pub claim: Claim,
     /// How it ended; `None` while it has not.
     pub end: Option<LeaseEnd>,
+}
+
+impl LastOrder {
+    /// For any other unit than its caller.
+    pub(crate) const fn of_another(self) -> Self {
+        Self { link: 0, call: 0, claim: Claim::NONE, ..self }
+    }
+
+    /// Its trace id: [`trace_id`] of link and call, 0 for other units than its caller. A program that wrote down the trace ids
+    /// of its calls knows them again after a start or on another host.
+    pub const fn trace(&self) -> u64 {
+        trace_id(self.link, self.call)
+    }
+}
+
+/// The trace id of a call: the lower half of the nonce in its caller's hello, and its id on that link.
+pub const fn trace_id(link: u32, call: u32) -> u64 {
+    (link as u64) << 32 | call as u64
 }
 
 /// What a node tells of a call that moved something there, or was to: of one that was [interrupted](Error::Interrupted).
@@ -212,7 +233,7 @@ pub enum OrderOutcome {
     Ended(LeaseEnd),
     /// It has not begun, and does not any more, because its link has ended.
     NotBegun,
-    /// The node cannot tell: it was started since, or has done something for another caller, or by an earlier link.
+    /// The node cannot tell, and it may have run: it was started since, or has done something for another caller, or by an earlier link.
     Unknown,
 }
 
@@ -346,21 +367,22 @@ impl Field<'_> for Option<Latch> {
     }
 }
 
-/// 0 for none, 1 for one that has not ended, 2 and how it has; then holder, link and call.
+/// 0 for none, 1 for one that has not ended, 2 and how it has; then holder, link, call and claim.
 impl Field<'_> for Option<LastOrder> {
     fn put(self, writer: &mut Writer<'_>) {
-        let LastOrder { holder, link, call, end } =
-            self.unwrap_or(LastOrder { holder: 0, link: 0, call: 0, end: None });
+        let LastOrder { holder, link, call, claim, end } =
+            self.unwrap_or(LastOrder { holder: 0, link: 0, call: 0, claim: Claim::NONE, end: None });
         let how = end.map_or(u64::from(self.is_some()), |end| (end as u64).saturating_add(2));
-        for number in [how, holder.into(), link.into(), call.into()] {
+        for number in [how, holder.into(), link.into(), call.into(), claim.term, claim.claimant] {
             writer.number(number);
         }
     }
 
     fn take(reader: &mut Reader<'_>) -> Self {
         let [how, holder, link, call] = [(); 4].map(|()| reader.u32());
+        let claim = Claim { term: reader.u64(), claimant: reader.u64() };
         let end = how.checked_sub(2).map(LeaseEnd::of);
-        (how != 0).then_some(LastOrder { holder, link, call, end })
+        (how != 0).then_some(LastOrder { holder, link, call, claim, end })
     }
 }
 
@@ -404,14 +426,14 @@ mod tests {
 
     #[test]
     fn only_what_is_certain_of_an_order_is_told() {
-        let last = LastOrder { holder: 1, link: 9, call: 7, end: Some(LeaseEnd::Finished) };
+        let last = LastOrder { holder: 1, link: 9, call: 7, claim: Claim::NONE, end: Some(LeaseEnd::Finished) };
         let told = |last| ActuatorState { latch: None, last }.outcome_of(9, 7);
         assert_eq!(told(None), OrderOutcome::Unknown, "the node was started since");
         assert_eq!(told(Some(last)), OrderOutcome::Ended(LeaseEnd::Finished));
         assert_eq!(told(Some(LastOrder { end: None, ..last })), OrderOutcome::Runs);
         assert_eq!(told(Some(LastOrder { call: 6, ..last })), OrderOutcome::NotBegun);
         assert_eq!(told(Some(LastOrder { link: 8, ..last })), OrderOutcome::Unknown, "of another link");
-        let others = LastOrder { holder: 2, link: 0, call: 0, end: None };
+        let others = LastOrder { holder: 2, ..last.of_another() };
         assert_eq!(told(Some(others)), OrderOutcome::Unknown);
     }
 

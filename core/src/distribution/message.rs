@@ -3,7 +3,7 @@
 //! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
-pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome};
+pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome, trace_id};
 #[cfg(feature = "streams")]
 pub use super::control::{NO_SUBSCRIPTION, SubscriptionRefusal};
 

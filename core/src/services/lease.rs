@@ -10,10 +10,11 @@ use core::num::NonZeroU32;
 use core::sync::atomic::{AtomicBool, AtomicU8, AtomicU16, AtomicU32, Ordering};
 
 use crate::config::Priority;
+use crate::distribution::claim;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::latch::LatchWord;
 pub(crate) use crate::distribution::latch::odd_millis;
-pub use crate::distribution::message::{ActuatorState, LastOrder, Latch, LeaseEnd, OrderOutcome};
+pub use crate::distribution::message::{ActuatorState, LastOrder, Latch, LeaseEnd, OrderOutcome, trace_id};
 use crate::error::{Error, ServiceError};
 use crate::services::heart::Renew;
 use crate::services::requests::CallId;
@@ -44,6 +45,8 @@ pub struct Claim {
     pub link: u32,
     /// The caller's id of the call.
     pub call: u32,
+    /// What the caller commands with.
+    pub under: claim::Claim,
     /// When it was made: an order that is older than a stop does not begin, whatever was reset since.
     pub made: Instant,
 }
@@ -80,6 +83,8 @@ pub struct Lease {
     link: AtomicU32,
     /// That one's name for the call.
     call: AtomicU32,
+    /// That one's claim: term and claimant, the lower halves first.
+    claim: [AtomicU32; 4],
     /// How it ended, as the number of a [`LeaseEnd`].
     how: AtomicU8,
     /// While it is latched, no order begins.
@@ -124,6 +129,7 @@ impl Lease {
             holder: AtomicU32::new(0),
             link: AtomicU32::new(0),
             call: AtomicU32::new(0),
+            claim: [const { AtomicU32::new(0) }; 4],
             how: AtomicU8::new(0),
             latch: LatchWord::new(),
             ramp: AtomicU16::new(0),
@@ -237,6 +243,10 @@ impl Lease {
         self.operator.store(claim.operator, Ordering::Release);
         self.link.store(claim.link, Ordering::Release);
         self.call.store(claim.call, Ordering::Release);
+        let claim::Claim { term, claimant } = claim.under;
+        for (word, value) in self.claim.iter().zip([term, term >> 32, claimant, claimant >> 32]) {
+            word.store(value as u32, Ordering::Release);
+        }
         Ok(order)
     }
 
@@ -380,9 +390,16 @@ impl Lease {
             holder: self.holder.load(Ordering::Acquire),
             link: self.link.load(Ordering::Acquire),
             call: self.call.load(Ordering::Acquire),
+            claim: self.last_claim(),
             end,
         });
         ActuatorState { latch: self.latch(), last }
+    }
+
+    fn last_claim(&self) -> claim::Claim {
+        let word = |word: &AtomicU32| u64::from(word.load(Ordering::Acquire));
+        let [term, term_high, claimant, claimant_high] = self.claim.each_ref().map(word);
+        claim::Claim { term: term | term_high << 32, claimant: claimant | claimant_high << 32 }
     }
 
     /// Differs when the [state](Self::state) does; 0 for one that nothing has happened to.

@@ -130,6 +130,8 @@ pub(super) fn order<T: Send + 'static>(own: u32, peer: &Peer<T>, function: &str)
         function: function.to_owned(),
         order: order.to_owned(),
         holder,
+        trace: last.filter(|last| last.call != 0).map(|last| format!("{:016x}", last.trace())),
+        claim: last.filter(|last| last.call != 0).map(|last| (last.claim.term, last.claim.claimant)),
         left_ms: left.map(|left| left.as_millis()),
         inhibited: latch.map(|Latch { by, reason }| InhibitedInfo { by, reason }),
         age_ms: peer.link_info().map(|link| link.stream_ms),

@@ -626,6 +626,12 @@ pub struct OrderInfo {
     pub order: String,
     /// The ID number of its caller.
     pub holder: Option<u32>,
+    /// The trace id of its call in 16 hexadecimal digits, where its caller has the id number of the unit that is asked.
+    #[serde(default)]
+    pub trace: Option<String>,
+    /// Under which claim, likewise: term and claimant.
+    #[serde(default)]
+    pub claim: Option<(u64, u64)>,
     /// How long it goes on if no more renewal of the unit that is asked gets there, counted from the node's last answer: too long by
     /// as much as that was held up.
     pub left_ms: Option<u64>,

@@ -192,9 +192,8 @@ impl<T: Send + 'static> Engine<T> {
         let Some((Parked { link, call, arguments }, turn)) = self.services.state.take_ready() else { return };
         self.go_on_with_parked();
         let now = self.now();
-        // A command that waited for its turn may no longer be wanted, and its caller may be gone.
-        let is_cancelled = self.serving(&link, call.ticket).is_cancelled();
-        let is_over = now >= call.deadline || is_cancelled || !self.is_wanted(now, &call);
+        // A call that waited for its turn may be late, and its caller may be gone.
+        let is_over = now >= call.deadline || self.serving(&link, call.ticket).is_cancelled();
         let result = if is_over { Err(Error::Expired) } else { turn.map(drop) };
         let own = std::mem::replace(&mut worker.arguments, arguments);
         let state = match result {
@@ -209,13 +208,6 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(next) = next {
             self.serve(&link, next, worker);
         }
-    }
-
-    /// Whether the lease of a call that has waited here still lasts, if it has one.
-    fn is_wanted(&self, now: Instant, call: &Call) -> bool {
-        let functions = self.functions();
-        let actuator = functions.function(call.slot).and_then(|function| function.handler.actuator.as_ref());
-        actuator.zip(call.order).is_none_or(|(actuator, order)| actuator.word().is_live_for(order, now))
     }
 
     fn give_up(&self, turn: Option<Turn>) {
@@ -332,8 +324,11 @@ impl<T: Send + 'static> Engine<T> {
     }
 }
 
-/// Runs a handler, which may panic.
-fn guarded(told: &handler::Call, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
+/// Runs a handler, which may panic. Not for an order that ended while its call waited for a thread or for its turn.
+pub(super) fn guarded(told: &handler::Call, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
+    if told.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
+        return Err(Error::Expired);
+    }
     catch_unwind(AssertUnwindSafe(run)).map_or_else(
         |_| {
             tracing::error!(caller = %told.caller, "a handler panicked");

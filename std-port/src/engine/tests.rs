@@ -165,6 +165,34 @@ fn an_answer_that_cannot_be_kept_is_dropped_with_its_deadline() {
     pair.peer.block_request_with("fill", &mut text(LONG), &options(PATIENT)).unwrap();
 }
 
+/// The thread that is to run a call may come when the call's order has ended.
+#[test]
+fn no_handler_runs_for_an_order_that_has_ended() {
+    let (tell, told) = channel();
+    let tell = Mutex::new(tell);
+    let go = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        lock(&tell).send(call.clone()).unwrap();
+        Ok(())
+    };
+    let pair = Pair::new(Constraints::M_UNIT, |agv| {
+        let options = ServiceOptions::new().lease(Duration::from_secs(3_600), || {});
+        agv.my_function_list().add_service(&"go()".parse().unwrap(), options, go).unwrap();
+    });
+    pair.peer.block_request_with("go", &mut Parameters::new(), &options(PATIENT)).unwrap();
+    let told = told.recv().unwrap();
+    let runs = AtomicUsize::new(0);
+    let run = || {
+        serving::guarded(&told, || {
+            runs.fetch_add(1, Ordering::Relaxed);
+            Ok(())
+        })
+    };
+    assert_eq!(run(), Ok(()), "its order lasts");
+    pair.peer.release("go").unwrap();
+    until(|| !told.lease.as_ref().unwrap().is_live());
+    assert_eq!((run(), runs.into_inner()), (Err(Error::Expired), 1));
+}
+
 #[test]
 fn an_event_that_finds_no_room_is_counted_for_its_subscriber_and_the_unit() {
     let pair = Pair::new(Constraints::M_UNIT, |_| {});

@@ -5,7 +5,7 @@ use std::sync::mpsc::Receiver;
 
 use cara_std::control::Control;
 use cara_std::{
-    Actuator, Call, Claim, CommunicationSystem, Definition, Error, Parameters, ParametersView, ServiceError,
+    Actuator, Call, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, ServiceError,
     ServiceOptions, StartError, Unit, UnitEvent,
 };
 
@@ -163,4 +163,31 @@ fn a_manager_that_cannot_store_its_claim_does_not_start() {
     let manager = manager(fleet, &file.join("state"), false);
     let error = manager.start().unwrap_err();
     assert!(matches!(error, StartError::Claim(_)) && error.to_string().contains("CARA_STATE"), "{error}");
+}
+
+/// What a vehicle tells a manager that joins of the order before: under which claim, by which call, and how it ended.
+#[test]
+fn a_vehicle_that_joins_tells_claim_and_trace_id_of_its_last_order() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let [here, board] = ["here", "board"].map(|name| folder.path().join(name));
+    let first = manager(fleet, &here, false);
+    first.start().unwrap();
+    let agv = vehicle(fleet, &board);
+    move_it(&first);
+    let kept = first.peer("agv").unwrap().trace_of("go").unwrap();
+    let claim = first.claim();
+    first.stop();
+
+    let second = manager(fleet, &here, false);
+    second.start().unwrap();
+    assert!(second.claim() > claim);
+    let told = || second.peer("agv").ok()?.actuator_state("go")?.last;
+    until("it tells", || told().is_some_and(|last| last.end.is_some()));
+    let last = told().unwrap();
+    assert_eq!((last.claim, last.trace(), last.end), (claim, kept, Some(LeaseEnd::Expired)));
+    move_it(&second);
+    until("it tells of the next", || told().is_some_and(|last| last.claim == second.claim()));
+    assert_eq!(told().map(|last| last.trace()), second.peer("agv").unwrap().trace_of("go"));
+    assert_ne!(told().unwrap().trace(), kept);
+    drop(agv);
 }

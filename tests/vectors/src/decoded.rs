@@ -190,8 +190,9 @@ fn control(control: &Control<'_>) -> Value {
         }
         Control::Actuator { slot, latch, last } => {
             let latch = latch.map(|Latch { by, reason }| json!({ "by": by, "reason": reason }));
-            let last = last.map(|LastOrder { holder, link, call, end }| {
-                json!({ "holder": holder, "link": link, "call": call, "end": end.map(LeaseEnd::word) })
+            let last = last.map(|LastOrder { holder, link, call, claim, end }| {
+                let claim = [claim.term, claim.claimant];
+                json!({ "holder": holder, "link": link, "call": call, "claim": claim, "end": end.map(LeaseEnd::word) })
             });
             json!({ "actuator": { "slot": slot, "latch": latch, "last": last } })
         }

@@ -1,6 +1,7 @@
 //! Vectors of messages and session bodies.
 
 use cara_core::config::Priority;
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::message::{
@@ -17,6 +18,8 @@ use crate::introductions::item;
 use crate::introductions::{report, reported};
 use crate::values::{GO_TO, arguments, motion};
 use crate::vector::{Context, Kind, Vector, definition};
+
+const CLAIM: Claim = Claim { term: 5, claimant: 0x0123_4567_89AB_CDEF };
 
 /// Every vector of this file.
 pub(crate) fn all() -> Vec<Vector> {
@@ -320,11 +323,11 @@ fn controls() -> Vec<Vector> {
             Control::Actuator {
                 slot: 3,
                 latch: None,
-                last: Some(LastOrder { holder: 1, link: 0xC0FF_EE00, call: 700, end: None }),
+                last: Some(LastOrder { holder: 1, link: 0xC0FF_EE00, call: 700, claim: CLAIM, end: None }),
             },
             json!({ "actuator": {
                 "slot": 3, "latch": null,
-                "last": { "holder": 1, "link": 0xC0FF_EE00_u32, "call": 700, "end": null },
+                "last": { "holder": 1, "link": 0xC0FF_EE00_u32, "call": 700, "claim": [5, 0x0123_4567_89AB_CDEF_u64], "end": null },
             } }),
         ),
         (
@@ -333,11 +336,11 @@ fn controls() -> Vec<Vector> {
             Control::Actuator {
                 slot: 300,
                 latch: Some(Latch { by: 70_000, reason: 12 }),
-                last: Some(LastOrder { holder: 2, link: 0, call: 0, end: Some(LeaseEnd::Stopped) }),
+                last: Some(LastOrder { holder: 2, link: 0, call: 0, claim: Claim::NONE, end: Some(LeaseEnd::Stopped) }),
             },
             json!({ "actuator": {
                 "slot": 300, "latch": { "by": 70_000, "reason": 12 },
-                "last": { "holder": 2, "link": 0, "call": 0, "end": "stopped" },
+                "last": { "holder": 2, "link": 0, "call": 0, "claim": [0, 0], "end": "stopped" },
             } }),
         ),
         (
@@ -346,11 +349,17 @@ fn controls() -> Vec<Vector> {
             Control::Actuator {
                 slot: 3,
                 latch: None,
-                last: Some(LastOrder { holder: 1, link: 0xC0FF_EE00, call: 700, end: Some(LeaseEnd::Released) }),
+                last: Some(LastOrder {
+                    holder: 1,
+                    link: 0xC0FF_EE00,
+                    call: 700,
+                    claim: CLAIM,
+                    end: Some(LeaseEnd::Released),
+                }),
             },
             json!({ "actuator": {
                 "slot": 3, "latch": null,
-                "last": { "holder": 1, "link": 0xC0FF_EE00_u32, "call": 700, "end": "released" },
+                "last": { "holder": 1, "link": 0xC0FF_EE00_u32, "call": 700, "claim": [5, 0x0123_4567_89AB_CDEF_u64], "end": "released" },
             } }),
         ),
     ];

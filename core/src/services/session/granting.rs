@@ -30,9 +30,10 @@ impl<P: Port> Session<P> {
         if end <= cx.now {
             return Err(Error::Expired);
         }
-        if self.obedience.gives_way() || !self.may_move(cx) {
+        if self.obedience.gives_way() {
             return Err(Error::Busy);
         }
+        let under = self.may_move(cx).ok_or(Error::Busy)?;
         let service = service_of(cx, head.slot, head.generation);
         let is_same = |known: &Granted| {
             known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))
@@ -62,6 +63,7 @@ impl<P: Port> Session<P> {
             operator: head.operator,
             link: self.hello().map_or(0, |hello| hello.nonce as u32),
             call: head.id,
+            under,
             made: head.sent_at,
         };
         // The service's word is changed before the table here: where it refuses, nothing of this session has changed.

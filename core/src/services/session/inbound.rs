@@ -487,7 +487,7 @@ impl<P: Port> Session<P> {
             // The handler of a function that stops waits where a safe hook is to run first: `poll` comes before `next_call`.
             // A moving call waits until the claim that it is made under is stored.
             let waits = function.attributes.stop && self.awaits_hook(cx, header.slot, header.generation)
-                || function.attributes.lease.is_some() && !self.may_move(cx);
+                || function.attributes.lease.is_some() && self.may_move(cx).is_none();
             let arguments = arguments.filter(|_| !waits);
             let bytes = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {

@@ -3,6 +3,7 @@
 
 use super::{Phase, Session};
 use crate::config::CHALLENGE_TIMEOUT;
+use crate::distribution::claim::Claim;
 use crate::distribution::hello::ClaimReport;
 use crate::distribution::message::Control;
 use crate::error::CloseReason;
@@ -16,8 +17,8 @@ const LOOK: Duration = Duration::from_millis(20);
 /// The peer's claim, as far as its calls have to do with it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Obedience {
-    /// The hub lets moving calls begin: it need not be asked again.
-    may_move: bool,
+    /// The hub lets moving calls begin under this claim: it need not be asked again.
+    may_move: Option<Claim>,
     /// A moving call waits until the hub lets it begin.
     pub(super) waits: bool,
     /// A manager with a higher claim wants to command: until when the peer has to answer, and its orders go on.
@@ -29,7 +30,7 @@ pub(super) struct Obedience {
 
 impl Obedience {
     pub(super) const fn new() -> Self {
-        Self { may_move: false, waits: false, gives_way: None, next: Instant::FAR_FUTURE, has_news: false }
+        Self { may_move: None, waits: false, gives_way: None, next: Instant::FAR_FUTURE, has_news: false }
     }
 
     pub(super) const fn gives_way(&self) -> bool {
@@ -58,18 +59,18 @@ impl<P: Port> Session<P> {
         let Some(peer) = self.remote.as_ref().map(|remote| &remote.hello.identity) else { return };
         let now = cx.now;
         cx.hub.enter(&mut |hub| hub.node.claim_raised(now, peer, report));
-        self.obedience.may_move = false;
+        self.obedience.may_move = None;
     }
 
-    /// Whether a moving call of the peer may begin. Otherwise it waits, and the port is asked to store the peer's claim.
-    pub(super) fn may_move(&mut self, cx: &mut Context<'_, P>) -> bool {
-        if !self.obedience.may_move
+    /// The claim under which a moving call of the peer may begin. Without one it waits, and the port is asked to store the peer's.
+    pub(super) fn may_move(&mut self, cx: &mut Context<'_, P>) -> Option<Claim> {
+        if self.obedience.may_move.is_none()
             && let Some(remote) = &self.remote
         {
-            let (now, mut may) = (cx.now, true);
-            cx.hub.enter(&mut |hub| may = hub.node.may_move(now, &remote.hello.identity));
-            (self.obedience.may_move, self.obedience.waits) = (may, !may);
-            if !may {
+            let (now, peer, mut may) = (cx.now, &remote.hello.identity, None);
+            cx.hub.enter(&mut |hub| may = hub.node.may_move(now, peer).then(|| hub.node.obeyed(peer)));
+            (self.obedience.may_move, self.obedience.waits) = (may, may.is_none());
+            if may.is_none() {
                 self.obedience.next = now + LOOK;
             }
         }

@@ -10,7 +10,7 @@ use crate::distribution::identity::Identity;
 use crate::distribution::message::{CONTROL_BYTES, Control, LONGEST_HEADER_BYTES, PUBLISH_BYTES};
 use crate::host::secure::Secure;
 use crate::services::access::Bucket;
-use crate::services::lease::{ActuatorState, LastOrder};
+use crate::services::lease::ActuatorState;
 use crate::services::{Context, Port};
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
@@ -304,8 +304,8 @@ impl<P: Port> Session<P> {
             let told = self.publishing.table.get(usize::from(slot.0)).and_then(|publication| publication.told);
             let Some(function) = moves(slot).filter(|function| told == Some(function.generation)) else { continue };
             let ActuatorState { latch, last } = function.handler.state();
-            // A link's nonce is its own caller's alone.
-            let last = last.map(|last| if last.holder == peer { last } else { LastOrder { link: 0, call: 0, ..last } });
+            // A link's nonce and a claim are their own caller's alone.
+            let last = last.map(|last| if last.holder == peer { last } else { last.of_another() });
             if !self.send_control(cx, &Control::Actuator { slot: slot.0, latch, last }) {
                 return false;
             }

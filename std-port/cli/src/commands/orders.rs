@@ -41,7 +41,7 @@ pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Res
 
 fn table(orders: &[OrderInfo]) -> Rows {
     let mut rows = Rows::new(["NODE", "FUNCTION", "ORDER", "OF UNIT", "ENDS WITHIN", "INHIBITED"]);
-    for OrderInfo { node, id, function, order, holder, left_ms, inhibited, age_ms } in orders {
+    for OrderInfo { node, id, function, order, holder, left_ms, inhibited, age_ms, .. } in orders {
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
         let cells = [
             format!("{node}/{id}"),

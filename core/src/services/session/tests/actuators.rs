@@ -6,6 +6,7 @@ use super::super::{Event, RequestOptions};
 use super::none;
 use super::pair::Pair;
 use crate::config::{LEASES, Priority};
+use crate::distribution::claim;
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::Slot;
 use crate::error::{Error, Limit, ServiceError};
@@ -107,8 +108,16 @@ fn functions_that_move_the_same_thing_are_published_with_the_same_number() {
 fn what_another_caller_moves_is_held_unless_it_is_taken_over() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other =
-        Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 0, call: 0, made: pair.agv.now };
+    let other = Claim {
+        holder: 77,
+        replaces: None,
+        takes_over: false,
+        operator: false,
+        link: 0,
+        call: 0,
+        under: claim::Claim::NONE,
+        made: pair.agv.now,
+    };
     let order = word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     let refused = call(&mut pair, "dock");
     assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 77, operator: false }));
@@ -376,7 +385,16 @@ fn what_was_stopped_is_made_safe_and_not_finished() {
 #[test]
 fn nothing_comes_alive_under_a_latch() {
     let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
-    let claim = Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0, made: now };
+    let claim = Claim {
+        holder: 1,
+        replaces: None,
+        takes_over: true,
+        operator: false,
+        link: 0,
+        call: 0,
+        under: claim::Claim::NONE,
+        made: now,
+    };
     let order = lease.claim(now, now + LEASE, &claim).unwrap();
     lease.inhibit(now, Latch { by: 0, reason: 1 });
     assert!(!lease.is_live(now) && !lease.lasts_beyond(now) && !lease.renew(order, now + LEASE));
@@ -414,7 +432,7 @@ fn the_caller_is_told_the_state_of_what_it_moves() {
     let moves = call(&mut pair, "go");
     pair.run(Duration::from_secs(1));
     let link = pair.manager.session.nonce as u32;
-    let last = LastOrder { holder: 1, link, call: moves.0, end: None };
+    let last = LastOrder { holder: 1, link, call: moves.0, claim: claim::Claim::NONE, end: None };
     assert_eq!([go, dock].map(|slot| state(&pair, slot)), [Some(ActuatorState { latch: None, last: Some(last) }); 2]);
     assert_eq!(state(&pair, lift), Some(ActuatorState::default()));
     let events = pair.manager.happened.len();
@@ -477,12 +495,20 @@ fn the_vehicles_own_latch_is_told_within_a_keep_alive() {
 fn who_moves_it_is_told_to_others_but_not_by_which_link() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other =
-        Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 5, call: 6, made: pair.agv.now };
+    let other = Claim {
+        holder: 77,
+        replaces: None,
+        takes_over: false,
+        operator: false,
+        link: 5,
+        call: 6,
+        under: claim::Claim::NONE,
+        made: pair.agv.now,
+    };
     word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     pair.run(crate::config::Constraints::S_UNIT.keep_alive);
     let last = state(&pair, go).unwrap().last.unwrap();
-    assert_eq!(last, LastOrder { holder: 77, link: 0, call: 0, end: None });
+    assert_eq!(last, LastOrder { holder: 77, link: 0, call: 0, claim: claim::Claim::NONE, end: None });
 }
 
 #[test]

@@ -5,6 +5,7 @@ use super::super::{Delivery, RequestOptions};
 use super::none;
 use super::pair::Pair;
 use crate::config::Priority;
+use crate::distribution::claim;
 use crate::distribution::function_list::Slot;
 use crate::error::Error;
 use crate::services::lease::{Claim, Service as _};
@@ -69,7 +70,16 @@ fn a_call_in_a_stream_that_was_held_up_does_not_replace_a_later_datagram_however
             assert!(pair.agv.end_order(go, order));
             let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
             let (now, made) = (pair.agv.now, pair.agv.now);
-            let other = Claim { holder: 7, replaces: None, takes_over: false, operator: false, link: 1, call: 1, made };
+            let other = Claim {
+                holder: 7,
+                replaces: None,
+                takes_over: false,
+                operator: false,
+                link: 1,
+                call: 1,
+                under: claim::Claim::NONE,
+                made,
+            };
             let order = word.claim(now, now + LEASE, &other).unwrap();
             assert!(word.finish(now, order));
         }
@@ -111,7 +121,16 @@ fn a_later_call_that_is_refused_does_not_keep_an_earlier_one_out() {
     let first = pair.manager.request_with("go", &none(), &RequestOptions::new(), true).unwrap();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
     let (now, made) = (pair.agv.now, pair.agv.now);
-    let other = Claim { holder: 7, replaces: None, takes_over: false, operator: false, link: 1, call: 1, made };
+    let other = Claim {
+        holder: 7,
+        replaces: None,
+        takes_over: false,
+        operator: false,
+        link: 1,
+        call: 1,
+        under: claim::Claim::NONE,
+        made,
+    };
     let order = word.claim(now, now + LEASE, &other).unwrap();
     let best_effort = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::new() };
     pair.manager.request_with("go", &none(), &best_effort, false).unwrap();

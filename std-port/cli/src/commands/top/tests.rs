@@ -67,6 +67,8 @@ fn order(node: &str, id: u32, left_ms: Option<u64>, stopped_by: Option<u32>) -> 
         function: "go_to".into(),
         order: if left_ms.is_some() { "runs" } else { "stopped" }.into(),
         holder: Some(1),
+        trace: None,
+        claim: None,
         left_ms,
         inhibited: stopped_by.map(|by| InhibitedInfo { by, reason: 0 }),
         age_ms: None,
