@@ -2,9 +2,13 @@
 //! announced or a moving call begins under it.
 
 use std::env;
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use cara_core::distribution::identity::{Fleet, Identity};
+use rustix::fs::{FlockOperation, flock};
 
 use crate::file_name::escape;
 use crate::keys::{self, KeptClaims, KeyError};
@@ -23,7 +27,7 @@ pub(crate) fn folder() -> Option<PathBuf> {
 /// The file of a unit's claims.
 #[derive(Debug)]
 pub(crate) struct ClaimFile {
-    path: PathBuf,
+    pub(crate) path: PathBuf,
 }
 
 impl ClaimFile {
@@ -31,11 +35,6 @@ impl ClaimFile {
         let role = identity.role().as_str();
         let name = format!("{}-{}-{role}-{}.claims", escape(identity.name()), identity.id(), fleet.0);
         Self { path: folder.join(name) }
-    }
-
-    #[cfg(test)]
-    pub(crate) fn path(&self) -> &Path {
-        &self.path
     }
 
     /// What is kept. A file that is missing, or damaged, keeps nothing: that locks no unit out, and is reported in the log.
@@ -49,6 +48,20 @@ impl ClaimFile {
             tracing::warn!(path = %self.path.display(), "the kept claims cannot be read, and count as none: {why}");
             KeptClaims::default()
         })
+    }
+
+    /// As long as this is there the unit runs, and [`forget_claims`](crate::control::forget_claims) leaves the file alone.
+    pub(crate) fn hold(&self) -> io::Result<File> {
+        let folder = self.path.parent().unwrap_or(Path::new("."));
+        keys::make_folder(folder).map_err(io::Error::other)?;
+        self.lock(FlockOperation::NonBlockingLockShared)
+    }
+
+    pub(crate) fn lock(&self, how: FlockOperation) -> io::Result<File> {
+        let path = self.path.with_added_extension("lock");
+        let file = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(path)?;
+        flock(&file, how)?;
+        Ok(file)
     }
 
     /// Keeps claims: on the disk, with the file's name, when this returns.
@@ -79,13 +92,13 @@ mod tests {
             file.keep(&kept).unwrap();
             assert_eq!(file.read(), kept);
         }
-        let right = std::fs::read(file.path()).unwrap();
+        let right = std::fs::read(&file.path).unwrap();
         for at in 0..right.len() {
             let mut wrong = right.clone();
             wrong[at] ^= 1;
-            std::fs::write(file.path(), wrong).unwrap();
+            std::fs::write(&file.path, wrong).unwrap();
             assert_eq!(file.read(), KeptClaims::default(), "{at}");
-            std::fs::write(file.path(), &right[..at]).unwrap();
+            std::fs::write(&file.path, &right[..at]).unwrap();
             assert_eq!(file.read(), KeptClaims::default(), "{at}");
         }
     }

@@ -12,6 +12,8 @@
 //!   are parsed, and, if the call has to wait, again just before it begins. Permission to call includes permission to
 //!   see.
 //! - **[`Verb::List`]**: the peer sees this unit's function in the list that is published to it.
+//! - **[`Verb::TakeOver`]**: the peer's calls of this unit's function may take over what another caller moves. Without it a call that
+//!   is to take over is refused, also where nothing is held.
 //! - **[`Verb::Publish`]**: this unit sees the peer's function of that name, so that it can be called from here.
 //! - **A rate** limits the calls of each peer to each function over all priorities: otherwise a peer could evade it by
 //!   choosing another priority. A function that must always be reachable, such as a stop, belongs in a rule without a
@@ -34,6 +36,8 @@ pub enum Verb {
     Call = 2,
     /// Offer it to this unit.
     Publish = 4,
+    /// With a call that it may make: take over what another caller moves.
+    TakeOver = 8,
 }
 
 /// A set of verbs.
@@ -49,8 +53,10 @@ impl Verbs {
     pub const CALL: Self = Self(Verb::Call as u8);
     /// Offer functions.
     pub const PUBLISH: Self = Self(Verb::Publish as u8);
+    /// Take over what another caller moves, with a call.
+    pub const TAKE_OVER: Self = Self(Verb::TakeOver as u8);
     /// All of them.
-    pub const ALL: Self = Self::LIST.and(Self::CALL).and(Self::PUBLISH);
+    pub const ALL: Self = Self::LIST.and(Self::CALL).and(Self::PUBLISH).and(Self::TAKE_OVER);
 
     /// The verbs of both sets.
     pub const fn and(self, other: Self) -> Self {
@@ -395,13 +401,13 @@ mod tests {
         fn a_table_allows_what_one_of_its_rules_allows_alone(
             rules in rows(),
             (name, id, m_unit) in (prop::sample::select(&["a", "b", "c"][..]), 0..3_u32, any::<bool>()),
-            (function, verb) in (prop::sample::select(&["a", "b", "c"][..]), 0..3_u32),
+            (function, verb) in (prop::sample::select(&["a", "b", "c"][..]), 0..4_u32),
             operator in prop::bool::weighted(0.2),
         ) {
             let role = if m_unit { Role::MUnit } else { Role::SUnit };
             let identity = Identity::new(name, id, role).unwrap();
             let who = if operator { Principal::Operator } else { Principal::Node(&identity) };
-            let verb = [Verb::List, Verb::Call, Verb::Publish][verb as usize];
+            let verb = [Verb::List, Verb::Call, Verb::Publish, Verb::TakeOver][verb as usize];
             // Written out once more, without the code under test.
             let allows = |rule: &Rule<&str, Vec<&str>>| {
                 let named = match &rule.functions { Functions::All => true, Functions::Named(names) => names.contains(&function) };

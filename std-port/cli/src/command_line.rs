@@ -28,6 +28,7 @@ pub(crate) enum Verb {
     Stop(commands::stop::Stop),
     Reset(commands::stop::Reset),
     Retire(commands::retire::Arguments),
+    ForgetClaim(commands::forget_claim::Arguments),
     Set(commands::set::Arguments),
     Watch(commands::watch::Arguments),
     Top(commands::top::Arguments),

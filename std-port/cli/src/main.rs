@@ -32,6 +32,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Publish(arguments) => commands::publish::run(arguments, global),
         Verb::Stop(arguments) => commands::stop::stop(arguments, global),
         Verb::Reset(arguments) => commands::stop::reset(arguments, global),
+        Verb::ForgetClaim(arguments) => commands::forget_claim::run(arguments, global),
         Verb::Retire(arguments) => commands::retire::run(arguments, global),
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),

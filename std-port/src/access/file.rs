@@ -210,7 +210,7 @@ impl Checker<'_> {
 
     /// `None` where there are none to be judged.
     fn verbs(&mut self, words: &Given<'_>, row: &Range<usize>) -> Option<Verbs> {
-        const HELP: &str = "write \"list\", \"call\" or \"publish\", or several of them in an array";
+        const HELP: &str = "write \"list\", \"call\", \"take_over\" or \"publish\", or several of them in an array";
         let words = self.given(words, row, "verbs", HELP)?;
         let mut verbs = Verbs::NONE;
         for word in words.get_ref() {

@@ -14,7 +14,8 @@ const OPERATOR: &str = "operator";
 const M_UNITS: &str = "m_units";
 const S_UNITS: &str = "s_units";
 const ROLES: [(&str, Role); 2] = [("@m_unit", Role::MUnit), ("@s_unit", Role::SUnit)];
-const VERBS: [(&str, Verb); 3] = [("list", Verb::List), ("call", Verb::Call), ("publish", Verb::Publish)];
+const VERBS: [(&str, Verb); 4] =
+    [("list", Verb::List), ("call", Verb::Call), ("take_over", Verb::TakeOver), ("publish", Verb::Publish)];
 const SPANS: [(&str, u64); 3] = [("s", 1), ("min", 60), ("h", 3600)];
 
 /// The text names no principal.

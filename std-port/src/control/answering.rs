@@ -10,7 +10,7 @@ use cara_core::error::Error;
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
-use super::protocol::{Answer, Failure, Question};
+use super::protocol::{Answer, CallQuestion, Failure, Question};
 use super::stop::{self, Which};
 use super::{call, constraint, describe, everybody, hold, select, stream};
 use crate::{CommunicationSystem, Finding, Identity, Peer};
@@ -106,7 +106,7 @@ fn attempt<T: Send + 'static>(
         Question::Functions { node } => functions(system, node, sink),
         Question::Orders { node } => orders(system, node.as_deref(), sink),
         Question::Call(question) => {
-            permit(system, &question.function, Verb::Call)?;
+            permit_call(system, question)?;
             match question.node {
                 Some(_) => call::call(system, question, sink, wanted),
                 None => {
@@ -115,7 +115,7 @@ fn attempt<T: Send + 'static>(
             }
         }
         Question::Hold(question) => {
-            permit(system, &question.function, Verb::Call)?;
+            permit_call(system, question)?;
             hold::hold(system, question, sink, lives)
         }
         Question::Stop { node } => stop::call(system, Which::Stop, node.as_deref(), sink, wanted),
@@ -177,6 +177,11 @@ pub(super) fn permit<T: Send + 'static>(
         Error::NotAllowed => Failure::not_allowed(function, verb),
         error => error.into(),
     })
+}
+
+fn permit_call<T: Send + 'static>(system: &CommunicationSystem<T>, question: &CallQuestion) -> Result<(), Failure> {
+    permit(system, &question.function, Verb::Call)?;
+    if question.take_over { permit(system, &question.function, Verb::TakeOver) } else { Ok(()) }
 }
 
 fn nodes<T: Send + 'static>(

@@ -111,14 +111,25 @@ impl Audit {
     }
 
     fn tell(&self, origin: &str, who: &Who, line: &Line<'_>) {
-        let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let Who { uid, pid, program } = who;
-        let Line { ask, function, take_over, node, outcome } = line;
-        self.write(&json!({
-            "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "ask": ask,
-            "function": function, "take_over": take_over, "node": node, "outcome": outcome,
-        }));
+        self.write(&entry(origin, who, line));
     }
+}
+
+fn entry(origin: &str, who: &Who, line: &Line<'_>) -> Value {
+    let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let Who { uid, pid, program } = who;
+    let Line { ask, function, take_over, node, outcome } = line;
+    json!({
+        "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "ask": ask,
+        "function": function, "take_over": take_over, "node": node, "outcome": outcome,
+    })
+}
+
+/// Writes down at once what this process does without a unit.
+pub(super) fn note(path: &Path, ask: &str, node: &str, outcome: &str) -> io::Result<()> {
+    let line = Line { ask, function: None, take_over: false, node: Some(node), outcome };
+    let entry = entry("operator", &Who::own(), &line);
+    LogFile::open(path, LONGEST)?.write(format!("{entry}\n").as_bytes())
 }
 
 /// What a line tells beside who and when.

@@ -43,6 +43,7 @@ impl Failure {
             Verb::List => "list",
             Verb::Call => "call",
             Verb::Publish => "publish",
+            Verb::TakeOver => "take over",
         };
         let text = format!(
             "the unit's access table does not let the operator {verb} '{function}': \

@@ -18,6 +18,7 @@ mod describe;
 mod elsewhere;
 mod everybody;
 mod failure;
+mod forgetting;
 mod hold;
 pub mod json;
 mod lines;
@@ -38,6 +39,7 @@ pub use client::{
     Answers, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called, running_in,
 };
 pub use elsewhere::{Elsewhere, elsewhere};
+pub use forgetting::{ForgetError, Forgotten, forget_claims};
 pub use place::{directories, directory};
 pub(crate) use server::Server;
 

@@ -1,6 +1,7 @@
 //! Claims on Linux: what a unit claims or obeys is stored, on a thread of its own while the unit runs, and what the node decides
 //! about them is done.
 
+use std::fs::File;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::{Instant, SystemTime};
@@ -44,6 +45,8 @@ pub(super) struct Claims {
     /// A manager starts beside a live one, and fences it.
     pub(super) take_over: TakeOver,
     writer: Mutex<Writer>,
+    /// Says that the unit runs.
+    held: Mutex<Option<File>>,
 }
 
 /// The thread that writes the file.
@@ -66,7 +69,7 @@ enum Job {
 
 impl Claims {
     pub(super) fn new(folder: Option<PathBuf>, take_over: TakeOver) -> Self {
-        Self { folder, take_over, writer: Mutex::default() }
+        Self { folder, take_over, writer: Mutex::default(), held: Mutex::default() }
     }
 }
 
@@ -147,6 +150,10 @@ impl<T: Send + 'static> Engine<T> {
             if file.is_some() {
                 cell.hub.node.store_claims();
             }
+        }
+        if let Some(file) = &file {
+            // Where nothing can be written, nothing can be forgotten.
+            *lock(&self.claims.held) = file.hold().ok();
         }
         lock(&self.claims.writer).kept = kept;
         Ok(())

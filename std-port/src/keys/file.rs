@@ -117,7 +117,7 @@ fn foreign(path: &Path, owner: u32) -> KeyError {
 }
 
 /// Makes a folder that only this user enters, unless there is one.
-pub(super) fn make_folder(path: &Path) -> Result<(), KeyError> {
+pub(crate) fn make_folder(path: &Path) -> Result<(), KeyError> {
     let made = DirBuilder::new().recursive(true).mode(0o700).create(path);
     made.map_err(|error| KeyError::NoFolder { path: path.to_owned(), error })
 }

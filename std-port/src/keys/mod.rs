@@ -38,6 +38,7 @@ pub(crate) use claims::{KeptClaims, KeptObeyed, read_claims, write_claims};
 pub use error::{FleetError, KeyError, Owner};
 #[cfg(feature = "access")]
 pub(crate) use file::Mark;
+pub(crate) use file::make_folder;
 pub use file::{check_replaceable, write_private};
 pub use fleet::FleetKeys;
 pub use live::LiveRing;

@@ -67,6 +67,20 @@ fn the_operator_does_what_its_rule_allows_as_often_as_it_does() {
 }
 
 #[test]
+fn the_operator_takes_over_only_where_a_rule_says_so() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut client = depot.client();
+    let take = || cara_std::control::protocol::CallQuestion { take_over: true, ..call(Some("agv"), "fail", vec![]) };
+    depot.system.set_access(Some(rules(&["fail"], Verbs::CALL).into()));
+    for question in [Question::Call(take()), Question::Hold(take())] {
+        let failure = ask(&mut client, question).unwrap_err();
+        assert!(failure.error == "NotAllowed" && failure.text.contains("take over 'fail'"), "{failure}");
+    }
+    depot.system.set_access(Some(rules(&["fail"], Verbs::CALL.and(Verbs::TAKE_OVER)).into()));
+    assert_eq!(error(&ask(&mut client, Question::Call(take())).unwrap()), Some("Service"));
+}
+
+#[test]
 fn no_rate_holds_off_a_stop_of_the_operator() {
     let (depot, agv) = Depot::with_agv();
     let nothing =

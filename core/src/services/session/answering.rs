@@ -57,7 +57,8 @@ impl<P: Port> Session<P> {
             }
             let function = functions.lookup(head.slot, head.generation)?;
             // The table may have changed while the call waited.
-            if !decide(access, remote, function.name(), Verb::Call).is_allowed() {
+            let may = |verb| decide(access, remote, function.name(), verb).is_allowed();
+            if !may(Verb::Call) || head.takes_over && !may(Verb::TakeOver) {
                 return Err(Error::NotAllowed);
             }
             read_arguments(function.signature, block, arguments).map(|()| function.attributes)

@@ -17,6 +17,7 @@ use crate::host::connections::{Incoming, LinkCounter, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
+use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Cancelled, Seen};
 use crate::services::lease::ActuatorState;
 use crate::services::lease::Service;
@@ -563,6 +564,9 @@ impl<P: Port> Session<P> {
         }
         if cx.access.is_some() {
             self.permit_call(cx, &function, priority)?;
+            if header.takes_over && !self.may(cx, header.slot, Verb::TakeOver) {
+                return Err(Error::NotAllowed);
+            }
         }
         if priority != Priority::Emergency && !function.attributes.stop {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;

@@ -50,7 +50,7 @@ impl<P: Port> Session<P> {
         cx.access.is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
     }
 
-    fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
+    pub(super) fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
         let function = cx.functions.function(slot);
         function.is_none_or(|function| decide(cx.access, self.remote.as_ref(), function.name(), verb).is_allowed())
     }

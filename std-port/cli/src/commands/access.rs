@@ -32,7 +32,7 @@ enum What {
 /// The exit code is 0 if the table is correct, and what is asked for allowed; 1 if it is not allowed; 2 for mistakes in the
 /// file, each with its line and column.
 #[derive(clap::Args)]
-#[command(group = clap::ArgGroup::new("question").args(["call", "list", "publish"]))]
+#[command(group = clap::ArgGroup::new("question").args(["call", "take_over", "list", "publish"]))]
 struct Check {
     /// The table, in TOML.
     file: PathBuf,
@@ -42,6 +42,9 @@ struct Check {
     /// May it call this function?
     #[arg(long, value_name = "FUNCTION", requires = "who")]
     call: Option<String>,
+    /// May it take over what another caller moves with this function?
+    #[arg(long, value_name = "FUNCTION", requires = "who")]
+    take_over: Option<String>,
     /// May it see this function?
     #[arg(long, value_name = "FUNCTION", requires = "who")]
     list: Option<String>,
@@ -61,7 +64,12 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
 
 impl Check {
     fn question(&self) -> Option<(&str, Verb)> {
-        let asked = [(&self.call, Verb::Call), (&self.list, Verb::List), (&self.publish, Verb::Publish)];
+        let asked = [
+            (&self.call, Verb::Call),
+            (&self.take_over, Verb::TakeOver),
+            (&self.list, Verb::List),
+            (&self.publish, Verb::Publish),
+        ];
         asked.into_iter().find_map(|(function, verb)| Some((function.as_deref()?, verb)))
     }
 }
@@ -126,6 +134,7 @@ fn tell(
         Verb::Call => "call",
         Verb::List => "see",
         Verb::Publish => "publish",
+        Verb::TakeOver => "take over what another caller moves with",
     };
     let (rule, exit) = match decision {
         Decision::Denied => (None, Exit::Failed),

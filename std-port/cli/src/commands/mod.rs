@@ -5,6 +5,7 @@ pub(crate) mod bench;
 pub(crate) mod call;
 pub(crate) mod completions;
 pub(crate) mod counters;
+pub(crate) mod forget_claim;
 pub(crate) mod functions;
 pub(crate) mod man;
 pub(crate) mod orders;

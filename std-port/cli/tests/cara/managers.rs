@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use cara_std::{Call, Claim, ParametersView, ServiceError, ServiceOptions};
 use serde_json::Value;
 
 use crate::support::{PATIENCE, Ran, Running, Stage, agv, private_folder, until};
@@ -228,4 +229,39 @@ fn two_managers_with_equal_terms_do_not_split_the_fleet() {
         assert_eq!(has(&here), 0);
         drop(second);
     }
+}
+
+#[test]
+fn what_a_vehicle_has_obeyed_is_forgotten_while_it_does_not_run() {
+    let mut stage = Stage::empty();
+    stage.know("agv-1", 11);
+    stage.start_manager();
+    let state = private_folder();
+    let start = |stage: &Stage| {
+        let agv = stage.vehicle("agv-1", 11).state_folder(state.path()).build().unwrap();
+        let options = ServiceOptions::new().lease(Duration::from_secs(5), || {});
+        let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        agv.my_function_list().add_service(&"drive()".parse().unwrap(), options, drive).unwrap();
+        agv.publish_my_function_list().unwrap();
+        agv.start().unwrap();
+        agv
+    };
+    let agv = start(&stage);
+    until("it drives", || stage.cara(&["call", "agv-1", "drive"]).code == 0);
+    let obeyed = agv.claim();
+    let folder = state.path().to_str().unwrap();
+    stage.ends(1, &["forget-claim", "agv-1/11", "--state", folder]).says("agv-1/11 runs: stop its program first");
+    agv.stop();
+    drop(agv);
+    stage.ends(1, &["forget-claim", "agv-2/12", "--state", folder]).says("no claim that agv-2/12 has obeyed");
+    stage.ends(2, &["forget-claim", "agv-1/11"]).says("--state FOLDER");
+    // What is kept counts at its next start, until it is forgotten.
+    stage.kill_manager();
+    assert_eq!(start(&stage).claim(), obeyed);
+    let told = stage.ends(0, &["forget-claim", "agv-1/11", "--state", folder]);
+    told.says(&format!("agv-1/11 (fleet {}) has forgotten claim {obeyed} of manager/1", stage.fleet));
+    let audit = std::fs::read_to_string(state.path().join("audit.log")).unwrap();
+    assert!(audit.contains("\"ask\":\"forget-claim\"") && audit.contains("agv-1/11"), "{audit}");
+    assert_eq!(start(&stage).claim(), Claim::NONE);
+    stage.ends(1, &["forget-claim", "agv-1/11", "--state", folder]).says("no claim");
 }

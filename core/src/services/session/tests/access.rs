@@ -67,6 +67,35 @@ fn a_peer_sees_and_calls_what_a_rule_allows_and_nothing_else() {
 }
 
 #[test]
+fn taking_over_is_a_right_of_its_own() {
+    let both = Verbs::CALL.and(Verbs::TAKE_OVER);
+    let options = RequestOptions { take_over: true, ..RequestOptions::default() };
+    let mut pair = under(table([row(MANAGER, &["go"], Verbs::CALL)]));
+    let outcome = |pair: &mut Pair, options: &RequestOptions| {
+        let id = pair.manager.request_with("go", &x(1), options, true).unwrap();
+        pair.settle();
+        pair.manager.outcome(id).unwrap().map(drop)
+    };
+    assert_eq!(outcome(&mut pair, &options), Err(Error::NotAllowed));
+    assert_eq!(outcome(&mut pair, &RequestOptions::default()), Ok(()));
+    pair.agv.set_table(table([row(MANAGER, &["go"], both)]));
+    assert_eq!(outcome(&mut pair, &options), Ok(()));
+
+    // The table changes while a call waits.
+    let mut pair = Pair::with(&Setup { running: 1, ..Setup::default() });
+    pair.agv.offer_held("go(x: int)");
+    pair.publish();
+    let ids = [&RequestOptions::default(), &options]
+        .map(|options| pair.manager.request_with("go", &x(1), options, true).unwrap());
+    pair.settle();
+    pair.agv.set_table(table([row(MANAGER, &["go"], Verbs::CALL)]));
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    assert_eq!(pair.manager.outcome(ids[1]).unwrap().unwrap_err(), Error::NotAllowed);
+    assert_eq!(pair.agv.ran(), ["go"]);
+}
+
+#[test]
 fn an_unlisted_peer_sees_nothing() {
     for rows in
         [vec![], vec![row(Who::node("manager", 2), &["go"], Verbs::ALL), row(Who::S_UNITS, &["go"], Verbs::ALL)]]
