@@ -1,12 +1,14 @@
 //! Claims: a manager that takes over, one that steps down, and what is stored across starts.
 
 use std::path::Path;
-use std::sync::mpsc::Receiver;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Arc, Mutex};
 
 use cara_std::control::Control;
 use cara_std::{
-    Actuator, Call, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, ServiceError,
-    ServiceOptions, StartError, Unit, UnitEvent,
+    Actuator, Call, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, Renew,
+    RequestOptions, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, system, unit, until};
@@ -190,4 +192,52 @@ fn a_vehicle_that_joins_tells_claim_and_trace_id_of_its_last_order() {
     assert_eq!(told().map(|last| last.trace()), second.peer("agv").unwrap().trace_of("go"));
     assert_ne!(told().unwrap().trace(), kept);
     drop(agv);
+}
+
+/// A handler of the earlier manager hangs. What the next one moves begins once the order of that call is dead and its hook has run,
+/// and the handler changes nothing any more.
+#[test]
+fn a_handler_that_hangs_is_cut_off_before_the_next_manager_moves_anything() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let [here, there] = ["here", "there"].map(|name| folder.path().join(name));
+    let agv = unit("agv", 7, fleet).build().unwrap();
+    let log = Arc::new(Mutex::new(Vec::new()));
+    let note = |what: &'static str| {
+        let log = log.clone();
+        move || log.lock().unwrap().push(what)
+    };
+    let options = ServiceOptions::new().lease(std::time::Duration::from_secs(30), note("hook"));
+    let (goes_on, may_go_on) = channel::<()>();
+    let (first_runs, next_runs, late, refused) =
+        (note("first runs"), note("next runs"), note("a late commit"), note("no late commit"));
+    let (runs, may_go_on) = (AtomicUsize::new(0), Mutex::new(may_go_on));
+    let go = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        if runs.fetch_add(1, Ordering::Relaxed) > 0 {
+            return Ok(call.commit(&next_runs)?);
+        }
+        first_runs();
+        may_go_on.lock().unwrap().recv().unwrap();
+        call.commit(&late).inspect_err(|_| refused())?;
+        Ok(())
+    };
+    agv.my_function_list().add_service(&Definition::parse("go()").unwrap(), options, go).unwrap();
+    agv.publish_my_function_list().unwrap();
+    agv.start().unwrap();
+    let first = manager(fleet, &here, false);
+    first.start().unwrap();
+    until("it is told of the function", || first.peer("agv").is_ok_and(|agv| agv.their_function_list().contains("go")));
+    first
+        .peer("agv")
+        .unwrap()
+        .request_with("go", &Parameters::new(), &RequestOptions::renewing(Renew::Process))
+        .unwrap();
+    until("its handler runs", || log.lock().unwrap().len() == 1);
+
+    let second = manager(fleet, &there, true);
+    second.start().unwrap();
+    move_it(&second);
+    assert_eq!(*log.lock().unwrap(), ["first runs", "hook", "next runs"]);
+    goes_on.send(()).unwrap();
+    until("the handler ends", || log.lock().unwrap().len() == 4);
+    assert_eq!(log.lock().unwrap()[3], "no late commit");
 }
