@@ -16,7 +16,7 @@ use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_sim::{
-    Action, Actuator, Crash, Direction, FaultCounts, FaultPlan, Heart, Service, UnitEvent, UnitHandle, World,
+    Action, Actuator, Crash, Direction, FaultCounts, FaultPlan, Heart, Service, Storing, UnitEvent, UnitHandle, World,
 };
 
 use crate::watch::{DRIVE, Does, FORK, LENGTHS, Made, PULSE, Reached, Seen, Wanted, Watch};
@@ -87,14 +87,20 @@ pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
     let constraints = Constraints { maximum_nodes: size.vehicles as u16 + 8, ..Constraints::M_UNIT };
     let start = |(number, identity): (usize, &Identity)| {
         let is_crane = number < cranes;
-        watch.borrow_mut().add_vehicle(!is_crane, is_secured);
+        // Some disks fail, and some hang.
+        let storing = match random.below(6) {
+            0 => Storing::Fails,
+            1 => Storing::Hangs,
+            _ => Storing::Works,
+        };
+        watch.borrow_mut().add_vehicle(!is_crane, is_secured && storing == Storing::Works);
         let (watch, seed) = (Rc::clone(&watch), random.bits());
         let unit = if is_crane {
             world.m_unit(identity.name(), identity.id()).constraints(constraints)
         } else {
             world.s_unit(identity.name(), identity.id()).joins("manager", 1)
         };
-        unit.clock(ahead(&mut random)).program(move |unit| vehicle(unit, &watch, number, seed)).start()
+        unit.storing(storing).clock(ahead(&mut random)).program(move |unit| vehicle(unit, &watch, number, seed)).start()
     };
     let units: Vec<UnitHandle> = vehicles.iter().enumerate().map(start).collect();
     // The first one is the traffic control; of the managers one runs at first.
@@ -164,13 +170,17 @@ fn supervise(random: &mut Random, watch: &Shared, managers: &[UnitHandle]) {
     let chance = if managers.iter().any(UnitHandle::is_running) { 40 } else { 10 };
     let idle: Vec<&UnitHandle> = managers.iter().filter(|manager| !manager.is_running()).collect();
     if !idle.is_empty() && one_in(random, chance) {
-        take_over(watch, idle[random.below(idle.len() as u64) as usize]);
+        let next = idle[random.below(idle.len() as u64) as usize];
+        take_over(random, watch, next);
     }
 }
 
-fn take_over(watch: &Shared, manager: &UnitHandle) {
-    let newest = watch.borrow().newest_term();
-    manager.keep_term(newest);
+/// With what the managers before it have stored, or on another host, with a store of its own.
+fn take_over(random: &mut Random, watch: &Shared, manager: &UnitHandle) {
+    if one_in(random, 2) {
+        let newest = watch.borrow().newest_term();
+        manager.keep_term(newest);
+    }
     manager.start();
 }
 
@@ -196,7 +206,7 @@ fn something_happens(
             let hangs = pick(random, &running);
             world.suspend(&hangs, between(random, 100, 6_000));
             let others = managers.iter().find(|manager| !manager.is_running());
-            others.into_iter().for_each(|other| take_over(watch, other));
+            others.into_iter().for_each(|other| take_over(random, watch, other));
         }
         3 | 4 if !running.is_empty() => {
             // Two managers, neither of which hears of the other: the vehicles have to tell them.
@@ -204,7 +214,7 @@ fn something_happens(
             let others: Vec<_> = managers.iter().map(UnitHandle::host).filter(|host| *host != first.host()).collect();
             world.network(|network| network.partition_for(&[first.host()], &others, Direction::Both, span));
             let other = managers.iter().find(|manager| !manager.is_running());
-            other.into_iter().for_each(|other| take_over(watch, other));
+            other.into_iter().for_each(|other| take_over(random, watch, other));
             if one_in(random, 2) {
                 world.crash(&pick(random, vehicles), crash);
             }
