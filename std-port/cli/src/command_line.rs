@@ -35,7 +35,6 @@ pub(crate) enum Verb {
     Stream(commands::stream::Arguments),
     Counters(commands::counters::Arguments),
     Ping(commands::ping::Arguments),
-    Bench(commands::bench::Arguments),
     Web(cara_web::Arguments),
     Node(node::Arguments),
     Doctor(cara_doctor::Arguments),

@@ -40,7 +40,6 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Stream(arguments) => commands::stream::run(arguments, global),
         Verb::Counters(arguments) => commands::counters::run(arguments, global),
         Verb::Ping(arguments) => commands::ping::run(arguments, global),
-        Verb::Bench(arguments) => commands::bench::run(arguments, global),
         Verb::Web(arguments) => commands::web::run(arguments, global),
         Verb::Node(arguments) => node::run(arguments, global),
         Verb::Doctor(arguments) => cara_doctor::run(arguments, global),

@@ -140,9 +140,6 @@ fn attempt<T: Send + 'static>(
             let times = (*count, Duration::from_micros(*pause_us), Duration::from_millis(*timeout_ms));
             call::ping(system, node, times, sink)
         }
-        Question::Bench { call, count, pause_us } => {
-            call::bench(system, call, (*count, Duration::from_micros(*pause_us)), sink, lives)
-        }
     }
 }
 

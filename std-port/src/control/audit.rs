@@ -237,7 +237,6 @@ impl<'q> Asked<'q> {
         match question {
             Question::Call(call) => of_call("call", call),
             Question::Hold(call) => of_call("hold", call),
-            Question::Bench { call, .. } => of_call("bench", call),
             Question::Stop { node } => of_node("stop", node.as_ref()),
             Question::Reset { node } => of_node("reset", node.as_ref()),
             Question::Publish { node, .. } => of_node("publish", node.as_ref()),

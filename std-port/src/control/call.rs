@@ -4,12 +4,10 @@ use std::task::Poll;
 use std::time::Instant;
 
 use cara_core::error::{Cause, Error};
-use cara_core::services::access::Verb;
 use cara_core::services::heart::Renew;
 use cara_core::time::Duration;
 
-use super::answering::{End, LOOK, Lives, Sink, pause, permit, send};
-use super::hold::{lease_of, unattended};
+use super::answering::{End, LOOK, Sink, pause, send};
 use super::protocol::{Answer, Argument, CallQuestion, Failure, Said};
 use super::{describe, select, values};
 use crate::communication_system::thread_waker;
@@ -315,40 +313,6 @@ pub(super) fn block_all<T: Send + 'static>(
     }
 }
 
-/// Calls repeatedly and reports the duration of each call. Each call begins a lease again, so it needs a live client.
-pub(super) fn bench<T: Send + 'static>(
-    system: &CommunicationSystem<T>,
-    question: &CallQuestion,
-    (count, between): (u32, Duration),
-    sink: Sink<'_>,
-    lives: Lives<'_>,
-) -> Result<(), End> {
-    let Some(node) = &question.node else {
-        return Err(Failure::configuration("BadQuestion", "name the node whose round trips are measured").into());
-    };
-    let options = RequestOptions { delivery: Delivery::Reliable, ..options(question)? };
-    let peer = select::node(system, node)?;
-    let prepared = prepare(&peer, question)?;
-    let lease = lease_of(&peer, &question.function);
-    let mut parameters = prepared.parameters.clone();
-    for number in 0..count {
-        if number > 0 {
-            pause(system, between)?;
-        }
-        permit(system, &question.function, Verb::Call)?;
-        let last = lives().ok_or(End::Gone)?;
-        if lease.is_some_and(|lease| last.elapsed() >= lease) {
-            return Err(unattended(&question.function).into());
-        }
-        parameters.copy_from(&prepared.parameters)?;
-        let started = Instant::now();
-        let outcome = peer.block_request_with(&question.function, &mut *parameters, &options);
-        let took = started.elapsed();
-        send(sink, sample(outcome.map(|()| took).map_err(|error| prepared.explain(error))))?;
-    }
-    Ok(())
-}
-
 /// Sends pings, and tells how long each took.
 pub(super) fn ping<T: Send + 'static>(
     system: &CommunicationSystem<T>,
@@ -361,15 +325,14 @@ pub(super) fn ping<T: Send + 'static>(
         if number > 0 {
             pause(system, between)?;
         }
-        let took = peer.ping(timeout);
-        send(sink, sample(took.map(Into::into).map_err(Failure::from)))?;
+        let took = peer.ping(timeout).map(std::time::Duration::from);
+        send(
+            sink,
+            match took {
+                Ok(took) => Answer::Sample { us: Some(took.as_secs_f64() * 1e6), error: None },
+                Err(error) => Answer::Sample { us: None, error: Some(error.into()) },
+            },
+        )?;
     }
     Ok(())
-}
-
-fn sample(took: Result<std::time::Duration, Failure>) -> Answer {
-    match took {
-        Ok(took) => Answer::Sample { us: Some(took.as_secs_f64() * 1e6), error: None },
-        Err(failure) => Answer::Sample { us: None, error: Some(failure) },
-    }
 }

@@ -311,7 +311,7 @@ impl Client {
     /// Asks. Unread answers to the previous question are skipped, which for [`Question::Watch`] never ends: drop the
     /// client instead.
     ///
-    /// [`Question::Hold`] and [`Question::Bench`] need heartbeats, which the iterator sends while it waits for the next
+    /// [`Question::Hold`] needs heartbeats, which the iterator sends while it waits for the next
     /// answer: a program that stops reading loses its lease.
     pub fn ask(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
         while self.open {

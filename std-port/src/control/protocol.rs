@@ -12,8 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 /// In the manager's first line, so that an older command recognises a newer manager.
 pub const CONTROL_VERSION: u32 = 2;
 
-/// How often a client sends an empty line, its heartbeat, while a [`Question::Hold`] or a [`Question::Bench`] is
-/// answered. A stopped process sends none, so that its lease ends.
+/// How often a client sends an empty line, its heartbeat, while a [`Question::Hold`] is answered. A stopped process sends none, so that its lease ends.
 pub const BEAT: std::time::Duration = std::time::Duration::from_millis(50);
 
 /// Longest line in bytes, in either direction: a call with 256 KiB of parameters, written as text.
@@ -120,33 +119,23 @@ pub enum Question {
         /// How long to wait for each.
         timeout_ms: u64,
     },
-    /// Measures round trips of blocking calls within this unit. An [`Answer::Sample`] for each. Calls of a function with a
-    /// lease end after its length without a [`BEAT`] of the client.
-    Bench {
-        /// What is called, again and again; its `asynchronous` is not looked at.
-        call: CallQuestion,
-        /// How many calls.
-        count: u32,
-        /// Between two of them.
-        pause_us: u64,
-    },
 }
 
 impl Question {
     /// Whether what it keeps moving needs a [`BEAT`] of the client.
     pub(super) fn needs_beats(&self) -> bool {
-        matches!(self, Self::Hold(_) | Self::Bench { .. })
+        matches!(self, Self::Hold(_))
     }
 
     /// Whether the thread that answers it watches or stops something, so that it waits for no client that reads slowly.
     pub(super) fn waits_for_no_reader(&self) -> bool {
-        matches!(self, Self::Hold(_) | Self::Bench { .. } | Self::Stop { .. } | Self::Reset { .. })
+        matches!(self, Self::Hold(_) | Self::Stop { .. } | Self::Reset { .. })
     }
 
     /// Whether it is carried out only while its client is there: what moves something, or may let it move again, is not wanted
     /// any more by a client that has gone before its turn came, as where the unit's process was stopped meanwhile.
     pub(super) fn needs_its_client(&self) -> bool {
-        matches!(self, Self::Call(_) | Self::Hold(_) | Self::Bench { .. } | Self::Reset { .. })
+        matches!(self, Self::Call(_) | Self::Hold(_) | Self::Reset { .. })
     }
 
     /// Whether it is answered also where all connections are in use.

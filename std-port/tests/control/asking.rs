@@ -128,10 +128,6 @@ fn every_question_about_a_node_fails_for_one_that_is_away() {
     let mut client = depot.client();
     let node = || "agv".to_owned();
     assert_eq!(refused(&mut client, Question::Functions { node: node() }), "NotConnected");
-    assert_eq!(
-        refused(&mut client, Question::Bench { call: call(Some("agv"), "echo", vec![]), count: 1, pause_us: 0 }),
-        "NotConnected"
-    );
     let answers = ask(&mut client, crate::support::ping("agv", 1, 100)).unwrap();
     assert!(
         matches!(&answers[..], [Answer::Sample { us: None, error: Some(failure) }] if failure.error == "NotConnected")

@@ -87,8 +87,6 @@ fn options_that_cannot_be_are_refused() {
     let all = ask(&mut client, Question::Call(call(None, "fly", vec![]))).unwrap();
     let [Answer::Called { error: Some(failure), .. }] = &all[..] else { panic!("{all:?}") };
     assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("UnknownFunction", "peer"));
-    let nobody = Question::Bench { call: call(None, "fail", vec![]), count: 1, pause_us: 0 };
-    assert_eq!(refused(&mut client, nobody), "BadQuestion");
 }
 
 #[test]
@@ -165,7 +163,7 @@ fn a_call_of_all_tells_who_was_not_called() {
 }
 
 #[test]
-fn round_trips_are_measured_with_and_without_a_function() {
+fn round_trips_are_measured_without_a_function() {
     let (depot, _agv) = Depot::with_agv();
     let mut client = depot.client();
     let measured = |answers: Vec<Answer>| {
@@ -180,18 +178,8 @@ fn round_trips_are_measured_with_and_without_a_function() {
         times.len()
     };
     assert_eq!(measured(ask(&mut client, ping("agv", 20, 20_000)).unwrap()), 20);
-    let before = depot.system.s_unit("agv").unwrap().counters();
-    let bench = Question::Bench { call: call(Some("agv"), "echo", every_type()), count: 300, pause_us: 0 };
-    assert_eq!(measured(ask(&mut client, bench).unwrap()), 300);
     let sent = |counters: &[(&'static str, u64)]| counters.iter().find(|(name, _)| *name == "RequestsSent").unwrap().1;
-    assert_eq!(sent(&before), 0, "a ping calls no function");
-    assert_eq!(sent(&depot.system.s_unit("agv").unwrap().counters()), 300);
-    let failing = Question::Bench { call: call(Some("agv"), "fail", vec![]), count: 3, pause_us: 0 };
-    let answers = ask(&mut client, failing).unwrap();
-    assert!(
-        answers.len() == 3
-            && answers.iter().all(|answer| matches!(answer, Answer::Sample { us: None, error: Some(_) }))
-    );
+    assert_eq!(sent(&depot.system.s_unit("agv").unwrap().counters()), 0, "a ping calls no function");
     assert_eq!(refused(&mut client, ping("x", 1, 1)), "UnknownNode");
 }
 

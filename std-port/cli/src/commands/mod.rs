@@ -1,7 +1,6 @@
 //! The verbs, one file each.
 
 pub(crate) mod access;
-pub(crate) mod bench;
 pub(crate) mod call;
 pub(crate) mod completions;
 pub(crate) mod counters;

@@ -19,7 +19,6 @@ const VERBS: &[&[&str]] = &[
     &["stream", "agv-1"],
     &["counters"],
     &["ping", "agv-1"],
-    &["bench", "agv-1"],
 ];
 
 #[test]
@@ -109,8 +108,6 @@ fn as_a_manager_the_same_questions_have_the_same_answers() {
     stage.ends(0, &own(&["set", "agv-1", "request_timeout", "1s"]));
     stage.ends(0, &own(&["set", ".", "request_timeout", "1s"]));
     stage.ends(0, &own(&["watch", "--count", "1"])).says("joined");
-    let sizes = ["bench", "agv-1", "--sizes", "10", "--count", "3", "--periods", "5ms", "--group", "5"];
-    stage.ends(0, &own(&sizes)).says("availability");
 }
 
 #[test]

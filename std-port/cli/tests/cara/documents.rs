@@ -110,7 +110,6 @@ fn the_reference_has_every_key_of_the_json() {
         &["watch", "--for", "100ms"],
         &["counters"],
         &["ping", "agv-1", "-c", "1"],
-        &["bench", "agv-1", "--sizes", "1", "--count", "1", "--periods", "1ms", "--group", "1"],
         &["completions", "bash"],
         &["man"],
     ];
