@@ -6,10 +6,7 @@ use crate::time::Duration;
 
 /// The versions of the protocol that this unit speaks, told in every hello and who-has. Two units use the highest one
 /// that both speak, and refuse each other where there is none.
-pub const VERSIONS: Versions = Versions { first: 2, last: if LATER { 3 } else { 2 } };
-/// Set in a build that passes for a later version: it says more than this one knows wherever the wire format has room for
-/// it, for the tests of units that do not. Nothing else sets it.
-pub(crate) const LATER: bool = cfg!(cara_later);
+pub const VERSIONS: Versions = Versions { first: 2, last: 2 };
 /// First four bytes of every datagram and hello in plain mode. Secured mode has its own, so the two never meet.
 pub const PLAIN_MAGIC: [u8; 4] = *b"CARp";
 /// First four bytes of every datagram and hello in secured mode.

@@ -3,7 +3,7 @@
 //! `ReadPolicy` and `Watch` are the port's own: what decides which thread reads, what the epoll set is told, and which
 //! links the clock looks at, is what runs here. Around them stand the few steps of `calling.rs`, `workers.rs`,
 //! `staying.rs`, `reading.rs` and `threads.rs` that carry the decisions out, with a queue in the place of the socket and no
-//! time-outs: a wake-up that is lost blocks for ever, and the model reports that. With `--cfg cara_planted="lost_wakeup"`
+//! time-outs: a wake-up that is lost blocks for ever, and the model reports that. With `tests/variants/lost-wake-up.patch`
 //! it must fail.
 //!
 //! ```text

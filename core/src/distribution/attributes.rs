@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::config::{LATER, Priority};
+use crate::config::Priority;
 use crate::error::Error;
 use crate::time::Duration;
 
@@ -42,7 +42,7 @@ impl Attributes {
         stream: None,
     };
     /// Bytes of the encoded form.
-    pub const WIRE_BYTES: usize = if LATER { 12 } else { 8 };
+    pub const WIRE_BYTES: usize = 8;
     const PRIORITY: u8 = 0b11;
     const IDEMPOTENT: u8 = 1 << 2;
     const STOP: u8 = 1 << 3;
@@ -72,11 +72,7 @@ impl Attributes {
         let [low, high] = self.stream.unwrap_or(0).to_le_bytes();
         let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
         let [a, b, c, d] = lease.to_le_bytes();
-        let mut bytes = [0; Self::WIRE_BYTES];
-        if let Some(place) = bytes.first_chunk_mut() {
-            *place = [if LATER { flags | 0xC0 } else { flags }, self.actuator, low, high, a, b, c, d];
-        }
-        bytes
+        [flags, self.actuator, low, high, a, b, c, d]
     }
 
     /// The inverse of [`encode`](Self::encode). Other bits, and bytes that follow, are of a later version and passed over;

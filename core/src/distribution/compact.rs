@@ -4,10 +4,7 @@
 //! Neither side stops at the first error: it is recorded, and returned at the end.
 
 use super::items::ALIGNMENT;
-use crate::config::{LATER, NODE_NAME_BYTES};
-
-/// What a later version puts in front of every item.
-const UNKNOWN_ITEM: [u8; 8] = [0xF0, 0x7F, 3, 0, 1, 2, 3, 0];
+use crate::config::NODE_NAME_BYTES;
 
 /// Writes values one behind the other.
 pub(crate) struct Writer<'o> {
@@ -64,9 +61,6 @@ impl<'o> Writer<'o> {
 
     /// Begins an item of a list that can grow (see [`items`](super::items)); [`end`](Self::end) takes what is returned.
     pub(crate) fn begin(&mut self, kind: u16) -> usize {
-        if LATER {
-            self.bytes(&UNKNOWN_ITEM);
-        }
         self.bytes(&kind.to_le_bytes());
         self.bytes(&[0, 0]);
         self.used
@@ -75,9 +69,6 @@ impl<'o> Writer<'o> {
     /// Ends the item whose body begins at `start`: its length is put in front of it, and zeros behind it.
     #[cfg_attr(target_os = "none", inline(never))]
     pub(crate) fn end(&mut self, start: usize) {
-        if LATER {
-            self.bytes(&[0; ALIGNMENT]);
-        }
         let length = self.used.saturating_sub(start);
         let place = self.out.get_mut(start.saturating_sub(2)..).and_then(|out| out.first_chunk_mut());
         match (u16::try_from(length), place) {

@@ -15,7 +15,7 @@ use super::authenticator::CODE_BYTES;
 use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
 use super::items::{Items, Malformed};
-use crate::config::{Constraints, LATER, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
+use crate::config::{Constraints, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
 use crate::distribution::claim::{Claim, TaggedClaim};
 
 /// Bytes before the items.
@@ -225,7 +225,7 @@ impl Hello {
         let mut writer = Writer::new(out);
         writer.bytes(&mode.magic());
         writer.bytes(&[self.versions.first, self.versions.last]);
-        writer.bytes(&(mode.suites() | if LATER { 1 << 15 } else { 0 }).to_le_bytes());
+        writer.bytes(&mode.suites().to_le_bytes());
         writer.bytes(&self.fleet.0.to_le_bytes());
         writer.bytes(&self.capabilities.to_le_bytes());
         self.identity.put(self.epoch, &mut writer);

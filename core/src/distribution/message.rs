@@ -9,7 +9,7 @@ pub use super::control::{NO_SUBSCRIPTION, SubscriptionRefusal};
 
 use super::block::Put;
 use super::function_list::{Generation, Slot};
-use crate::config::{LATER, Priority};
+use crate::config::Priority;
 use crate::error::{Error, ServiceError};
 use crate::host::connections::Report;
 use crate::host::frame::ChunkWriter;
@@ -33,19 +33,10 @@ const OPERATOR: u8 = 0x04;
 const TAKES_OVER: u8 = 0x10;
 /// Flags without which a callee must not run the request, and which this version does not know.
 const UNKNOWN: u8 = 0xE0;
-/// Flags that a callee may pass over, and which this version does not know.
-const SKIPPABLE: u8 = 0x08;
-
 /// Bytes before a request's block.
-pub const REQUEST_BYTES: usize = LEAST_REQUEST_BYTES + MORE_BYTES;
+pub const REQUEST_BYTES: usize = 32;
 /// Bytes before a reply's block.
-pub const REPLY_BYTES: usize = LEAST_REPLY_BYTES + MORE_BYTES;
-/// The header of a request that each version has.
-const LEAST_REQUEST_BYTES: usize = 32;
-/// The header of a reply that each version has.
-const LEAST_REPLY_BYTES: usize = 16;
-/// What a later version has behind them.
-const MORE_BYTES: usize = if LATER { 8 } else { 0 };
+pub const REPLY_BYTES: usize = 16;
 /// Longest header that a receiver has room for in front of its longest block: those of later versions may be longer.
 pub const LONGEST_HEADER_BYTES: usize = 64;
 /// Bytes before the items of a control message.
@@ -55,9 +46,9 @@ const WORD: usize = 4;
 const REQUEST_WORDS: u8 = (REQUEST_BYTES / WORD) as u8;
 const REPLY_WORDS: u8 = (REPLY_BYTES / WORD) as u8;
 /// Longest control message that is not a `Publish`.
-pub const CONTROL_BYTES: usize = 48 + 2 * MORE_BYTES;
+pub const CONTROL_BYTES: usize = 48;
 /// Bytes that a `Publish` needs beside the signature.
-pub const PUBLISH_BYTES: usize = 32 + 3 * MORE_BYTES;
+pub const PUBLISH_BYTES: usize = 32;
 
 /// A message, borrowed from the bytes that it came in.
 #[derive(Debug)]
@@ -85,11 +76,11 @@ impl<'b> Message<'b> {
         match *bytes.first()? {
             REQUEST => {
                 let header = RequestHeader::decode(bytes.first_chunk()?);
-                Some(Self::Request(header, behind_header(bytes, bytes.get(6)?, LEAST_REQUEST_BYTES)?))
+                Some(Self::Request(header, behind_header(bytes, bytes.get(6)?, REQUEST_BYTES)?))
             }
             REPLY => {
                 let (id, status) = decode_reply(bytes.first_chunk()?);
-                let block = behind_header(bytes, bytes.get(3)?, LEAST_REPLY_BYTES)?;
+                let block = behind_header(bytes, bytes.get(3)?, REPLY_BYTES)?;
                 Some(Self::Reply(id, status.map(|()| block)))
             }
             FAILURE => {
@@ -98,15 +89,15 @@ impl<'b> Message<'b> {
             }
             #[cfg(feature = "details")]
             PROGRESS => {
-                let &[_, _, _, words, a, b, c, d] = bytes.first_chunk::<LEAST_PROGRESS_BYTES>()?;
-                let block = behind_header(bytes, &words, LEAST_PROGRESS_BYTES)?;
+                let &[_, _, _, words, a, b, c, d] = bytes.first_chunk::<PROGRESS_BYTES>()?;
+                let block = behind_header(bytes, &words, PROGRESS_BYTES)?;
                 Some(Self::Progress(u32::from_le_bytes([a, b, c, d]), block))
             }
             CONTROL => Some(Self::Control(bytes.get(CONTROL_HEADER_BYTES..)?)),
             #[cfg(feature = "streams")]
             SAMPLE => {
                 let header = SampleHeader::decode(bytes.first_chunk()?);
-                Some(Self::Sample(header, behind_header(bytes, bytes.get(6)?, LEAST_SAMPLE_BYTES)?))
+                Some(Self::Sample(header, behind_header(bytes, bytes.get(6)?, SAMPLE_BYTES)?))
             }
             _ => None,
         }
@@ -118,16 +109,6 @@ impl<'b> Message<'b> {
 fn behind_header<'b>(bytes: &'b [u8], words: &u8, least: usize) -> Option<&'b [u8]> {
     let length = usize::from(*words).saturating_mul(WORD);
     if length < least { None } else { bytes.get(length..) }
-}
-
-/// A header as this build sends it.
-#[inline]
-fn with_more<const LEAST: usize, const ALL: usize>(header: [u8; LEAST]) -> [u8; ALL] {
-    let mut bytes = [0; ALL];
-    if let Some(place) = bytes.first_chunk_mut() {
-        *place = header;
-    }
-    bytes
 }
 
 impl Put for ChunkWriter<'_> {
@@ -174,7 +155,6 @@ impl RequestHeader {
             | if self.wants_progress { WANTS_PROGRESS } else { 0 }
             | if self.takes_over { TAKES_OVER } else { 0 }
             | if self.operator { OPERATOR } else { 0 }
-            | if LATER { SKIPPABLE } else { 0 }
             | self.unknown;
         let [s0, s1] = self.slot.0.to_le_bytes();
         let [g0, g1] = self.generation.0.to_le_bytes();
@@ -183,7 +163,7 @@ impl RequestHeader {
         let [t0, t1, t2, t3, t4, t5, t6, t7] = self.stamp.to_le_bytes();
         let [e0, e1, e2, e3] = self.since.as_wire().to_le_bytes();
         let [n0, n1, n2, n3] = self.number.to_le_bytes();
-        with_more([
+        [
             REQUEST,
             flags,
             s0,
@@ -216,11 +196,11 @@ impl RequestHeader {
             n1,
             n2,
             n3,
-        ])
+        ]
     }
 
     #[inline]
-    fn decode(bytes: &[u8; LEAST_REQUEST_BYTES]) -> Self {
+    fn decode(bytes: &[u8; REQUEST_BYTES]) -> Self {
         let [_, flags, s0, s1, g0, g1, _, _, i0, i1, i2, i3, r0, r1, r2, r3, rest @ ..] = bytes;
         let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, n0, n1, n2, n3] = rest;
         Self {
@@ -252,12 +232,9 @@ pub struct SampleHeader {
     pub made: i64,
 }
 
-/// The header of a sample that each version has.
-#[cfg(feature = "streams")]
-const LEAST_SAMPLE_BYTES: usize = 16;
 /// Bytes before the block of a sample.
 #[cfg(feature = "streams")]
-pub const SAMPLE_BYTES: usize = LEAST_SAMPLE_BYTES + MORE_BYTES;
+pub const SAMPLE_BYTES: usize = 16;
 
 #[cfg(feature = "streams")]
 impl SampleHeader {
@@ -265,10 +242,10 @@ impl SampleHeader {
     pub fn encode(&self) -> [u8; SAMPLE_BYTES] {
         let ([s0, s1], [g0, g1]) = (self.slot.0.to_le_bytes(), self.generation.0.to_le_bytes());
         let [a, b, c, d, e, f, g, h] = self.made.to_le_bytes();
-        with_more([SAMPLE, 0, s0, s1, g0, g1, (SAMPLE_BYTES / WORD) as u8, 0, a, b, c, d, e, f, g, h])
+        [SAMPLE, 0, s0, s1, g0, g1, (SAMPLE_BYTES / WORD) as u8, 0, a, b, c, d, e, f, g, h]
     }
 
-    fn decode(bytes: &[u8; LEAST_SAMPLE_BYTES]) -> Self {
+    fn decode(bytes: &[u8; SAMPLE_BYTES]) -> Self {
         let &[_, _, s0, s1, g0, g1, _, _, a, b, c, d, e, f, g, h] = bytes;
         Self {
             slot: Slot(u16::from_le_bytes([s0, s1])),
@@ -278,18 +255,15 @@ impl SampleHeader {
     }
 }
 
-/// The header of progress that each version has.
-#[cfg(feature = "details")]
-const LEAST_PROGRESS_BYTES: usize = 8;
 /// Bytes before the block of progress.
 #[cfg(feature = "details")]
-pub const PROGRESS_BYTES: usize = LEAST_PROGRESS_BYTES + MORE_BYTES;
+pub const PROGRESS_BYTES: usize = 8;
 
 /// The header of what call `id` tells.
 #[cfg(feature = "details")]
 pub fn encode_progress(id: u32) -> [u8; PROGRESS_BYTES] {
     let [a, b, c, d] = id.to_le_bytes();
-    with_more([PROGRESS, 0, 0, (PROGRESS_BYTES / WORD) as u8, a, b, c, d])
+    [PROGRESS, 0, 0, (PROGRESS_BYTES / WORD) as u8, a, b, c, d]
 }
 
 /// What stands behind the header of a reply or failure whose service failed: its text, and the block of its values.
@@ -306,10 +280,10 @@ pub struct FailureDetails<'b> {
 impl<'b> FailureDetails<'b> {
     /// `None` for any other message, and where there are none.
     pub fn of(message: &'b [u8]) -> Option<Self> {
-        let &[REPLY | FAILURE, SERVICE_FAILED, _, words, ..] = message.first_chunk::<LEAST_REPLY_BYTES>()? else {
+        let &[REPLY | FAILURE, SERVICE_FAILED, _, words, ..] = message.first_chunk::<REPLY_BYTES>()? else {
             return None;
         };
-        let (&head, rest) = behind_header(message, &words, LEAST_REPLY_BYTES)?.split_first_chunk()?;
+        let (&head, rest) = behind_header(message, &words, REPLY_BYTES)?.split_first_chunk()?;
         let length = usize::try_from(u64::from_le_bytes(head)).ok()?;
         let (text, rest) = rest.split_at_checked(length)?;
         let values = rest.get(length.wrapping_neg() & 7..)?;
@@ -351,11 +325,11 @@ fn answer(kind: u8, id: u32, status: Result<(), Error>) -> [u8; REPLY_BYTES] {
     let [i0, i1, i2, i3] = id.to_le_bytes();
     let [a0, a1, a2, a3] = first.to_le_bytes();
     let [b0, b1, b2, b3] = second.to_le_bytes();
-    with_more([kind, code, index, REPLY_WORDS, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3])
+    [kind, code, index, REPLY_WORDS, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3]
 }
 
 #[inline]
-fn decode_reply(bytes: &[u8; LEAST_REPLY_BYTES]) -> (u32, Result<(), Error>) {
+fn decode_reply(bytes: &[u8; REPLY_BYTES]) -> (u32, Result<(), Error>) {
     let &[_, code, index, _, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3] = bytes;
     let id = u32::from_le_bytes([i0, i1, i2, i3]);
     if code == 0 {

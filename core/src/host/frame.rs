@@ -5,7 +5,7 @@
 //! two chunks of another message. The first chunk tells the message's length.
 
 use crate::bytes::copy;
-use crate::config::{LATER, MINIMUM_CHUNK_BYTES, Priority};
+use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::CloseReason;
 
 /// Bytes before a frame's body.
@@ -146,7 +146,6 @@ fn kind_and_payload<'b>(frame: &'b Frame<'_>) -> Option<(u8, &'b [u8])> {
         Frame::Session(bytes) => (SESSION, bytes),
         Frame::Proof(bytes) => (PROOF, bytes),
         Frame::Confirm(bytes) => (CONFIRM, bytes),
-        Frame::Skipped if LATER => (0x5F, b"later"),
         Frame::Chunk(_) | Frame::Skipped => return None,
     })
 }

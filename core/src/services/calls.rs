@@ -42,7 +42,7 @@ impl Window {
             return Seen::TooOld;
         }
         let bit = 1_u64.checked_shl(behind).unwrap_or(0);
-        if self.seen & bit != 0 && !cfg!(cara_planted = "double_execution") {
+        if self.seen & bit != 0 {
             return Seen::Before;
         }
         self.seen |= bit;

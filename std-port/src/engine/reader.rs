@@ -221,10 +221,8 @@ impl ReadPolicy {
 
     /// The next waiting caller gets the token, or else the pool. Returns the caller that is to be woken.
     fn pass_on(&mut self, waiter: Option<CallId>) -> Option<CallId> {
-        // The planted bug forgets to wake a caller, and believes that it has.
-        let forgets = cfg!(cara_planted = "lost_wakeup");
-        self.reader = if waiter.is_some() || forgets { Reader::Offered } else { Reader::Pool };
-        waiter.filter(|_| !forgets)
+        self.reader = if waiter.is_some() { Reader::Offered } else { Reader::Pool };
+        waiter
     }
 
     /// The clock looks at links whose holder is expected back. Only its own look takes a link off its list, so that calls

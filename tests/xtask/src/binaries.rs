@@ -4,13 +4,12 @@
 //! everything that is built with it. So binaries are built as members of the whole workspace, and those that are not
 //! optimised as if its tests were built too, as they are in CI: otherwise the same crates are compiled again for each of them.
 
-use std::fs::{self, Permissions};
-use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
 use crate::command::Run;
+use crate::paper::broken::Tree;
 use crate::workspace;
 
 /// Features that nothing in the workspace asks for, and whose code is checked and tested all the same.
@@ -50,15 +49,22 @@ pub(crate) fn tests() -> Run {
     Run::cargo().args(["test", "--workspace", "--features", FEATURES])
 }
 
-/// Sets a cfg in the crates of the workspace alone: what they depend on is that of every other build. Cargo tells builds
-/// apart by the path of the wrapper; what this one makes goes to a folder of its own, so that nothing else runs it.
-pub(crate) fn with_cfg(build: Run, folder: &Path, cfg: &str) -> Result<Run> {
-    fs::create_dir_all(folder)?;
-    let wrapper = folder.join("rustc-with-cfg");
-    fs::write(&wrapper, format!("#!/bin/sh\nexec \"$@\" --cfg '{cfg}'\n"))?;
-    fs::set_permissions(&wrapper, Permissions::from_mode(0o755))?;
+/// The patches that [`changed`] applies.
+pub(crate) const VARIANTS: &str = "tests/variants";
+
+/// The same build, of a clone of the last commit that a patch of `tests/variants` changes. What it depends on is that of every other
+/// build; what it makes goes to a folder of its own, so that nothing else runs it.
+pub(crate) fn changed(build: Run, patch: &str) -> Result<Run> {
+    let folder = changed_folder(patch);
+    let tree = folder.join("tree");
+    Tree::at(tree.clone())?.apply(&Path::new(VARIANTS).join(patch).with_extension("patch"))?;
     Ok(build
-        .env("RUSTC_WORKSPACE_WRAPPER", &wrapper.to_string_lossy())
+        .within(&tree)
         .env("CARGO_BUILD_BUILD_DIR", &workspace::target().to_string_lossy())
         .env("CARGO_TARGET_DIR", &folder.to_string_lossy()))
+}
+
+/// Where [`changed`] puts what it makes.
+pub(crate) fn changed_folder(patch: &str) -> PathBuf {
+    workspace::target().join("variants").join(patch)
 }

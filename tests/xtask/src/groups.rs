@@ -85,7 +85,7 @@ pub(crate) const GROUPS: [Group; 27] = [
         quick: Some(2),
         by_default: true,
         waits: false,
-        run: |_| all(&[paper::check, bad_input::check, claims::check, orders::check]),
+        run: |_| all(&[paper::check, bad_input::check, claims::check, orders::check, planted::check]),
     },
     Group {
         name: "names",

@@ -1,22 +1,24 @@
 //! Units of this version beside units of a later one, and of earlier ones.
 //!
-//! A build with the cfg `cara_later`, which nothing else sets, speaks one version more and says what this one does not know
-//! wherever the wire format has room for it: items, capabilities, suites, frames, session bodies, flags, and longer headers
-//! and bodies of every kind.
+//! A build with the patch `a-later-version` speaks one version more and says what this one does not know wherever the wire format
+//! has room for it: items, capabilities, suites, frames, session bodies, flags, and longer headers and bodies of every kind.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Result, ensure};
 
 use crate::command::Run;
 use crate::{binaries, demo, planted, workspace};
 
+const LATER: &str = "a-later-version";
+
 /// Every scenario between later units, and the demonstration between both versions, either way round.
 pub(crate) fn check() -> Result<()> {
     binaries::build(&demo::PROGRAMS)?;
     let builds = [&demo::PROGRAMS[..], &["seeds"]].concat();
-    binaries::with_cfg(binaries::debug_build(&builds), &folder(), "cara_later")?.stream()?;
-    let seeds = folder().join("debug/seeds");
+    binaries::changed(binaries::debug_build(&builds), LATER)?.stream()?;
+    let later = binaries::changed_folder(LATER).join("debug");
+    let seeds = later.join("seeds");
     // That so few seeds reach all that a scenario is to reach is not asked here.
     let (_, output, errors) = Run::new(&seeds.to_string_lossy()).args(["--seeds", "50"]).captured()?;
     let failed = planted::failed(&output);
@@ -24,7 +26,7 @@ pub(crate) fn check() -> Result<()> {
     for counted in [", items skipped ", "datagram items skipped "] {
         ensure!(output.contains(counted), "nothing was passed over as {counted:?}: {output}");
     }
-    both_ways(&folder().join("debug"), "a later one")
+    both_ways(&later, "a later one")
 }
 
 /// The demonstration beside builds of earlier revisions. Each version of the wire format that units in use may speak has a
@@ -60,8 +62,4 @@ fn both_ways(theirs: &Path, name: &str) -> Result<()> {
     demo::between(&ours, theirs)?;
     println!("== a manager of {name}, and AGVs of this version");
     demo::between(theirs, &ours)
-}
-
-fn folder() -> PathBuf {
-    workspace::target().join("later")
 }

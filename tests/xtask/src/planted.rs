@@ -1,21 +1,29 @@
-//! Bugs that are planted on purpose, behind the cfg `cara_planted` that nothing else sets: each has to be found.
-
-use std::path::PathBuf;
+//! Bugs that are planted on purpose, by patches: each has to be found.
 
 use anyhow::{Result, bail};
 
 use crate::command::Run;
+use crate::paper::broken::CONTEXT;
 use crate::{binaries, workspace};
 
-/// Found by scenarios. The third, `lost_wakeup`, is a race of threads: the model of the hand-over finds it in every run, the
+/// Found by scenarios. The third, `lost-wake-up`, is a race of threads: the model of the hand-over finds it in every run, the
 /// scenarios on Linux only in most.
-const BY_SCENARIOS: [&str; 2] = ["double_execution", "leaked_slot"];
+const BY_SCENARIOS: [&str; 2] = ["double-execution", "leaked-slot"];
+
+/// Fails where a patch of `tests/variants` does not apply.
+pub(crate) fn check() -> Result<()> {
+    let patches = workspace::files_with("patch")?;
+    for patch in patches.iter().filter(|patch| patch.starts_with(binaries::VARIANTS)) {
+        Run::new("git").args(["apply", "--check", CONTEXT]).args([patch]).text()?;
+    }
+    Ok(())
+}
 
 /// Builds the scenarios with each bug, and requires that some of them fail.
 pub(crate) fn scenarios() -> Result<()> {
     for bug in BY_SCENARIOS {
-        plant(binaries::debug_build(&["seeds"]), bug)?.stream()?;
-        let seeds = folder(bug).join("debug/seeds");
+        binaries::changed(binaries::debug_build(&["seeds"]), bug)?.stream()?;
+        let seeds = binaries::changed_folder(bug).join("debug/seeds");
         let (passed, output, errors) = Run::new(&seeds.to_string_lossy()).args(["--seeds", "10"]).captured()?;
         let finders = failed(&output);
         if passed || finders.is_empty() {
@@ -31,20 +39,12 @@ pub(crate) fn loom() -> Result<()> {
     // It has to be named: it takes too long beside the other tests.
     let model = || binaries::tests().args(["--test", "hand_over"]);
     model().stream()?;
-    let (passed, output, _) = plant(model(), "lost_wakeup")?.captured()?;
+    let (passed, output, _) = binaries::changed(model(), "lost-wake-up")?.captured()?;
     if passed || !output.contains("no thread reads") {
         bail!("the planted lost wake-up was not found: {output}");
     }
     println!("the planted lost wake-up is found");
     Ok(())
-}
-
-fn plant(build: Run, bug: &str) -> Result<Run> {
-    binaries::with_cfg(build, &folder(bug), &format!("cara_planted=\"{bug}\""))
-}
-
-fn folder(bug: &str) -> PathBuf {
-    workspace::target().join("planted").join(bug)
 }
 
 /// Scenarios of which the output says that a run of theirs failed.

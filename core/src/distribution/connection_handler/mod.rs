@@ -32,7 +32,7 @@ pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;
 
-use crate::config::{Constraints, LATER, VERSIONS};
+use crate::config::{Constraints, VERSIONS};
 use crate::counters::Counters;
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Datagram, DatagramError};
@@ -294,7 +294,7 @@ impl<P: Port> Node<P> {
         let constraints = &self.config.constraints;
         Hello {
             versions: VERSIONS,
-            capabilities: if LATER { 1 << 63 } else { 0 },
+            capabilities: 0,
             fleet: self.config.fleet,
             identity: self.config.identity.clone(),
             wanted: self.manager().cloned(),

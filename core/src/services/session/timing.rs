@@ -3,7 +3,7 @@
 use super::granting::expire_granted;
 use super::{CHALLENGE_DATAGRAMS, Event, Phase, Session, close_code};
 use crate::bytes::copy;
-use crate::config::{DATAGRAM_BYTES, GATHER, LATER};
+use crate::config::{DATAGRAM_BYTES, GATHER};
 use crate::distribution::datagram;
 use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
 use crate::error::{CloseReason, Error};
@@ -263,10 +263,6 @@ impl<P: Port> Session<P> {
         self.publishing.actuators_due = true;
         self.pump(cx);
         let body = SessionBody::keep_alive(cx.now.as_micros(), self.report());
-        if LATER {
-            self.link.send_frame(&Frame::Skipped);
-            self.send_datagram(cx, &[200], &[]);
-        }
         self.send_datagram(cx, &body, &[]);
         // Where none come, none may arrive there either: the peer could not tell.
         if !self.liveness.is_heard() || !self.liveness.hears() {
@@ -278,7 +274,6 @@ impl<P: Port> Session<P> {
     /// Sends a session datagram; `body` and `rest` follow each other in it. `false` when the network refused it.
     pub(super) fn send_datagram(&mut self, cx: &mut Context<'_, P>, body: &[u8], rest: &[u8]) -> bool {
         let Some((to, header)) = self.datagram_header() else { return false };
-        let rest = if LATER && rest.is_empty() { &[0xEE; 4] } else { rest };
         let (front, back) = self.link.cipher().datagram_room();
         let mut bytes = [0; LONGEST_DATAGRAM];
         let start = header.len().saturating_add(front);

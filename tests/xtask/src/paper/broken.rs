@@ -115,7 +115,10 @@ pub(crate) struct Tree {
 
 impl Tree {
     pub(crate) fn new() -> Result<Self> {
-        let root = workspace::root().join("target/paper/tree");
+        Self::at(workspace::root().join("target/paper/tree"))
+    }
+
+    pub(crate) fn at(root: PathBuf) -> Result<Self> {
         if !root.join(".git").exists() {
             let clone = Run::new("git").args(["clone", "--quiet", "--shared", "--no-checkout", "."]);
             clone.args([root.as_os_str()]).text()?;
@@ -124,6 +127,11 @@ impl Tree {
         tree.git(&["fetch", "--quiet", "origin", "HEAD"])?;
         tree.git(&["reset", "--quiet", "--hard", "FETCH_HEAD"])?;
         Ok(tree)
+    }
+
+    pub(crate) fn apply(&self, patch: &Path) -> Result<()> {
+        let file = workspace::root().join(patch);
+        self.git(&["apply", CONTEXT, &file.to_string_lossy()]).map(drop)
     }
 
     fn git(&self, arguments: &[&str]) -> Result<String> {
@@ -142,8 +150,7 @@ impl Tree {
 
     /// The name of the test, if it fails with the patch, which is relative to the root.
     pub(crate) fn finds(&self, patch: &Path, test: &str) -> Result<String> {
-        let file = workspace::root().join(patch);
-        self.git(&["apply", CONTEXT, &file.to_string_lossy()])?;
+        self.apply(patch)?;
         let ended = self.passes(test);
         self.git(&["reset", "--quiet", "--hard"])?;
         match ended? {
