@@ -4,6 +4,8 @@
 //! everything that is built with it. So binaries are built as members of the whole workspace, and those that are not
 //! optimised as if its tests were built too, as they are in CI: otherwise the same crates are compiled again for each of them.
 
+use std::fs::{self, Permissions};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
@@ -53,13 +55,16 @@ pub(crate) fn tests() -> Run {
 pub(crate) const VARIANTS: &str = "tests/variants";
 
 /// The same build, of a clone of the last commit that a patch of `tests/variants` changes. What it depends on is that of every other
-/// build; what it makes goes to a folder of its own, so that nothing else runs it.
+/// build, so what it makes itself goes to a folder of its own; cargo tells both apart by the path of the wrapper.
 pub(crate) fn changed(build: Run, patch: &str) -> Result<Run> {
     let folder = changed_folder(patch);
-    let tree = folder.join("tree");
+    let (tree, wrapper) = (folder.join("tree"), folder.join("rustc"));
     Tree::at(tree.clone())?.apply(&Path::new(VARIANTS).join(patch).with_extension("patch"))?;
+    fs::write(&wrapper, "#!/bin/sh\nexec \"$@\"\n")?;
+    fs::set_permissions(&wrapper, Permissions::from_mode(0o755))?;
     Ok(build
         .within(&tree)
+        .env("RUSTC_WORKSPACE_WRAPPER", &wrapper.to_string_lossy())
         .env("CARGO_BUILD_BUILD_DIR", &workspace::target().to_string_lossy())
         .env("CARGO_TARGET_DIR", &folder.to_string_lossy()))
 }
