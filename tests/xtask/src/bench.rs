@@ -32,7 +32,7 @@ pub(crate) struct Options {
     /// So many turns of each cell of the response time instead of the usual.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     rounds: Option<u32>,
-    /// Draws the paper's figures 6, 7 and 8 and the ratios here, as SVG and PNG.
+    /// Draws the paper's figures 6, 7 and 8 and the ratios here, as SVG.
     #[arg(long, value_name = "DIR")]
     plots: Option<std::path::PathBuf>,
     /// Further options of `cara-bench experiments`, such as `--only response --chars 100`.

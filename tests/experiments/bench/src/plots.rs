@@ -26,7 +26,7 @@ struct Figure {
     about: Vec<String>,
 }
 
-/// Draws every figure for which there are rows, each as SVG and PNG.
+/// Draws every figure for which there are rows, each as SVG.
 pub(crate) fn draw(results: &Results, folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
     for mut figure in figures(results).into_iter().chain(link::figures(results)) {

@@ -69,7 +69,7 @@ pub(crate) struct Options {
     /// machine, and makes the others.
     #[arg(long, value_name = "FILE")]
     resume: Option<PathBuf>,
-    /// Draws the paper's figures 6, 7 and 8 and the ratios there, as SVG and PNG.
+    /// Draws the paper's figures 6, 7 and 8 and the ratios there, as SVG.
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
 }

@@ -196,13 +196,12 @@ impl Style {
     }
 }
 
-/// Draws charts in rows, as `path` with `.svg` and with `.png`, with `about` below the legend.
+/// Draws charts in rows, as an SVG file `path`, with `about` below the legend.
 pub(super) fn draw(rows: &[Vec<Chart>], about: &[String], path: &Path) -> Result<()> {
     register_font(FONT, FontStyle::Normal, dejavu::sans::regular()).map_err(|_| anyhow!("the font cannot be read"))?;
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0) as u32;
     let size = (SIZE.0 * columns + LEGEND, SIZE.1 * rows.len() as u32);
-    all(rows, about, &SVGBackend::new(&path.with_extension("svg"), size).into_drawing_area())?;
-    all(rows, about, &BitMapBackend::new(&path.with_extension("png"), size).into_drawing_area())
+    all(rows, about, &SVGBackend::new(&path.with_extension("svg"), size).into_drawing_area())
 }
 
 fn all<D: DrawingBackend>(rows: &[Vec<Chart>], about: &[String], root: &Area<D>) -> Result<()> {
