@@ -5,6 +5,7 @@
 //! optimised as if its tests were built too, as they are in CI: otherwise the same crates are compiled again for each of them.
 
 use std::fs::{self, Permissions};
+use std::io::IsTerminal;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
@@ -42,7 +43,9 @@ pub(crate) fn debug_build(names: &[&str]) -> Run {
 }
 
 fn workspace_build(names: &[&str]) -> Run {
-    let build = Run::cargo().args(["build", "--quiet", "--workspace", "--features", FEATURES]);
+    let build = Run::cargo().args(["build", "--workspace", "--features", FEATURES]);
+    // On a terminal the first build of a demonstration shows how far it is.
+    let build = if std::io::stderr().is_terminal() { build } else { build.args(["--quiet"]) };
     names.iter().fold(build, |build, name| build.args(["--bin", name]))
 }
 
