@@ -18,7 +18,7 @@
 //! # From one application to the other
 //! ```text
 //! request -> function list (find, check) -> message (encode in place) -> link -> frame -> Mailman => network
-//! network => Session::receive -> frame -> link -> message (decode, borrowed) -> Event::Call | Event::Reply | …
+//! network => Session::receive -> frame -> link -> message (decode, borrowed) -> Event::Incoming | Event::Reply | …
 //! ```
 //!
 //! # Polling

@@ -10,13 +10,13 @@ use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::RequestOptions;
 
-use crate::handler::Call;
+use crate::handler::Served;
 use crate::machine::{LinkContext, LinkSession, Machine};
 use crate::peer::Peer;
 use crate::taken::{PAUSE, Running, TakenCall};
 use crate::time::{now, timer};
 
-impl<T> Call<T> {
+impl<T> Served<T> {
     /// What the handler returns for this failure, whose text and values go to the caller.
     pub fn fail(&self, failure: Failure) -> ServiceError {
         let error = failure.error();

@@ -17,7 +17,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::host::port::Port as _;
 use cara_core::services::Context;
 use cara_core::services::lease::Lease;
-use cara_core::services::session::{Call, Event};
+use cara_core::services::session::{Event, Incoming};
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
 use core::task::{Context as TaskContext, Poll};
@@ -54,7 +54,7 @@ pub(crate) enum Job {
 #[repr(u32)]
 pub(crate) enum Begun {
     Nothing,
-    Call(Call),
+    Call(Incoming),
 }
 
 impl<T> Machine<T> {
@@ -336,7 +336,7 @@ impl<T> Machine<T> {
         match event {
             // No handle here pings.
             Event::Reply(..) | Event::Answered => {}
-            Event::Call(call) => (self.begun, self.begun_on) = (Begun::Call(call), index),
+            Event::Incoming(call) => (self.begun, self.begun_on) = (Begun::Call(call), index),
             Event::Closed(reason) => return self.closed(index, reason),
             Event::Acknowledged { skipped: 0, .. } => self.wakers.news.wake(),
             Event::LeaseExpired(slot) => {

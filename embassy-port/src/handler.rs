@@ -16,7 +16,7 @@ use crate::lease::LeaseWatch;
 use crate::time::now;
 
 /// What a handler is told about the call that it serves.
-pub struct Call<T: 'static> {
+pub struct Served<T: 'static> {
     /// The caller.
     pub caller: Identity,
     /// The call's class.
@@ -37,9 +37,9 @@ pub struct Call<T: 'static> {
     pub(crate) running: core::cell::Cell<Option<crate::taken::Running>>,
 }
 
-impl<T> fmt::Debug for Call<T> {
+impl<T> fmt::Debug for Served<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Call")
+        f.debug_struct("Served")
             .field("caller", &self.caller)
             .field("priority", &self.priority)
             .field("deadline", &self.deadline)
@@ -49,7 +49,7 @@ impl<T> fmt::Debug for Call<T> {
     }
 }
 
-impl<T> Call<T> {
+impl<T> Served<T> {
     /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
     pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
         match &self.lease {
@@ -66,9 +66,9 @@ impl<T> Call<T> {
 }
 
 /// A service that the runner runs, with the application's state.
-pub type Method<T> = dyn Fn(&mut T, &Call<T>, &mut ParametersView) -> Result<(), ServiceError>;
+pub type Method<T> = dyn Fn(&mut T, &Served<T>, &mut ParametersView) -> Result<(), ServiceError>;
 /// A service that the runner runs, without it.
-pub type Free<T> = dyn Fn(&Call<T>, &mut ParametersView) -> Result<(), ServiceError>;
+pub type Free<T> = dyn Fn(&Served<T>, &mut ParametersView) -> Result<(), ServiceError>;
 /// Makes safe what a service has started.
 pub type Safe = dyn Fn();
 /// Runs after something has ended.
@@ -154,7 +154,12 @@ impl<T> Handler<T> {
     }
 
     /// [`Error::WouldDeadlock`] when the state is lent already.
-    pub(crate) fn run(&self, state: &RefCell<T>, call: &Call<T>, parameters: &mut ParametersView) -> Result<(), Error> {
+    pub(crate) fn run(
+        &self,
+        state: &RefCell<T>,
+        call: &Served<T>,
+        parameters: &mut ParametersView,
+    ) -> Result<(), Error> {
         let state = || state.try_borrow_mut().map_err(|_| Error::WouldDeadlock);
         let result = match self.run {
             Run::Free(run) => run(call, parameters),

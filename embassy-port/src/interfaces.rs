@@ -19,7 +19,7 @@ use cara_core::time::Instant;
 use cara_core::typed::{AnyCall, AwaitedCaller, Caller, Free, Functions, Interface, Method};
 
 use crate::functions::MyFunctionList;
-use crate::handler::{Call, Handler, Hook, Safe, ServiceOptions};
+use crate::handler::{Handler, Hook, Safe, Served, ServiceOptions};
 use crate::lease::LeaseWatch;
 use crate::peer::Peer;
 
@@ -56,7 +56,7 @@ impl<T> Actuator<T> {
     }
 }
 
-impl<T> AnyCall for Call<T> {
+impl<T> AnyCall for Served<T> {
     type Order = LeaseWatch;
 
     fn order(&self) -> Option<LeaseWatch> {
@@ -116,7 +116,7 @@ impl<T: 'static> MyFunctionList<T> {
 }
 
 impl<T: 'static> Functions<T> for MyFunctionList<T> {
-    type Call = Call<T>;
+    type Call = Served<T>;
     type Actuator = Actuator<T>;
 
     fn add_method(
@@ -124,7 +124,7 @@ impl<T: 'static> Functions<T> for MyFunctionList<T> {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&Actuator<T>>,
-        run: &'static Method<T, Call<T>>,
+        run: &'static Method<T, Served<T>>,
     ) -> Result<(), Error> {
         self.add(signature, attributes, actuator, Handler::method(run))
     }
@@ -134,7 +134,7 @@ impl<T: 'static> Functions<T> for MyFunctionList<T> {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&Actuator<T>>,
-        run: &'static Free<Call<T>>,
+        run: &'static Free<Served<T>>,
     ) -> Result<(), Error> {
         self.add(signature, attributes, actuator, Handler::free(run))
     }

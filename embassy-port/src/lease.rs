@@ -5,7 +5,7 @@ use core::future::poll_fn;
 use core::task::Poll;
 
 use cara_core::services::lease::{Ended, Lease, Order, Stage};
-use cara_core::services::session::Call;
+use cara_core::services::session::Incoming;
 
 use crate::handle::Handle;
 use crate::time::now;
@@ -31,7 +31,7 @@ pub struct LeaseWatch {
 
 impl LeaseWatch {
     /// A call's hold of the lease of its service.
-    pub(crate) fn new(lease: Option<&'static Lease>, call: &Call) -> Option<Self> {
+    pub(crate) fn new(lease: Option<&'static Lease>, call: &Incoming) -> Option<Self> {
         lease.zip(call.order).map(|(lease, order)| Self { lease, order })
     }
 
@@ -52,7 +52,7 @@ impl LeaseWatch {
 }
 
 impl<T> Handle<T> {
-    /// What an order ([`Call::lease`](crate::Call::lease)) has started is finished: it ends, no hook runs, and its caller is told
+    /// What an order ([`Incoming::lease`](crate::Served::lease)) has started is finished: it ends, no hook runs, and its caller is told
     /// so. `false` for one that has ended before, as when a newer call has replaced it.
     pub fn end_order(&self, order: &LeaseWatch) -> bool {
         self.act(|machine| {

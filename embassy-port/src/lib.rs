@@ -123,7 +123,7 @@ pub use config::Config;
 pub use event::{Name, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::Handle;
-pub use handler::{Call, Free, Handler, Hook, Method, Safe, ServiceOptions};
+pub use handler::{Free, Handler, Hook, Method, Safe, Served, ServiceOptions};
 pub use interfaces::Actuator;
 pub use lease::LeaseWatch;
 pub use limits::Limits;

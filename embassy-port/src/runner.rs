@@ -8,12 +8,12 @@ use core::task::{Context, Poll};
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::services::session::Call as CoreCall;
+use cara_core::services::session::Incoming;
 use cara_core::time::{Duration, Instant};
 
 use crate::driving::{Begun, Job};
 use crate::handle::Handle;
-use crate::handler::{Call, Hook, Listed};
+use crate::handler::{Hook, Listed, Served};
 use crate::lease::LeaseWatch;
 use crate::machine::{LinkSession, Machine, Shared};
 use crate::taken::Running;
@@ -189,7 +189,7 @@ impl<T> Runner<T> {
     }
 
     #[inline(never)]
-    fn serve(&mut self, link: u16, call: &CoreCall) {
+    fn serve(&mut self, link: u16, call: &Incoming) {
         let serial = self.shared.machine.borrow().link(link).map_or(0, |link| link.serial);
         let running = Running { link, serial, ticket: call.ticket, deadline: call.deadline };
         let result = self.begin(running, call);
@@ -202,7 +202,7 @@ impl<T> Runner<T> {
     }
 
     /// Runs a call; `None` when it is answered, or a task is left to do so.
-    fn begin(&mut self, running: Running, call: &CoreCall) -> Option<Result<(), Error>> {
+    fn begin(&mut self, running: Running, call: &Incoming) -> Option<Result<(), Error>> {
         let (told, handler) = {
             let machine = &mut *self.shared.machine.borrow_mut();
             let Some(function) = machine.functions.function(call.slot) else {
@@ -219,7 +219,7 @@ impl<T> Runner<T> {
             if handler.is_task() {
                 return machine.leave_to_task(running, *call, caller, self.arguments).err().map(Err);
             }
-            let told = Call {
+            let told = Served {
                 caller,
                 priority: call.priority,
                 deadline: call.deadline,

@@ -5,7 +5,7 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::session::Call as CoreCall;
+use cara_core::services::session::Incoming;
 use cara_core::services::{Context, Ticket};
 use cara_core::time::{Duration, Instant};
 use core::fmt;
@@ -39,7 +39,7 @@ enum Holds {
     /// Its arguments wait for a task.
     Call {
         running: Running,
-        call: CoreCall,
+        call: Incoming,
         caller: Identity,
     },
     /// Its results wait for room on the link.
@@ -98,7 +98,7 @@ impl<T> Machine<T> {
     pub(crate) fn leave_to_task(
         &mut self,
         running: Running,
-        call: CoreCall,
+        call: Incoming,
         caller: Identity,
         arguments: &ParametersView,
     ) -> Result<(), Error> {
@@ -166,7 +166,7 @@ impl<T> Machine<T> {
         &mut self,
         function: &str,
         parameters: &mut ParametersView,
-    ) -> Option<Result<(Running, CoreCall, Identity), Error>> {
+    ) -> Option<Result<(Running, Incoming, Identity), Error>> {
         let wanted = self.functions.find(function);
         if wanted.is_none() {
             return Some(Err(Error::UnknownFunction));

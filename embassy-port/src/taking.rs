@@ -10,7 +10,7 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{Error, ServiceError};
 use cara_core::typed::{TypedCall, Variables, failure};
 
-use crate::handler::Call;
+use crate::handler::Served;
 use crate::taken::TakenCall;
 
 /// As [`TypedCall`], for a function whose method takes the call and returns: `call: &impl LongCall<Left, Blocked, State = Agv>`.
@@ -48,7 +48,7 @@ pub trait LongCall<P: Variables, F: Variables = ()>: TypedCall<P, F> {
     fn take(&self) -> TypedTaken<Self::State, P, F>;
 }
 
-impl<T: 'static, P: Variables, F: Variables> LongCall<P, F> for Call<T> {
+impl<T: 'static, P: Variables, F: Variables> LongCall<P, F> for Served<T> {
     type State = T;
 
     fn take(&self) -> TypedTaken<T, P, F> {

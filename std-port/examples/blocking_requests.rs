@@ -7,7 +7,7 @@ use std::time::Duration;
 use cara_std::control::Control;
 use cara_std::keys::FleetKeys;
 use cara_std::{
-    Call, CommunicationSystem, Fleet, Identity, Interfaces, Parameters, ParametersView, ServiceError, Unit,
+    CommunicationSystem, Fleet, Identity, Interfaces, Parameters, ParametersView, Served, ServiceError, Unit,
 };
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let manager = manager.control(Control::Off).keys(keys.ring(&depot)?).build()?;
     let vehicle = Unit::builder("agv", 7, "depot", 1)?.fleet(fleet).interfaces(Interfaces::Loopback);
     let vehicle = vehicle.keys(keys.ring(&agv)?).build()?;
-    let next = |_: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+    let next = |_: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
         let number: i64 = view.variable("number").map_err(|_| ServiceError::BadResults)?;
         view.set_value("number", number + 1).map_err(|_| ServiceError::BadResults)
     };

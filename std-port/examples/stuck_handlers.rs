@@ -11,7 +11,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Priority, Renew, RequestOptions,
+    CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Priority, Renew, RequestOptions, Served,
     ServiceError, ServiceOptions, Unit,
 };
 
@@ -67,17 +67,17 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn offer(vehicle: &Unit<()>, hook: Sender<Instant>) -> Result<(), Box<dyn Error>> {
-    let stuck = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let stuck = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         loop {
             std::thread::park();
         }
     };
-    let stuck_state = |(): &mut (), _: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let stuck_state = |(): &mut (), _: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         loop {
             std::thread::park();
         }
     };
-    let quick = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let quick = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     let hook = Mutex::new(hook);
     let safe = move || {
         let _ = hook.lock().map(|hook| hook.send(Instant::now()));

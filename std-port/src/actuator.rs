@@ -16,9 +16,9 @@ use crate::safe_hook::SafeHook;
 ///
 /// ```no_run
 /// # use std::{sync::{Arc, atomic::{AtomicBool, Ordering}}, time::Duration};
-/// # use cara_std::{Call, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
-/// # fn drive_to(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> { Ok(()) }
-/// # fn halt(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> { Ok(()) }
+/// # use cara_std::{Served, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
+/// # fn drive_to(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> { Ok(()) }
+/// # fn halt(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> { Ok(()) }
 /// let agv = Unit::new("agv", 7, "depot", 1)?;
 /// let functions = agv.my_function_list();
 /// let power = Arc::new(AtomicBool::new(false));

@@ -296,7 +296,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
         MyFunctionList { engine: self.engine() }
     }
 
-    /// What an order ([`Call::lease`](crate::Call::lease)) has started is finished: it ends, no hook runs, and its caller is told
+    /// What an order ([`Served::lease`](crate::Served::lease)) has started is finished: it ends, no hook runs, and its caller is told
     /// so. `false` for one that has ended before, as when a newer call has replaced it, and for a lease that is of no call.
     pub fn end_order(&self, order: &LeaseWatch) -> bool {
         let Some((word, order)) = order.order() else { return false };

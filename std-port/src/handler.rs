@@ -26,7 +26,7 @@ use crate::lease::{LeaseEnded, LeaseWatch};
 
 /// What a handler is told about the call that it serves.
 #[derive(Clone, Debug)]
-pub struct Call {
+pub struct Served {
     /// The caller.
     pub caller: Identity,
     /// The call's class.
@@ -43,16 +43,16 @@ pub struct Call {
     pub(crate) given_up: Option<Arc<crate::engine::GivenUp>>,
 }
 
-impl Call {
+impl Served {
     /// Does what the call wants to change, unless its order has ended; always for a service without a lease. See
     /// [`LeaseWatch::commit`].
     ///
     /// ```
     /// # use std::sync::atomic::{AtomicI64, Ordering};
-    /// # use cara_std::{Call, ParametersView, ServiceError};
+    /// # use cara_std::{Served, ParametersView, ServiceError};
     /// static TARGET: AtomicI64 = AtomicI64::new(0);
     ///
-    /// fn go_to(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    /// fn go_to(call: &Served, parameters: &mut ParametersView) -> Result<(), ServiceError> {
     ///     let target: i64 = parameters.variable("target")?;
     ///     call.commit(|| TARGET.store(target, Ordering::SeqCst))?;
     ///     Ok(())
@@ -68,8 +68,8 @@ impl Call {
     /// What the handler returns for this failure, whose text and values go to the caller.
     ///
     /// ```
-    /// # use cara_std::{Call, Failure, ParametersView, ServiceError};
-    /// fn go_to(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    /// # use cara_std::{Served, Failure, ParametersView, ServiceError};
+    /// fn go_to(call: &Served, parameters: &mut ParametersView) -> Result<(), ServiceError> {
     ///     Err(call.fail(Failure::new(7, "the way is blocked")))
     /// }
     /// ```
@@ -84,8 +84,8 @@ impl Call {
     /// signature.
     ///
     /// ```
-    /// # use cara_std::{Call, Parameters, ParametersView, ServiceError};
-    /// fn go_to(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    /// # use cara_std::{Served, Parameters, ParametersView, ServiceError};
+    /// fn go_to(call: &Served, parameters: &mut ParametersView) -> Result<(), ServiceError> {
     ///     let mut left = Parameters::new();
     ///     left.add_int("left", 1)?;
     ///     for metres in (0..10).rev() {
@@ -115,14 +115,14 @@ impl Call {
     }
 }
 
-type Free = dyn Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
-type Method<T> = dyn Fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
+type Free = dyn Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
+type Method<T> = dyn Fn(&mut T, &Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 /// The rest of a handler that is a future: its results.
 #[cfg(feature = "async")]
 pub(crate) type Work = Pin<Box<dyn Future<Output = Result<Box<ParametersView>, ServiceError>> + Send>>;
 /// Begins a handler that is a future. The results may lie where its arguments lay.
 #[cfg(feature = "async")]
-pub(crate) type Begin = dyn Fn(Call, Box<ParametersView>) -> Work + Send + Sync;
+pub(crate) type Begin = dyn Fn(Served, Box<ParametersView>) -> Work + Send + Sync;
 /// Makes safe what a service has started.
 pub(crate) type Safe = dyn Fn() + Send + Sync;
 /// Runs after something has ended.
@@ -367,11 +367,11 @@ impl<T> ServiceOptions<T> {
 /// |---|---|
 /// | the paper's, free | `fn(Parameters) -> Parameters` |
 /// | the paper's, method | `fn(&mut T, Parameters) -> Parameters` |
-/// | in place, free | `fn(&Call, &mut ParametersView) -> Result<(), ServiceError>` |
-/// | in place, method | `fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError>` |
+/// | in place, free | `fn(&Served, &mut ParametersView) -> Result<(), ServiceError>` |
+/// | in place, method | `fn(&mut T, &Served, &mut ParametersView) -> Result<(), ServiceError>` |
 /// | the paper's, future | `async fn(Parameters) -> Parameters` |
-/// | future | `async fn(Call, Parameters) -> Result<Parameters, ServiceError>` |
-/// | future of any size | `async fn(Call, Box<ParametersView>) -> Result<Box<ParametersView>, ServiceError>` |
+/// | future | `async fn(Served, Parameters) -> Result<Parameters, ServiceError>` |
+/// | future of any size | `async fn(Served, Box<ParametersView>) -> Result<Box<ParametersView>, ServiceError>` |
 ///
 /// `Parameters` may be of any size (`Parameters<2048>`), or [`GrowingParameters`](crate::GrowingParameters).
 ///
@@ -412,18 +412,18 @@ where
     }
 }
 
-impl<T, F> IntoHandler<T, fn(&Call, &mut ParametersView) -> Result<(), ServiceError>> for F
+impl<T, F> IntoHandler<T, fn(&Served, &mut ParametersView) -> Result<(), ServiceError>> for F
 where
-    F: Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
+    F: Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
 {
     fn into_run(self) -> RunOf<T> {
         RunOf(Run::Free(Arc::new(self)))
     }
 }
 
-impl<T, F> IntoHandler<T, fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError>> for F
+impl<T, F> IntoHandler<T, fn(&mut T, &Served, &mut ParametersView) -> Result<(), ServiceError>> for F
 where
-    F: Fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
+    F: Fn(&mut T, &Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
 {
     fn into_run(self) -> RunOf<T> {
         RunOf(Run::Method(Arc::new(self)))

@@ -17,13 +17,13 @@ use cara_core::typed::{AnyCall, BlockingCaller, Caller, Free, Functions, Interfa
 
 use crate::actuator::Actuator;
 use crate::engine::room;
-use crate::handler::{Call, IntoHandler, ServiceOptions};
+use crate::handler::{IntoHandler, Served, ServiceOptions};
 use crate::heart::Hold;
 use crate::lease::LeaseWatch;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
 
-impl AnyCall for Call {
+impl AnyCall for Served {
     type Order = LeaseWatch;
 
     fn order(&self) -> Option<LeaseWatch> {
@@ -123,7 +123,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 }
 
 impl<T: Send + 'static> Functions<T> for MyFunctionList<'_, T> {
-    type Call = Call;
+    type Call = Served;
     type Actuator = Actuator;
 
     fn add_method(
@@ -131,9 +131,9 @@ impl<T: Send + 'static> Functions<T> for MyFunctionList<'_, T> {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&Actuator>,
-        run: &'static Method<T, Call>,
+        run: &'static Method<T, Served>,
     ) -> Result<(), Error> {
-        let run = move |state: &mut T, call: &Call, parameters: &mut ParametersView| -> Result<(), ServiceError> {
+        let run = move |state: &mut T, call: &Served, parameters: &mut ParametersView| -> Result<(), ServiceError> {
             run(state, call, parameters)
         };
         self.add(signature, attributes, actuator, run)
@@ -144,10 +144,10 @@ impl<T: Send + 'static> Functions<T> for MyFunctionList<'_, T> {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&Actuator>,
-        run: &'static Free<Call>,
+        run: &'static Free<Served>,
     ) -> Result<(), Error> {
         let run =
-            move |call: &Call, parameters: &mut ParametersView| -> Result<(), ServiceError> { run(call, parameters) };
+            move |call: &Served, parameters: &mut ParametersView| -> Result<(), ServiceError> { run(call, parameters) };
         self.add(signature, attributes, actuator, run)
     }
 }

@@ -37,7 +37,7 @@ impl ServiceLease {
 
 /// A lease, to be read from any thread at any time: a few atomic loads and the clock.
 ///
-/// [`Call::lease`](crate::Call::lease) is that of one call: once dead it is dead for ever, whatever call comes next. What
+/// [`Served::lease`](crate::Served::lease) is that of one call: once dead it is dead for ever, whatever call comes next. What
 /// [`add_function`](crate::MyFunctionList::add_function) returns is the service's, for whichever call holds it now: for a
 /// motor's loop, which has to stand still whenever no call moves it.
 #[derive(Clone)]
@@ -154,7 +154,7 @@ impl fmt::Debug for LeaseWatch {
     }
 }
 
-/// The end of a lease; see [`LeaseWatch::ended`] and [`Call::lease_ended`](crate::Call::lease_ended).
+/// The end of a lease; see [`LeaseWatch::ended`] and [`Served::lease_ended`](crate::Served::lease_ended).
 #[derive(Clone, Debug)]
 #[must_use = "it is awaited"]
 pub struct LeaseEnded {

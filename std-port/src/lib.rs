@@ -102,7 +102,7 @@ pub use event::{Finding, UnitEvent};
 pub use explained::Explained;
 pub use growing::{CallParameters, GrowingParameters};
 pub use handle::{Handle, MUnit, SUnit, WeakHandle};
-pub use handler::{Call, IntoHandler, ServiceOptions};
+pub use handler::{IntoHandler, Served, ServiceOptions};
 pub use heart::{Heart, Hold};
 pub use lease::{LeaseEnded, LeaseWatch};
 pub use line_queue::LineQueue;

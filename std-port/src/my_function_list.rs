@@ -58,9 +58,9 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     /// lease, which is dead unless the options ask for one.
     ///
     /// ```no_run
-    /// use cara_std::{Call, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
+    /// use cara_std::{Served, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
     ///
-    /// fn double(_: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    /// fn double(_: &Served, parameters: &mut ParametersView) -> Result<(), ServiceError> {
     ///     let number: i64 = parameters.variable("number")?;
     ///     Ok(parameters.set_value("number", 2 * number)?)
     /// }

@@ -5,7 +5,7 @@ mod keyed;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Interfaces, Parameters, ParametersView, ServiceError};
+use cara_std::{Interfaces, Parameters, ParametersView, Served, ServiceError};
 
 fn count(folder: &str) -> usize {
     std::fs::read_dir(folder).unwrap().count()
@@ -27,7 +27,7 @@ fn live_once(stops: bool) {
     let agv = agv.interfaces(Interfaces::Loopback).build().unwrap();
     let mut number = Parameters::new();
     number.add_int("number", 1).unwrap();
-    let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let echo = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     agv.my_function_list().add_function("echo", &number, echo).unwrap();
     agv.publish_my_function_list().unwrap();
     manager.start().unwrap();

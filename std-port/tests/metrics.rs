@@ -10,7 +10,7 @@ use std::slice;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Call, CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, ServiceError, Unit,
+    CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, Served, ServiceError, Unit,
 };
 
 use keyed::keyed;
@@ -137,7 +137,7 @@ fn every_counter_of_the_api_is_in_the_text_with_its_value() {
         .map(|other| {
             let agv = Unit::builder("agv", other.id(), name, 1).unwrap().interfaces(Interfaces::Loopback);
             let agv = keyed(agv, fleet, other, slice::from_ref(&own)).build().unwrap();
-            let fail = |_: &Call, _: &mut ParametersView| Err(ServiceError::NotReady);
+            let fail = |_: &Served, _: &mut ParametersView| Err(ServiceError::NotReady);
             agv.my_function_list().add_function("fail", &Parameters::new(), fail).unwrap();
             agv.publish_my_function_list().unwrap();
             agv.start().unwrap();

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::keys::{FleetKeys, Store, place};
 use cara_std::{
-    BuildError, Builder, Call, CloseReason, CommunicationSystem, Definition, Fleet, Identity, Interfaces, MUnit,
-    Parameters, ParametersView, Refusal, SUnit, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
+    BuildError, Builder, CloseReason, CommunicationSystem, Definition, Fleet, Identity, Interfaces, MUnit, Parameters,
+    ParametersView, Refusal, SUnit, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -65,12 +65,12 @@ fn started_vehicle(builder: Builder<(), SUnit>) -> Unit {
 }
 
 fn serving(agv: Unit) -> Unit {
-    let double = |_: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+    let double = |_: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
         let number: i64 = view.variable("number").map_err(|_| ServiceError::BadResults)?;
         view.set_value("number", 2 * number).map_err(|_| ServiceError::BadResults)
     };
     agv.my_function_list().add_function("double", &number(0), double).unwrap();
-    let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let echo = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     agv.my_function_list().add_function("echo", &text(""), echo).unwrap();
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();
@@ -293,7 +293,7 @@ fn a_claim_that_is_obeyed_outlives_a_change_of_keys() {
         let agv = vehicle(fleet, 7).key_file(store.file_of(&agv(7))).state_folder(&board).build().unwrap();
         agv.renew_keys_every(cara_std::Duration::from_secs(1));
         let drive = agv.my_function_list().actuator(|| ()).unwrap();
-        let go = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let go = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let options = ServiceOptions::new().moves(&drive, Duration::from_secs(1));
         agv.my_function_list().add_service(&Definition::parse("go()").unwrap(), options, go).unwrap();
         serving(agv)

@@ -4,7 +4,7 @@ mod keyed;
 
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, CommunicationSystem, Error, Interfaces, Parameters, ParametersView, ServiceError, Unit};
+use cara_std::{CommunicationSystem, Error, Interfaces, Parameters, ParametersView, Served, ServiceError, Unit};
 
 /// A fleet of its own, so that tests on one machine do not meet.
 fn fleet() -> u32 {
@@ -27,13 +27,13 @@ fn pair() -> (CommunicationSystem, Unit<[i64; 2]>) {
     let agv = agv.interfaces(Interfaces::Loopback).state([3_i64, 4]).build().unwrap();
     let mut position = Parameters::new();
     position.add_int("position", 2).unwrap();
-    let pos_info = |state: &mut [i64; 2], _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+    let pos_info = |state: &mut [i64; 2], _: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
         view.set_value("position", *state).map_err(|_| ServiceError::BadResults)
     };
     agv.my_function_list().add_function("pos_info", &position, pos_info).unwrap();
     let mut text = Parameters::<40_000>::sized();
     text.add_string("text", 20_000).unwrap();
-    let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let echo = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     agv.my_function_list().add_function("echo", &text, echo).unwrap();
     agv.publish_my_function_list().unwrap();
     (manager, agv)
@@ -75,7 +75,7 @@ fn a_handler_that_holds_a_weak_handle_does_not_keep_the_unit() {
     let alive = std::sync::Arc::new(());
     let (weak, held) = (agv.downgrade(), alive.clone());
     let definition = "call_home()".parse().unwrap();
-    let call_home = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let call_home = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         let _ = (&held, weak.upgrade());
         Ok(())
     };
@@ -92,7 +92,7 @@ fn a_handler_that_holds_a_weak_handle_does_not_keep_the_unit() {
 fn a_function_that_could_not_be_served_is_refused_when_it_is_added() {
     let (manager, _) = pair();
     let definition = "log(text: string[1000000])".parse().unwrap();
-    let log = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let log = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     let added = manager.my_function_list().add_service(&definition, cara_std::ServiceOptions::new(), log);
     assert!(matches!(added, Err(Error::TooLarge { .. })), "{added:?}");
     assert!(manager.my_function_list().is_empty());

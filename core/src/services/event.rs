@@ -141,7 +141,7 @@ impl<F, N, E> UnitEvent<F, N, E> {
             }
             Event::Acknowledged { skipped: 0, .. }
             | Event::Answered
-            | Event::Call(_)
+            | Event::Incoming(_)
             | Event::Reply(..)
             | Event::Actuator { .. } => {
                 return None;

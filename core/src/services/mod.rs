@@ -24,7 +24,7 @@
 //! | event | what the port does |
 //! |---|---|
 //! | [`LeaseExpired`](session::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
-//! | [`Call`](session::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
+//! | [`Incoming`](session::Event::Incoming) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
 //! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
 //! | `Sample`, `Subscribed` (feature `streams`) | keeps the value, which `session.results` shows, or what became of a subscription. It says `session.subscribe` again with each [`ListChanged`](session::Event::ListChanged), and `session.stream_changed`, then `session.poll`, for each value that the unit publishes |
 //! | [`Joined`](session::Event::Joined) | the peer is taken, and is being told what is published to it; from here on it is `session.peer()` |
@@ -105,7 +105,7 @@
 //!             match event {
 //!                 None if consumed == 0 => return worked,
 //!                 None | Some(Event::Joined | Event::ListChanged | Event::Acknowledged { .. }) => {}
-//!                 Some(Event::Call(call)) => {
+//!                 Some(Event::Incoming(call)) => {
 //!                     let n: i64 = arguments.variable("n").expect("the request was checked");
 //!                     arguments.clear();
 //!                     arguments.add_int("twice", 1).expect("there is room");

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use cara_apps::agv::STOP;
 use cara_processes::{Process, random_fleet, skip};
-use cara_std::{Call, Definition, Identity, Interfaces, LinkCounter, ParametersView, Priority, ServiceOptions, Unit};
+use cara_std::{Definition, Identity, Interfaces, LinkCounter, ParametersView, Priority, Served, ServiceOptions, Unit};
 use cara_test_keys::KeyFolder;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -98,11 +98,11 @@ fn a_manager_written_from_the_document_follows_new_keys() {
     let agv = agv.key_file(file).build().unwrap();
     agv.renew_keys_every(Duration::from_secs(1).into());
     let options = ServiceOptions::new().priority(Priority::Emergency);
-    let stop = |_: &Call, _: &mut ParametersView| Ok(());
+    let stop = |_: &Served, _: &mut ParametersView| Ok(());
     agv.my_function_list().add_service(&Definition::parse(STOP).unwrap(), options, stop).unwrap();
     let (safe, released) = channel();
     let options = ServiceOptions::new().lease(3 * PATIENCE, move || safe.send(()).unwrap());
-    let hold = |_: &Call, _: &mut ParametersView| Ok(());
+    let hold = |_: &Served, _: &mut ParametersView| Ok(());
     agv.my_function_list().add_service(&Definition::parse("hold()").unwrap(), options, hold).unwrap();
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();

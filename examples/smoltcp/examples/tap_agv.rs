@@ -19,9 +19,9 @@ use cara_core::distribution::identity::Fleet;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
 use cara_core::services::lease::{Lease, Order};
-use cara_core::services::session::{Call, Event};
+use cara_core::services::session::{Event, Incoming};
 use cara_core::time::{Duration, Instant};
-use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
+use cara_smoltcp::{Outcome, Program, Resources, SUnit, Settings};
 use clap::Parser;
 use smoltcp::phy::{Medium, TunTapInterface, wait};
 
@@ -62,8 +62,8 @@ struct Vehicle {
 }
 
 impl Program for Vehicle {
-    fn serve(&mut self, call: &Call, parameters: &mut ParametersView) -> Served {
-        Served::Now(self.outcome(call, parameters))
+    fn serve(&mut self, call: &Incoming, parameters: &mut ParametersView) -> Outcome {
+        Outcome::Now(self.outcome(call, parameters))
     }
 
     fn make_safe(&mut self, _: Slot) {
@@ -78,7 +78,7 @@ impl Program for Vehicle {
 }
 
 impl Vehicle {
-    fn outcome(&mut self, call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    fn outcome(&mut self, call: &Incoming, parameters: &mut ParametersView) -> Result<(), ServiceError> {
         let function = call.slot;
         if function == self.pos_info {
             self.agv.pos_info(parameters)

@@ -12,15 +12,15 @@
 //! use cara_core::distribution::hello::Manager;
 //! use cara_core::distribution::parameters::ParametersView;
 //! use cara_core::error::ServiceError;
-//! use cara_core::services::session::Call;
+//! use cara_core::services::session::Incoming;
 //! use cara_core::time::Instant;
-//! use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
+//! use cara_smoltcp::{Program, Resources, SUnit, Outcome, Settings};
 //!
 //! struct Agv([i64; 2]);
 //!
 //! impl Program for Agv {
-//!     fn serve(&mut self, _: &Call, position: &mut ParametersView) -> Served {
-//!         Served::Now(position.set_value("position", self.0).map_err(|_| ServiceError::BadResults))
+//!     fn serve(&mut self, _: &Incoming, position: &mut ParametersView) -> Outcome {
+//!         Outcome::Now(position.set_value("position", self.0).map_err(|_| ServiceError::BadResults))
 //!     }
 //!     fn make_safe(&mut self, _: Slot) {}
 //! }
@@ -49,7 +49,7 @@ mod settings;
 mod stack;
 mod unit;
 
-pub use program::{Program, Served};
+pub use program::{Outcome, Program};
 pub use resources::Resources;
 pub use settings::Settings;
 pub use unit::SUnit;

@@ -10,11 +10,11 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Plain;
-use cara_core::services::session::{Call, Event, Session, SessionConfig};
+use cara_core::services::session::{Event, Incoming, Session, SessionConfig};
 use cara_core::services::{Context, Ticket};
 use cara_core::time::Instant;
 
-use crate::program::{Program, Served};
+use crate::program::{Outcome, Program};
 use crate::stack::Stream;
 use crate::unit::{SUnit, context};
 
@@ -126,7 +126,7 @@ impl SUnit {
     }
 
     /// While results wait for room there is no place for those of a further call: only emergencies are served.
-    fn next_call(&mut self, now: Instant) -> Option<Call> {
+    fn next_call(&mut self, now: Instant) -> Option<Incoming> {
         let session = self.session.as_mut()?;
         let arguments = self.arguments.as_mut_view();
         match self.unanswered {
@@ -139,7 +139,7 @@ impl SUnit {
     fn happened<P: Program>(&mut self, now: Instant, event: Event, lent: &[u8], program: &mut P) {
         match event {
             Event::LeaseExpired(function) => program.make_safe(function),
-            Event::Call(call) => self.serve(now, &call, program),
+            Event::Incoming(call) => self.serve(now, &call, program),
             Event::Reply(id, outcome) => {
                 let Some(session) = &self.session else { return };
                 program.replied(id, outcome.and_then(|results| session.results(&results, lent)));
@@ -156,8 +156,8 @@ impl SUnit {
         }
     }
 
-    fn serve<P: Program>(&mut self, now: Instant, call: &Call, program: &mut P) {
-        if let Served::Now(outcome) = program.serve(call, self.arguments.as_mut_view()) {
+    fn serve<P: Program>(&mut self, now: Instant, call: &Incoming, program: &mut P) {
+        if let Outcome::Now(outcome) = program.serve(call, self.arguments.as_mut_view()) {
             self.answer_served(now, call.ticket, outcome.map_err(Error::Service));
         }
     }

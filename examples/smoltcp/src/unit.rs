@@ -150,7 +150,7 @@ impl SUnit {
         session.request(context!(self, now), function, parameters, options, wants_reply)
     }
 
-    /// Answers a call that the program serves [later](crate::Served::Later). [`Error::Full`]: try again after a poll.
+    /// Answers a call that the program serves [later](crate::Outcome::Later). [`Error::Full`]: try again after a poll.
     pub fn answer(
         &mut self,
         now: Instant,
@@ -161,7 +161,7 @@ impl SUnit {
         session.answer(context!(self, now), ticket, results.map_err(Error::Service))
     }
 
-    /// What an order of this lease ([`Call::order`](cara_core::services::session::Call::order)) has started is finished: it ends,
+    /// What an order of this lease ([`Served::order`](cara_core::services::session::Incoming::order)) has started is finished: it ends,
     /// and nothing is made safe. `false` for one that has ended before.
     pub fn end_order(&mut self, now: Instant, lease: &'static Lease, order: Order) -> bool {
         let Some(session) = &mut self.session else { return false };

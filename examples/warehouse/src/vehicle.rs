@@ -9,7 +9,7 @@ use cara_apps::warehouse::{
     TransportServer,
 };
 use cara_std::{
-    Actuator, AnyCall, Call, Definition, Error, LeaseWatch, LinkCounter, ParametersView, Priority, Publisher,
+    Actuator, AnyCall, Definition, Error, LeaseWatch, LinkCounter, ParametersView, Priority, Publisher, Served,
     ServiceError, ServiceOptions, Threads, Unit,
 };
 
@@ -122,7 +122,7 @@ impl Running {
         functions.serve(TransportServer { drive: drive.clone() })?;
         let stopped = vehicle.clone();
         // The order has ended before this runs.
-        let stop = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let stop = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             stopped.lock().agv.motor.stop(now());
             Ok(())
         };

@@ -18,7 +18,7 @@
 //! | an event | [`Handle::events_async`], [`EventStream::next`] | no event is lost |
 //! | a value of a stream of a node | [`TheirStream::subscribe_async`], [`SampleStream::next`] | no value is lost; dropping the stream ends the subscription |
 //! | the application's state | [`Handle::with_state_async`] | the turn is given up |
-//! | the end of a lease | [`LeaseWatch::ended`], [`Call::lease_ended`] | nothing |
+//! | the end of a lease | [`LeaseWatch::ended`], [`Served::lease_ended`] | nothing |
 //! | the start and the end of the unit | [`Handle::start_async`], [`Handle::stop_async`] | it starts, or stops, all the same |
 //!
 //! What does not wait has no form of its own: [`Peer::request`], [`Peer::release`], [`Peer::flush`] and everything that
@@ -83,7 +83,7 @@
 //! need the state are refused with [`Error::WouldDeadlock`] meanwhile, as around a
 //! [`block_request`]. An `async` service holds no state while it waits, so that its peer may call back.
 //!
-//! [`Call::lease_ended`]: crate::Call::lease_ended
+//! [`Served::lease_ended`]: crate::Served::lease_ended
 //! [`CommunicationSystem::publish_and_wait_async`]: crate::CommunicationSystem::publish_and_wait_async
 //! [`CommunicationSystem::request_all_async`]: crate::CommunicationSystem::request_all_async
 //! [`CommunicationSystem::wait_for_s_unit_async`]: crate::CommunicationSystem::wait_for_s_unit_async

@@ -16,7 +16,7 @@ use crate::actuator::Actuator;
 use crate::engine::{Engine, GivenUp, Spawned};
 use crate::growing::HandlerParameters;
 use crate::handle::Handle;
-use crate::handler::{Call, IntoHandler, Run, RunOf, ServiceOptions};
+use crate::handler::{IntoHandler, Run, RunOf, Served, ServiceOptions};
 use crate::my_function_list::MyFunctionList;
 
 impl<T: Send + 'static, R> Handle<T, R> {
@@ -45,7 +45,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 }
 
 impl<T> ServiceOptions<T> {
-    /// A handler that is a future is not dropped when its call is given up, but told by [`Call::given_up`]: for one that has to
+    /// A handler that is a future is not dropped when its call is given up, but told by [`Served::given_up`]: for one that has to
     /// end in order. What it returns then has no caller.
     pub const fn runs_to_its_end(mut self) -> Self {
         self.to_its_end = true;
@@ -53,7 +53,7 @@ impl<T> ServiceOptions<T> {
     }
 }
 
-impl Call {
+impl Served {
     /// Ends when nothing wants the call any more: its caller waits no longer, its link has ended, or its order has. For a
     /// handler that is a future and [runs to its end](ServiceOptions::runs_to_its_end); any other such handler is dropped
     /// then. Of a call whose handler is no future it never ends. Dropping it loses nothing.
@@ -62,7 +62,7 @@ impl Call {
     }
 }
 
-/// The end of what a call is wanted for; see [`Call::given_up`].
+/// The end of what a call is wanted for; see [`Served::given_up`].
 #[derive(Clone, Debug)]
 #[must_use = "it is awaited"]
 pub struct CallGivenUp(Option<Arc<GivenUp>>);
@@ -78,7 +78,7 @@ impl Future for CallGivenUp {
 /// Lends an `async fn` of an interface the unit's state. It does not keep the unit running.
 pub struct StateOfTasks<T: Send + 'static> {
     engine: Weak<Engine<T>>,
-    call: Call,
+    call: Served,
 }
 
 impl<T: Send + 'static> fmt::Debug for StateOfTasks<T> {
@@ -107,13 +107,13 @@ impl<T: Send + 'static> AsyncFunctions<T> for MyFunctionList<'_, T> {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&Actuator>,
-        run: fn(Call, StateOfTasks<T>, Box<ParametersView>) -> W,
+        run: fn(Served, StateOfTasks<T>, Box<ParametersView>) -> W,
     ) -> Result<(), Error>
     where
         W: Future<Output = Result<Box<ParametersView>, ServiceError>> + Send + 'static,
     {
         let engine = Arc::downgrade(self.engine);
-        let run = move |call: Call, room: Box<ParametersView>| {
+        let run = move |call: Served, room: Box<ParametersView>| {
             let state = StateOfTasks { engine: engine.clone(), call: call.clone() };
             run(call, state, room)
         };
@@ -144,9 +144,9 @@ where
     }
 }
 
-impl<T, F, W, P: HandlerParameters> IntoHandler<T, Awaited<fn(Call, P) -> W>> for F
+impl<T, F, W, P: HandlerParameters> IntoHandler<T, Awaited<fn(Served, P) -> W>> for F
 where
-    F: Fn(Call, P) -> W + Send + Sync + 'static,
+    F: Fn(Served, P) -> W + Send + Sync + 'static,
     W: Future<Output = Result<P, ServiceError>> + Send + 'static,
 {
     fn into_run(self) -> RunOf<T> {
@@ -154,9 +154,9 @@ where
     }
 }
 
-impl<T, F, W> IntoHandler<T, Awaited<fn(Call, Box<ParametersView>) -> W>> for F
+impl<T, F, W> IntoHandler<T, Awaited<fn(Served, Box<ParametersView>) -> W>> for F
 where
-    F: Fn(Call, Box<ParametersView>) -> W + Send + Sync + 'static,
+    F: Fn(Served, Box<ParametersView>) -> W + Send + Sync + 'static,
     W: Future<Output = Result<Box<ParametersView>, ServiceError>> + Send + 'static,
 {
     fn into_run(self) -> RunOf<T> {
@@ -164,7 +164,7 @@ where
     }
 }
 
-fn by_value<T, W, P: HandlerParameters>(service: impl Fn(Call, P) -> W + Send + Sync + 'static) -> RunOf<T>
+fn by_value<T, W, P: HandlerParameters>(service: impl Fn(Served, P) -> W + Send + Sync + 'static) -> RunOf<T>
 where
     W: Future<Output = Result<P, ServiceError>> + Send + 'static,
 {

@@ -352,14 +352,14 @@ impl<T: Send + 'static> Drop for PendingCall<T> {
 
 /// Calls of one function on many links, all at the same time. Dropped, those that have not ended are given up.
 pub(crate) struct CallsToAll<T: Send + 'static> {
-    calls: Vec<Call<T>>,
+    calls: Vec<Member<T>>,
     /// Those before this one have ended.
     front: usize,
     unsent: usize,
     alarm: Alarm<T>,
 }
 
-enum Call<T: Send + 'static> {
+enum Member<T: Send + 'static> {
     Goes(PendingCall<T>),
     Ended(Result<(), Error>),
 }
@@ -373,8 +373,8 @@ impl<T: Send + 'static> CallsToAll<T> {
         options: &RequestOptions,
     ) -> Self {
         let call = |link: Result<_, _>| match link {
-            Ok(link) => Call::Goes(PendingCall::new(engine, link, function, options)),
-            Err(error) => Call::Ended(Err(error)),
+            Ok(link) => Member::Goes(PendingCall::new(engine, link, function, options)),
+            Err(error) => Member::Ended(Err(error)),
         };
         let calls: Vec<_> = links.into_iter().map(call).collect();
         Self { unsent: calls.len(), calls, front: 0, alarm: Alarm::new(engine.clone()) }
@@ -385,9 +385,9 @@ impl<T: Send + 'static> CallsToAll<T> {
         self.send_unsent(cx, parameters);
         // A reply that comes out of turn stays at its link, and wakes no task: the work is that of one look for each call.
         while let Some((call, parameters)) = self.calls.get_mut(self.front).zip(parameters.get_mut(self.front)) {
-            if let Call::Goes(pending) = call {
+            if let Member::Goes(pending) = call {
                 match pending.poll(cx, parameters.view_mut()) {
-                    Step::Over(result) => *call = Call::Ended(result),
+                    Step::Over(result) => *call = Member::Ended(result),
                     Step::InFlight | Step::Again(_) => return Poll::Pending,
                 }
             }
@@ -403,12 +403,12 @@ impl<T: Send + 'static> CallsToAll<T> {
         self.unsent = 0;
         let mut again = Instant::FAR_FUTURE;
         for (call, parameters) in self.calls.iter_mut().zip(parameters) {
-            let Call::Goes(pending) = call else { continue };
+            let Member::Goes(pending) = call else { continue };
             if pending.is_sent() {
                 continue;
             }
             match pending.advance_after(cx, parameters.view_mut(), SHORT_PAUSE) {
-                Step::Over(result) => *call = Call::Ended(result),
+                Step::Over(result) => *call = Member::Ended(result),
                 Step::InFlight => {}
                 Step::Again(at) => {
                     self.unsent += 1;
@@ -424,8 +424,8 @@ impl<T: Send + 'static> CallsToAll<T> {
     /// How each has ended; those that have not are given up.
     pub(crate) fn into_outcomes(self) -> impl Iterator<Item = Result<(), Error>> {
         self.calls.into_iter().map(|call| match call {
-            Call::Ended(outcome) => outcome,
-            Call::Goes(_) => Err(Error::TimedOut),
+            Member::Ended(outcome) => outcome,
+            Member::Goes(_) => Err(Error::TimedOut),
         })
     }
 }

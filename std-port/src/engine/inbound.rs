@@ -115,7 +115,7 @@ impl<T: Send + 'static> Engine<T> {
         match receipt.event {
             None => {}
             Some(Event::Joined) => step.joined = true,
-            Some(Event::Call(call)) => {
+            Some(Event::Incoming(call)) => {
                 let begun = self.begun(&functions, link, call);
                 match arguments.filter(|_| serving::is_emergency(&call)) {
                     None => step.call = Some(begun),

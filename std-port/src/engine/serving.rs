@@ -7,7 +7,7 @@ use cara_core::config::Priority;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::session::Call;
+use cara_core::services::session::Incoming;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
@@ -26,7 +26,7 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// A call that has begun.
 #[derive(Clone, Copy)]
 pub(super) struct Begun {
-    pub(super) call: Call,
+    pub(super) call: Incoming,
     /// Its turn, where it takes the application's state.
     turn: Option<Turn>,
 }
@@ -34,7 +34,7 @@ pub(super) struct Begun {
 /// A call whose turn has not come yet, with its arguments.
 pub(crate) struct Parked {
     link: Arc<LinkCell>,
-    call: Call,
+    call: Incoming,
     arguments: Box<ParametersView>,
 }
 
@@ -44,12 +44,12 @@ enum Ran {
     NotYet(Turn),
     /// It is to be begun as a task.
     #[cfg(feature = "async")]
-    Apart(Box<handler::Call>, Arc<handler::Begin>, bool),
+    Apart(Box<handler::Served>, Arc<handler::Begin>, bool),
 }
 
 impl<T: Send + 'static> Engine<T> {
     /// A call has begun, under its link's lock: it takes its turn.
-    pub(super) fn begun(&self, functions: &FunctionList<Boxed, Handler<T>>, link: &LinkCell, call: Call) -> Begun {
+    pub(super) fn begun(&self, functions: &FunctionList<Boxed, Handler<T>>, link: &LinkCell, call: Incoming) -> Begun {
         let takes_state = functions.function(call.slot).is_some_and(|function| function.handler.run.takes_state());
         Begun { call, turn: takes_state.then(|| self.services.state.take_turn(Some(link.id))) }
     }
@@ -244,7 +244,7 @@ impl<T: Send + 'static> Engine<T> {
             #[cfg(feature = "async")]
             Run::Task(begin) => {
                 self.give_up(turn);
-                let told = handler::Call { given_up: Some(Arc::default()), ..told };
+                let told = handler::Served { given_up: Some(Arc::default()), ..told };
                 let to_its_end =
                     self.functions().function(call.slot).is_some_and(|function| function.handler.to_its_end);
                 Ran::Apart(Box::new(told), begin, to_its_end)
@@ -253,7 +253,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// How a call is run, and what its handler is told.
-    fn prepare(&self, link: &Arc<LinkCell>, call: &Call) -> Result<(Run<T>, handler::Call), Error> {
+    fn prepare(&self, link: &Arc<LinkCell>, call: &Incoming) -> Result<(Run<T>, handler::Served), Error> {
         let peer = link.peer.get().ok_or(Error::NotConnected)?;
         let (run, actuator) = {
             let functions = self.functions();
@@ -270,7 +270,7 @@ impl<T: Send + 'static> Engine<T> {
             // An earlier call has given way.
             actuator.lease.wake();
         }
-        let told = handler::Call {
+        let told = handler::Served {
             caller: peer.identity.clone(),
             priority: call.priority,
             deadline: call.deadline,
@@ -289,7 +289,7 @@ impl<T: Send + 'static> Engine<T> {
         mut now: Instant,
         link: &'l Arc<LinkCell>,
         mut state: Locked<'l, LinkState>,
-        call: &Call,
+        call: &Incoming,
         result: Result<(), Error>,
         results: &ParametersView,
     ) -> Locked<'l, LinkState> {
@@ -325,7 +325,7 @@ impl<T: Send + 'static> Engine<T> {
 }
 
 /// Runs a handler, which may panic. Not for an order that ended while its call waited for a thread or for its turn.
-pub(super) fn guarded(told: &handler::Call, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
+pub(super) fn guarded(told: &handler::Served, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
     if told.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
         return Err(Error::Expired);
     }
@@ -339,6 +339,6 @@ pub(super) fn guarded(told: &handler::Call, run: impl FnOnce() -> Result<(), Ser
 }
 
 /// Whether an emergency is to be given to another thread than the one that read it.
-pub(super) fn is_emergency(call: &Call) -> bool {
+pub(super) fn is_emergency(call: &Incoming) -> bool {
     call.priority == Priority::Emergency
 }

@@ -11,7 +11,7 @@ use std::task::{Context, Poll, Wake, Waker};
 use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::session::Call;
+use cara_core::services::session::Incoming;
 
 use super::Engine;
 use super::alarms::Alarm;
@@ -66,8 +66,8 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn begin_task(
         &self,
         link: &Arc<LinkCell>,
-        call: Call,
-        told: handler::Call,
+        call: Incoming,
+        told: handler::Served,
         (begin, to_its_end): (&Begin, bool),
         arguments: Box<ParametersView>,
     ) {
@@ -110,7 +110,7 @@ impl<T: Send + 'static> Engine<T> {
 struct Task<T: Send + 'static> {
     engine: Arc<Engine<T>>,
     link: Arc<LinkCell>,
-    call: Call,
+    call: Incoming,
     /// The handler, while it runs.
     work: Option<Work>,
     /// What is answered once it does not.

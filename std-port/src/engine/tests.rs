@@ -27,7 +27,7 @@ use crate::sys::datagram::Socket;
 use crate::sys::epoll::wait_readable;
 use crate::testing::{Pair, fleet, until};
 use crate::threads::Driven;
-use crate::{Call, Interfaces, Parameters, ServiceError, ServiceOptions, Unit, UnitEvent};
+use crate::{Interfaces, Parameters, Served, ServiceError, ServiceOptions, Unit, UnitEvent};
 
 /// Too long for the buffer that a link has of its own.
 const LONG: usize = 16_000;
@@ -61,7 +61,7 @@ fn a_full_socket_is_watched_for_room_each_time() {
     let constraints = Constraints { keep_alive: LONGEST_KEEP_ALIVE, request_timeout: PATIENT, ..Constraints::M_UNIT };
     let taken = Arc::new(AtomicUsize::new(0));
     let counted = taken.clone();
-    let take = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let take = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         counted.fetch_add(1, Ordering::SeqCst);
         Ok(())
     };
@@ -93,7 +93,7 @@ fn a_full_socket_is_watched_for_room_each_time() {
 #[test]
 fn what_a_link_has_counted_counts_once_when_it_ends() {
     let pair = Pair::new(Constraints::M_UNIT, |agv| {
-        let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let echo = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         agv.my_function_list().add_function("take", &text(1), echo).unwrap();
     });
     for _ in 0..3 {
@@ -147,7 +147,7 @@ fn a_proven_link_gives_way_to_none() {
 /// The caller has given up, and no buffer comes free for the answer: the call ends, and its thread with it.
 #[test]
 fn an_answer_that_cannot_be_kept_is_dropped_with_its_deadline() {
-    let fill = |_: &Call, results: &mut ParametersView| -> Result<(), ServiceError> {
+    let fill = |_: &Served, results: &mut ParametersView| -> Result<(), ServiceError> {
         results.set_value("text", "x".repeat(LONG).as_str()).map_err(|_| ServiceError::BadResults)
     };
     let pair = Pair::new(Constraints::M_UNIT, |agv| {
@@ -170,7 +170,7 @@ fn an_answer_that_cannot_be_kept_is_dropped_with_its_deadline() {
 fn no_handler_runs_for_an_order_that_has_ended() {
     let (tell, told) = channel();
     let tell = Mutex::new(tell);
-    let go = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let go = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         lock(&tell).send(call.clone()).unwrap();
         Ok(())
     };
@@ -217,7 +217,7 @@ fn the_deadline_of_a_call_is_that_of_its_first_try() {
     const TIMEOUT: Duration = Duration::from_secs(30);
     let (tell, told) = channel();
     let tell = Mutex::new(tell);
-    let take = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let take = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         lock(&tell).send(call.deadline).unwrap();
         Ok(())
     };
@@ -251,7 +251,7 @@ fn the_deadline_of_a_call_is_that_of_its_first_try() {
 fn nothing_is_left_of_a_call_that_has_timed_out() {
     let (open, gate) = channel::<()>();
     let gate = Mutex::new(gate);
-    let wait = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let wait = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         let _ = lock(&gate).recv();
         Ok(())
     };

@@ -145,7 +145,7 @@ fn searching_and_publishing_are_done() {
     let mut client = depot.client();
     assert_eq!(ask(&mut client, Question::Search).unwrap(), []);
     let nothing =
-        |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
+        |_: &cara_std::Served, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
     let add = |name: &str| {
         let definition = format!("{name}()").parse().unwrap();
         depot.system.my_function_list().add_service(&definition, Default::default(), nothing).unwrap();

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use cara_std::control::Control;
 use cara_std::control::protocol::{Answer, Question};
 use cara_std::{
-    Call, Error, Parameters, ParametersView, Peer, Renew, RequestOptions, ServiceError, ServiceOptions, Unit,
+    Error, Parameters, ParametersView, Peer, Renew, RequestOptions, Served, ServiceError, ServiceOptions, Unit,
 };
 use serde_json::Value;
 
@@ -29,7 +29,7 @@ impl Audited {
             builder.audit(directory.join("audit")).unwrap()
         });
         let agv = depot.agv("agv", 7);
-        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let wheels = agv.my_function_list().actuator(|| {}).unwrap();
         let services = [
             ("drive()", ServiceOptions::new().moves(&wheels, LEASE)),

@@ -3,7 +3,7 @@
 use cara_std::control::Control;
 use cara_std::control::protocol::{Answer, Question};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, ServiceError, ServiceOptions,
+    Builder, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, Served, ServiceError, ServiceOptions,
 };
 
 use crate::keyed::keyed;
@@ -24,7 +24,7 @@ fn a_stop_of_all_reaches_those_that_are_on_no_roster() {
         m_unit(&manager, &doors, fleet).control(Control::Path(directory.join("manager.sock")))
     });
     let unit = m_unit(&doors, &manager, depot.fleet).build().unwrap();
-    let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     let wing = unit.my_function_list().actuator(|| {}).unwrap();
     let services =
         [("open()", ServiceOptions::new().moves(&wing, LEASE)), ("halt()", ServiceOptions::new().stops(&wing))];

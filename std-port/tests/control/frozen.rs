@@ -27,7 +27,7 @@ fn as_child() {
     let fleet = std::env::var(FLEET).expect("the fleet").parse().unwrap();
     let agv = vehicle("agv", 7, fleet).build().unwrap();
     let nothing =
-        |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
+        |_: &cara_std::Served, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
     agv.my_function_list().add_service(&"nothing()".parse().unwrap(), Default::default(), nothing).unwrap();
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use cara_std::control::execute_while;
 use cara_std::control::protocol::{Answer, Question};
-use cara_std::{Call, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{LeaseWatch, ParametersView, Served, ServiceError, ServiceOptions, Unit};
 
 use crate::support::{Depot, call, until};
 
@@ -29,7 +29,7 @@ impl Creeping {
         let safe = move || {
             counted.fetch_add(1, Ordering::SeqCst);
         };
-        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let options = ServiceOptions::new().lease(LEASE, safe);
         let lease = agv.my_function_list().add_service(&"creep()".parse().unwrap(), options, nothing).unwrap();
         agv.publish_my_function_list().unwrap();

@@ -83,7 +83,7 @@ fn the_operator_takes_over_only_where_a_rule_says_so() {
 fn no_rate_holds_off_a_stop_of_the_operator() {
     let (depot, agv) = Depot::with_agv();
     let nothing =
-        |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
+        |_: &cara_std::Served, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
     let stops = cara_std::ServiceOptions::new().stops_all().priority(cara_std::Priority::Emergency);
     agv.my_function_list().add_service(&"halt()".parse().unwrap(), stops, nothing).unwrap();
     agv.publish_my_function_list().unwrap();
@@ -105,7 +105,7 @@ fn publishing_is_a_permission_too() {
     let depot = Depot::new();
     let list = depot.system.my_function_list();
     let nothing =
-        |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
+        |_: &cara_std::Served, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
     list.add_service(&"report()".parse().unwrap(), cara_std::ServiceOptions::new(), nothing).unwrap();
     let publish = || Question::Publish { node: None, timeout_ms: 1_000 };
     depot.system.set_access(Some(rules(&["report"], Verbs::CALL).into()));

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use cara_std::control::protocol::{Answer, CallQuestion, Failure, Question};
 use cara_std::{
-    Call, Error, Parameters, ParametersView, Peer, Renew, RequestOptions, ServiceError, ServiceOptions, UnitEvent,
+    Error, Parameters, ParametersView, Peer, Renew, RequestOptions, Served, ServiceError, ServiceOptions, UnitEvent,
 };
 
 use crate::support::{Depot, ask, call, until};
@@ -36,7 +36,7 @@ fn an_operator_and_the_program_of_one_manager_hold_a_vehicle_for_themselves() {
     let safe = move || {
         counted.fetch_add(1, Ordering::SeqCst);
     };
-    let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     let options = ServiceOptions::new().lease(LEASE, safe);
     let lease = agv.my_function_list().add_service(&"drive()".parse().unwrap(), options, nothing).unwrap();
     agv.publish_my_function_list().unwrap();
@@ -82,7 +82,7 @@ fn an_operator_and_the_program_of_one_manager_hold_a_vehicle_for_themselves() {
 #[test]
 fn what_the_program_asks_of_its_own_call_is_not_an_operators() {
     let (depot, agv) = Depot::with_agv();
-    let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     let options = ServiceOptions::new().lease(LEASE, || {});
     agv.my_function_list().add_service(&"drive()".parse().unwrap(), options, nothing).unwrap();
     agv.publish_my_function_list().unwrap();

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use cara_std::control::protocol::{Answer, Argument, ArgumentValue, CallQuestion, Failure, Question};
 use cara_std::control::{Client, Control, ControlError};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, Priority, SUnit, ServiceError,
+    Builder, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, Priority, SUnit, Served, ServiceError,
     ServiceOptions, Unit,
 };
 use tempfile::TempDir;
@@ -101,10 +101,10 @@ impl Depot {
     pub(crate) fn agv(&self, name: &str, id: u32) -> Unit {
         let agv = vehicle(name, id, self.fleet).build().unwrap();
         let list = agv.my_function_list();
-        let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
-        let fail = |_: &Call, _: &mut ParametersView| Err(ServiceError::Failed(4));
+        let echo = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let fail = |_: &Served, _: &mut ParametersView| Err(ServiceError::Failed(4));
         let gate = self.gate.clone();
-        let slow = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let slow = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             gate.pass();
             Ok(())
         };

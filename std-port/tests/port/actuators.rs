@@ -5,8 +5,8 @@ use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex};
 
 use cara_std::{
-    Actuator, Call, CommunicationSystem, Definition, Error, Latch, Parameters, ParametersView, Peer, Priority, Renew,
-    RequestOptions, ServiceError, ServiceOptions, Stage, UnitEvent,
+    Actuator, CommunicationSystem, Definition, Error, Latch, Parameters, ParametersView, Peer, Priority, Renew,
+    RequestOptions, Served, ServiceError, ServiceOptions, Stage, UnitEvent,
 };
 
 use crate::support::{fleet, system, system_named, until};
@@ -39,9 +39,9 @@ impl Crane {
                 counted.fetch_add(1, Ordering::SeqCst);
             })
             .unwrap();
-        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let (watch, moved) = (drive.watch(), moved_in_halt.clone());
-        let halt = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let halt = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             moved.fetch_or(watch.is_live(), Ordering::SeqCst);
             Ok(())
         };
@@ -51,7 +51,7 @@ impl Crane {
         functions.add_service(&define("dock()"), moves(), nothing).unwrap();
         let committed = Arc::new(Mutex::new(Vec::new()));
         let commits = committed.clone();
-        let slow = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let slow = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             let commit = || call.commit(|| ()).is_ok();
             let before = commit();
             commits.lock().unwrap().push(before);

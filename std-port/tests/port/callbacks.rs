@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Error, Parameters, ParametersView, Peer, ServiceError};
+use cara_std::{Error, Parameters, ParametersView, Peer, Served, ServiceError};
 
 use crate::support::{Gate, ask, fleet, held, meet, number, pair, service, system, unit, value};
 
@@ -37,7 +37,7 @@ fn a_handler_with_the_state_calls_back_a_service_without_it() {
     let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let back: Back<i64> = Arc::default();
     let there = back.clone();
-    let asks_back = move |state: &mut i64, _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+    let asks_back = move |state: &mut i64, _: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
         *state += 1;
         let number = ask(there.get().unwrap(), "mine", value(view)).map_err(|_| ServiceError::NotReady)?;
         view.set_value("number", number).map_err(|_| ServiceError::BadResults)
@@ -62,7 +62,7 @@ fn methods_that_need_both_states_are_told_at_once() {
     let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let back: Back<i64> = Arc::default();
     let there = back.clone();
-    let forwards = move |_: &mut i64, _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+    let forwards = move |_: &mut i64, _: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
         match ask(there.get().unwrap(), "last", value(view)) {
             Ok(number) => view.set_value("number", number).map_err(|_| ServiceError::BadResults),
             Err(Error::WouldDeadlock) => Err(ServiceError::Failed(1)),
@@ -90,7 +90,7 @@ fn a_hook_does_not_wait_for_the_method_whose_thread_runs_it() {
     let back: Back<Vec<&str>> = Arc::default();
     let there = back.clone();
     let asks_back =
-        move |state: &mut Vec<&'static str>, _: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        move |state: &mut Vec<&'static str>, _: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             state.push("begins");
             let error = ask(there.get().unwrap(), "never", 0).unwrap_err();
             state.push(if error == Error::Interrupted { "interrupted" } else { "another error" });

@@ -7,8 +7,8 @@ use std::sync::{Arc, Mutex};
 
 use cara_std::control::Control;
 use cara_std::{
-    Actuator, Call, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, Renew,
-    RequestOptions, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
+    Actuator, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, Renew,
+    RequestOptions, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, system, unit, until};
@@ -25,7 +25,7 @@ fn vehicle_with_drive(fleet: u32, state: &Path) -> (Unit, Actuator) {
     let agv = unit("agv", 7, fleet).state_folder(state).build().unwrap();
     let drive = agv.my_function_list().actuator(|| ()).unwrap();
     let options = ServiceOptions::new().moves(&drive, std::time::Duration::from_secs(1));
-    let go = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let go = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     agv.my_function_list().add_service(&Definition::parse("go()").unwrap(), options, go).unwrap();
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();
@@ -211,7 +211,7 @@ fn a_handler_that_hangs_is_cut_off_before_the_next_manager_moves_anything() {
     let (first_runs, next_runs, late, refused) =
         (note("first runs"), note("next runs"), note("a late commit"), note("no late commit"));
     let (runs, may_go_on) = (AtomicUsize::new(0), Mutex::new(may_go_on));
-    let go = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let go = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         if runs.fetch_add(1, Ordering::Relaxed) > 0 {
             return Ok(call.commit(&next_runs)?);
         }

@@ -46,7 +46,7 @@ fn longer_messages_are_allowed_while_running() {
     let agv = unit("agv", 7, fleet).constraints(Constraints { maximum_nodes: 1, ..small }).build().unwrap();
     let mut text = Parameters::<100_000>::sized();
     text.add_string("text", 40_000).unwrap();
-    let echo = |_: &cara_std::Call, _: &mut cara_std::ParametersView| Ok(());
+    let echo = |_: &cara_std::Served, _: &mut cara_std::ParametersView| Ok(());
     let (peer, _) = meet(&manager, &agv);
     let long = "y".repeat(40_000);
     text.set_value("text", long.as_str()).unwrap();

@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use cara_std::{
-    Call, CallFailure, Canceller, CommunicationSystem, Constraints, Error, Failure, LeaseWatch, LinkCounter,
-    Parameters, ParametersView, Peer, RequestOptions, ServiceError, ServiceOptions, Stage, Unit,
+    CallFailure, Canceller, CommunicationSystem, Constraints, Error, Failure, LeaseWatch, LinkCounter, Parameters,
+    ParametersView, Peer, RequestOptions, Served, ServiceError, ServiceOptions, Stage, Unit,
 };
 
 use crate::support::{Gate, PATIENCE, counter, held, meet, number, pair, until, value};
@@ -39,7 +39,7 @@ pub(crate) fn serve(
     agv: &Unit,
     name: &str,
     options: ServiceOptions<()>,
-    handler: impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
+    handler: impl Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
 ) {
     let definition = format!("{name}{SIGNATURE}").parse().unwrap();
     agv.my_function_list().add_service(&definition, options, handler).unwrap();

@@ -3,8 +3,8 @@
 use std::ops::ControlFlow;
 
 use cara_std::{
-    Call, Canceller, CommunicationSystem, Constraints, Definition, Error, GrowingParameters, Parameters,
-    ParametersView, Peer, RequestOptions, ServiceError, ServiceOptions, Unit,
+    Canceller, CommunicationSystem, Constraints, Definition, Error, GrowingParameters, Parameters, ParametersView,
+    Peer, RequestOptions, Served, ServiceError, ServiceOptions, Unit,
 };
 
 use crate::support::{fleet, meet, retire_absent, system, unit};
@@ -21,12 +21,12 @@ fn listed(name: &str) -> Definition {
     format!("{name}() -> (list: int[..{ELEMENTS}])").parse().unwrap()
 }
 
-fn tell(_: &Call, results: &mut ParametersView) -> Result<(), ServiceError> {
+fn tell(_: &Served, results: &mut ParametersView) -> Result<(), ServiceError> {
     let text = "y".repeat(TEXT as usize);
     results.set_value("text", text.as_str()).map_err(|_| ServiceError::BadResults)
 }
 
-fn list(_: &Call, results: &mut ParametersView) -> Result<(), ServiceError> {
+fn list(_: &Served, results: &mut ParametersView) -> Result<(), ServiceError> {
     let listed = results.set_list("list", |list| (0..ELEMENTS).try_for_each(|element| list.push(i64::from(element))));
     listed.map_err(|_| ServiceError::BadResults)
 }
@@ -133,7 +133,7 @@ fn tasks_call_and_serve_with_growing_parameters() {
     functions.add_service(&listed("list"), ServiceOptions::new(), list).unwrap();
     let future = |parameters: GrowingParameters| async { with_list(parameters) };
     functions.add_service(&listed("future"), ServiceOptions::new(), future).unwrap();
-    let told = |_: Call, parameters: GrowingParameters| async { Ok(with_list(parameters)) };
+    let told = |_: Served, parameters: GrowingParameters| async { Ok(with_list(parameters)) };
     functions.add_service(&listed("told"), ServiceOptions::new(), told).unwrap();
     let (peer, _) = meet(&manager, &agv);
     retire_absent(&manager);

@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Error, Parameters, ParametersView, Priority, RequestOptions, Role, ServiceError, ServiceOptions};
+use cara_std::{
+    Error, Parameters, ParametersView, Priority, RequestOptions, Role, Served, ServiceError, ServiceOptions,
+};
 
 use crate::support::{
     Gate, PATIENCE, ask, fleet, held, meet, number, pair, publish, service, system, unit, until, value, within,
@@ -22,13 +24,13 @@ fn method(state: &mut i64, mut parameters: Parameters) -> Parameters {
     parameters
 }
 
-fn in_place(call: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+fn in_place(call: &Served, view: &mut ParametersView) -> Result<(), ServiceError> {
     let sign = if call.caller.role() == Role::MUnit { 1 } else { -1 };
     let number = sign * value(view);
     view.set_value("number", number).map_err(|_| ServiceError::BadResults)
 }
 
-fn method_in_place(state: &mut i64, _: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+fn method_in_place(state: &mut i64, _: &Served, view: &mut ParametersView) -> Result<(), ServiceError> {
     if value(view) == 0 {
         return Err(ServiceError::Failed(9));
     }
@@ -69,7 +71,7 @@ fn a_handler_that_panics_harms_nobody_else() {
     let manager = system(fleet).build().unwrap();
     let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let list = agv.my_function_list();
-    list.add_function("free", &number(0), |_: &Call, _: &mut ParametersView| panic!("as the test wants")).unwrap();
+    list.add_function("free", &number(0), |_: &Served, _: &mut ParametersView| panic!("as the test wants")).unwrap();
     list.add_function("method", &number(0), |_: &mut i64, _: Parameters| -> Parameters { panic!("likewise") }).unwrap();
     list.add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
@@ -260,7 +262,7 @@ fn an_emergency_overtakes_long_messages_that_are_sealed_ahead() {
     long.set_value("text", &*"x".repeat(20_000)).unwrap();
     let list = agv.my_function_list();
     let runs = stored.clone();
-    let store = move |_: &Call, _: &mut ParametersView| {
+    let store = move |_: &Served, _: &mut ParametersView| {
         runs.fetch_add(1, Ordering::SeqCst);
         Ok(())
     };

@@ -27,7 +27,7 @@ fn vehicle() -> Vehicle {
     let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap());
     let leases = ["drive(number: int)", "lift(number: int)"].map(|definition| {
         let options = ServiceOptions::new().lease(LEASE, || {});
-        let moved = |_: &cara_std::Call, _: &mut cara_std::ParametersView| Ok(());
+        let moved = |_: &cara_std::Served, _: &mut cara_std::ParametersView| Ok(());
         agv.my_function_list().add_service(&definition.parse().unwrap(), options, moved).unwrap()
     });
     let (peer, _) = meet(&manager, &agv);

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Barrier};
 
 use cara_std::{
-    Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions,
+    CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions, Served,
     ServiceError, ServiceOptions, Unit,
 };
 
@@ -14,7 +14,7 @@ use crate::support::{PATIENCE, fleet, meet, system, unit, until};
 /// So long that nothing here ends by time.
 const LEASE: cara_std::Duration = cara_std::Duration::from_secs(600);
 
-fn nothing(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn nothing(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     Ok(())
 }
 
@@ -130,7 +130,7 @@ fn a_stop_of_all_reaches_all_behind_a_handler_that_hangs_in_a_commit() {
     let (is_inside, goes_on) = (Arc::new(AtomicBool::new(false)), Arc::new(Barrier::new(2)));
     let hangs = {
         let (is_inside, goes_on) = (is_inside.clone(), goes_on.clone());
-        move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             let wait = || {
                 is_inside.store(true, Ordering::SeqCst);
                 goes_on.wait();

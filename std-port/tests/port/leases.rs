@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Call, CommunicationSystem, Error, LeaseEnd, LeaseWatch, ParametersView, Peer, Renew, RequestOptions, ServiceError,
-    ServiceOptions, Unit, UnitEvent,
+    CommunicationSystem, Error, LeaseEnd, LeaseWatch, ParametersView, Peer, Renew, RequestOptions, Served,
+    ServiceError, ServiceOptions, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, meet, number, service, system, unit, until};
@@ -36,7 +36,7 @@ fn vehicle() -> Vehicle {
     };
     let order = Arc::<Mutex<Option<LeaseWatch>>>::default();
     let newest = order.clone();
-    let go_to = move |speed: &mut i64, call: &Call, parameters: &mut ParametersView| -> Result<(), ServiceError> {
+    let go_to = move |speed: &mut i64, call: &Served, parameters: &mut ParametersView| -> Result<(), ServiceError> {
         *speed = 5;
         newest.lock().unwrap().clone_from(&call.lease);
         Ok(parameters.set_value("number", *speed)?)

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use cara_std::{
-    Call, CommunicationSystem, LeaseWatch, ParametersView, Peer, Renew, RequestOptions, ServiceError, ServiceOptions,
+    CommunicationSystem, LeaseWatch, ParametersView, Peer, Renew, RequestOptions, Served, ServiceError, ServiceOptions,
     Unit,
 };
 
@@ -31,7 +31,7 @@ fn vehicle(length: Duration) -> Vehicle {
     let (tell, ended) = channel();
     let orders = Arc::<Mutex<Vec<LeaseWatch>>>::default();
     let begun = orders.clone();
-    let go = move |call: &Call, parameters: &mut ParametersView| -> Result<(), ServiceError> {
+    let go = move |call: &Served, parameters: &mut ParametersView| -> Result<(), ServiceError> {
         let (number, lease, end) = (value(parameters), call.lease.clone().unwrap(), call.lease_ended());
         let (thread, task) = (tell.clone(), tell.clone());
         begun.lock().unwrap().push(lease.clone());

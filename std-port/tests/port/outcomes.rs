@@ -19,7 +19,7 @@ fn fleet_with_one_that_fails(count: u32) -> (CommunicationSystem, Vec<Unit>) {
     let units: Vec<_> = (0..count).map(|id| unit(&format!("agv{id}"), id, fleet).build().unwrap()).collect();
     for (id, agv) in units.iter().enumerate() {
         let fails = id as u32 + 1 == count;
-        let f = move |_: &cara_std::Call, view: &mut cara_std::ParametersView| -> Result<(), ServiceError> {
+        let f = move |_: &cara_std::Served, view: &mut cara_std::ParametersView| -> Result<(), ServiceError> {
             let number = value(view) + id as i64;
             if fails {
                 Err(ServiceError::Failed(4))
@@ -211,7 +211,7 @@ fn best_effort_arrives_in_one_datagram_or_is_refused() {
     long.add_string("text", 2000).unwrap();
     long.set_value("text", "x".repeat(2000).as_str()).unwrap();
     agv.my_function_list()
-        .add_function("long", &long, |_: &cara_std::Call, _: &mut cara_std::ParametersView| Ok(()))
+        .add_function("long", &long, |_: &cara_std::Served, _: &mut cara_std::ParametersView| Ok(()))
         .unwrap();
     let (peer, _) = meet(&manager, &agv);
     let options = RequestOptions { delivery: Delivery::BestEffort, ..Default::default() };

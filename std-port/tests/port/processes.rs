@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
 use cara_std::{
-    Call, CloseReason, Definition, Error, LeaseEnd, OrderOutcome, Parameters, ParametersView, Refusal, Renew,
-    RequestOptions, ServiceError, ServiceOptions, StartError, UnitEvent,
+    CloseReason, Definition, Error, LeaseEnd, OrderOutcome, Parameters, ParametersView, Refusal, Renew, RequestOptions,
+    Served, ServiceError, ServiceOptions, StartError, UnitEvent,
 };
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -87,7 +87,7 @@ fn as_child() {
             .unwrap();
             // Less than three keep-alives, and longer than a thread waits for its turn.
             let moves = ServiceOptions::new().lease(Duration::from_secs(2), || ());
-            let drive = |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+            let drive = |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
                 call.lease.as_ref().unwrap().wait_until_ended();
                 Ok(())
             };

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Builder, Call, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer,
-    RequestOptions, SUnit, ServiceError, Unit,
+    Builder, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer, RequestOptions,
+    SUnit, Served, ServiceError, Unit,
 };
 
 use crate::keyed::keyed;
@@ -136,7 +136,7 @@ pub(crate) fn value(parameters: &ParametersView) -> i64 {
 /// A service in place, free.
 pub(crate) fn service(
     act: impl Fn(i64) -> i64 + Send + Sync + 'static,
-) -> impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
+) -> impl Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
     move |_, view| {
         let number = act(value(view));
         view.set_value("number", number).map_err(|_| ServiceError::BadResults)
@@ -187,7 +187,7 @@ impl Gate {
 /// A service in place, free, that waits at the gate.
 pub(crate) fn held(
     gate: &Arc<Gate>,
-) -> impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
+) -> impl Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
     let gate = gate.clone();
     service(move |number| {
         gate.pass();

@@ -338,7 +338,7 @@ fn another_version_of_the_vehicle_is_told_before_anything_is_sent() {
     let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap());
     let calls = Arc::new(AtomicUsize::new(0));
     let counted = calls.clone();
-    let run = move |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), ServiceError> {
+    let run = move |_: &cara_std::Served, _: &mut cara_std::ParametersView| -> Result<(), ServiceError> {
         counted.fetch_add(1, Ordering::SeqCst);
         Ok(())
     };
@@ -638,7 +638,7 @@ fn an_order_is_not_sent_to_a_function_without_lists() {
     let fleet = fleet();
     let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap());
     let plan = Definition::parse("plan(nodes: string[32]) -> (count: int)").unwrap();
-    let run = |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), ServiceError> { unreachable!() };
+    let run = |_: &cara_std::Served, _: &mut cara_std::ParametersView| -> Result<(), ServiceError> { unreachable!() };
     agv.my_function_list().add_service(&plan, ServiceOptions::new(), run).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let sent = manager.counted(LinkCounter::MessagesSent);

@@ -19,7 +19,9 @@ use cara_core::services::hub::Hub;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::{CallId, Pending};
-use cara_core::services::session::{Call, Event, Publication, RequestOptions, Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{
+    Event, Incoming, Publication, RequestOptions, Session, SessionConfig, SessionStorage,
+};
 use cara_core::services::{CallHead, Context, Port};
 use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};
@@ -238,7 +240,7 @@ impl Side {
             at += receipt.consumed;
             let nothing = receipt.consumed == 0 && receipt.event.is_none();
             match receipt.event {
-                Some(Event::Call(call)) => {
+                Some(Event::Incoming(call)) => {
                     self.answer(call, parameters);
                     done += 1;
                 }
@@ -258,7 +260,7 @@ impl Side {
         done
     }
 
-    fn answer(&mut self, call: Call, parameters: &ParametersView) {
+    fn answer(&mut self, call: Incoming, parameters: &ParametersView) {
         self.session.answer(context!(self), call.ticket, Ok(parameters)).expect("an answer is sent");
     }
 }

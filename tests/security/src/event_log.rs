@@ -5,7 +5,7 @@ use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use cara_core::distribution::identity::Identity;
-use cara_std::{Call, Definition, Error, MyFunctionList, ParametersView, ServiceError, ServiceOptions, UnitEvent};
+use cara_std::{Definition, Error, MyFunctionList, ParametersView, Served, ServiceError, ServiceOptions, UnitEvent};
 
 use crate::target::Seen;
 
@@ -77,7 +77,7 @@ impl EventLog {
         for name in FUNCTIONS {
             let definition: Definition = format!("{name}(n: int)").parse().expect("a signature");
             let log = self.clone();
-            let note = move |call: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+            let note = move |call: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
                 let mark = view.variable("n").map_err(|_| ServiceError::BadResults)?;
                 let mut entries = log.entries();
                 entries.of.entry(call.caller.clone()).or_default().marks.push(mark);

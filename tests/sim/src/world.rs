@@ -45,7 +45,7 @@ pub use functions::MyFunctionList;
 pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
 pub use requests::{Hold, Watched};
-pub use service::{BoxedParameters, Call, LeaseWatch, Outcome, Service, boxed_parameters};
+pub use service::{BoxedParameters, LeaseWatch, Outcome, Served, Service, boxed_parameters};
 pub use state::Storing;
 pub use streams::Sample;
 

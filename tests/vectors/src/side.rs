@@ -12,7 +12,7 @@ use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
 use cara_core::services::heart::Renew;
 use cara_core::services::hub::Hub;
-use cara_core::services::session::{Call, Delivery, Event, RequestOptions, Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{Delivery, Event, Incoming, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port, Ticket};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};
@@ -72,7 +72,7 @@ pub(crate) struct Side {
     kept: Kept,
     now: Instant,
     /// Calls that the peer has made and that wait for an answer.
-    pub(crate) calls: Vec<Call>,
+    pub(crate) calls: Vec<Incoming>,
     /// What else happened, as the core tells it.
     pub(crate) events: Vec<String>,
 }
@@ -158,7 +158,7 @@ impl Side {
         self.take_calls();
     }
 
-    fn receive(&mut self, rest: &mut [u8]) -> (usize, Option<String>, Option<Call>) {
+    fn receive(&mut self, rest: &mut [u8]) -> (usize, Option<String>, Option<Incoming>) {
         let mut cx = Context {
             now: self.now,
             mailman: &mut self.kept,
@@ -169,7 +169,7 @@ impl Side {
             keys: &mut (),
         };
         let receipt = self.session.receive(&mut cx, rest, None);
-        let call = if let Some(Event::Call(call)) = &receipt.event { Some(*call) } else { None };
+        let call = if let Some(Event::Incoming(call)) = &receipt.event { Some(*call) } else { None };
         (receipt.consumed, receipt.event.as_ref().map(told), call)
     }
 

@@ -1,7 +1,7 @@
 //! The bytes of a stream as the core's own link takes them apart.
 
 use cara_core::error::CloseReason;
-use cara_core::host::connections::{Incoming, Link};
+use cara_core::host::connections::{Inbound, Link};
 use cara_core::host::frame::first_frame_length;
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Plain;
@@ -65,24 +65,24 @@ fn ended(mut seen: Vec<Value>, reason: CloseReason) -> Value {
 
 /// `None` for what ends the link. An unreadable hello is refused and an unreadable session body dropped, so both show
 /// their bytes.
-fn value(link: &Link<Boxed, Plain>, incoming: Incoming, lent: &[u8]) -> Option<Value> {
+fn value(link: &Link<Boxed, Plain>, incoming: Inbound, lent: &[u8]) -> Option<Value> {
     Some(match incoming {
-        Incoming::Hello(place) => {
+        Inbound::Hello(place) => {
             let bytes = link.view(place, lent);
             json!({ "hello": decoded::hello(bytes).unwrap_or_else(|| unreadable(bytes)) })
         }
-        Incoming::Refuse(code) => json!({ "refuse": code }),
-        Incoming::Close(code) => json!({ "close": code }),
-        Incoming::Ping => json!("ping"),
-        Incoming::Pong => json!("pong"),
-        Incoming::Skipped => json!("skipped"),
+        Inbound::Refuse(code) => json!({ "refuse": code }),
+        Inbound::Close(code) => json!({ "close": code }),
+        Inbound::Ping => json!("ping"),
+        Inbound::Pong => json!("pong"),
+        Inbound::Skipped => json!("skipped"),
         // Of secured links only.
-        Incoming::Proof(_) | Incoming::Confirm(_) => return None,
-        Incoming::Session(place) => {
+        Inbound::Proof(_) | Inbound::Confirm(_) => return None,
+        Inbound::Session(place) => {
             let bytes = link.view(place, lent);
             json!({ "session": decoded::session_body(bytes).unwrap_or_else(|| unreadable(bytes)) })
         }
-        Incoming::Message(priority, place) => json!({
+        Inbound::Message(priority, place) => json!({
             "priority": priority.word(),
             "message": decoded::message(link.view(place, lent))?,
         }),

@@ -94,7 +94,7 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
     Purpose {
         what: "what a link has received whole, where it lies, and the answer to a ping",
         places: &["services/session/inbound.rs"],
-        items: &["connections::Incoming", "connections::Place", "frame::Frame"],
+        items: &["connections::Inbound", "connections::Place", "frame::Frame"],
     },
     Purpose {
         what: "where a sample lies that came whole",

@@ -5,7 +5,7 @@ use core::net::SocketAddr;
 use std::vec;
 use std::vec::Vec;
 
-use super::{Incoming, Link};
+use super::{Inbound, Link};
 use crate::config::{LINK_BUFFER_BYTES, Priority};
 use crate::error::CloseReason;
 use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
@@ -130,12 +130,12 @@ pub(super) fn offer<C: Seal>(
     }
 }
 
-fn item<C: Seal>(link: &Link<Boxed, C>, incoming: Incoming, lent: &[u8]) -> Item {
+fn item<C: Seal>(link: &Link<Boxed, C>, incoming: Inbound, lent: &[u8]) -> Item {
     match incoming {
-        Incoming::Message(priority, place) => Item::Message(priority, link.view(place, lent).to_vec()),
-        Incoming::Session(place) => Item::Session(link.view(place, lent).to_vec()),
-        Incoming::Hello(place) => Item::Hello(link.view(place, lent).to_vec()),
-        Incoming::Ping => Item::Ping,
+        Inbound::Message(priority, place) => Item::Message(priority, link.view(place, lent).to_vec()),
+        Inbound::Session(place) => Item::Session(link.view(place, lent).to_vec()),
+        Inbound::Hello(place) => Item::Hello(link.view(place, lent).to_vec()),
+        Inbound::Ping => Item::Ping,
         _ => Item::Other,
     }
 }

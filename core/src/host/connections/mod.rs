@@ -29,7 +29,7 @@ use sender::Sender;
 #[derive(Clone, Copy, Debug)]
 // A wide tag, so that the rest is moved in words, not bytes.
 #[repr(u32)]
-pub enum Incoming {
+pub enum Inbound {
     /// The peer's hello.
     Hello(Place),
     /// The peer refuses, with a code.
@@ -99,7 +99,7 @@ pub struct Received {
     /// How many of the lent bytes are used up.
     pub consumed: usize,
     /// What they completed.
-    pub incoming: Option<Incoming>,
+    pub incoming: Option<Inbound>,
     /// No message buffer is free: stop reading, and offer the rest again later.
     pub paused: bool,
 }
@@ -168,7 +168,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         if received.incoming.is_some() {
             self.counters.count(LinkCounter::FramesReceived);
         }
-        if let Some(Incoming::Message(..)) = received.incoming {
+        if let Some(Inbound::Message(..)) = received.incoming {
             self.counters.count(LinkCounter::MessagesReceived);
         }
         Ok(received)

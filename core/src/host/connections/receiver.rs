@@ -4,7 +4,7 @@
 //! for a message in several chunks, or for both: the frame then follows the assembled part of the message. So a link
 //! that waits for a buffer holds none, and links cannot deadlock.
 
-use super::{Incoming, Place, Received, Store};
+use super::{Inbound, Place, Received, Store};
 use crate::bytes;
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::CloseReason;
@@ -277,24 +277,24 @@ impl<S: Storage> Receiver<S> {
     ) -> Result<(), CloseReason> {
         // Totals and lengths are the peer's word. Each arm compares them with the limits before a byte is copied.
         received.incoming = Some(match content {
-            Content::Hello => Incoming::Hello(place),
-            Content::Refuse(code) => Incoming::Refuse(code),
-            Content::Close(code) => Incoming::Close(code),
-            Content::Ping => Incoming::Ping,
-            Content::Pong => Incoming::Pong,
-            Content::Session => Incoming::Session(place),
-            Content::Proof => Incoming::Proof(place),
-            Content::Confirm => Incoming::Confirm(place),
-            Content::Skipped => Incoming::Skipped,
+            Content::Hello => Inbound::Hello(place),
+            Content::Refuse(code) => Inbound::Refuse(code),
+            Content::Close(code) => Inbound::Close(code),
+            Content::Ping => Inbound::Ping,
+            Content::Pong => Inbound::Pong,
+            Content::Session => Inbound::Session(place),
+            Content::Proof => Inbound::Proof(place),
+            Content::Confirm => Inbound::Confirm(place),
+            Content::Skipped => Inbound::Skipped,
             Content::Piece(Piece { priority, total: Some(total), last: true }) => {
                 self.check_whole(place, total as usize)?;
-                Incoming::Message(priority, place)
+                Inbound::Message(priority, place)
             }
             Content::Piece(Piece { priority, total: Some(total), last: false }) => {
                 return self.begin(priority, total as usize, place, lent);
             }
             Content::Piece(piece) => match self.go_on(&piece, place, lent)? {
-                Some(whole) => Incoming::Message(piece.priority, whole),
+                Some(whole) => Inbound::Message(piece.priority, whole),
                 None => return Ok(()),
             },
         });

@@ -1,7 +1,7 @@
 //! Calls of the peer: which one begins, and how it is answered or refused.
 
 use super::permitting::{decide, log_refusal};
-use super::{Call, Phase, Session};
+use super::{Incoming, Phase, Session};
 use crate::config::Priority;
 use crate::distribution::block;
 use crate::distribution::function::{Attributes, Signature};
@@ -29,7 +29,7 @@ impl<P: Port> Session<P> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
     /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`, and
     /// [`poll`](Self::poll) before it: what was stopped has its safe hook first.
-    pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Call> {
+    pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Incoming> {
         while self.phase == Phase::Live && !self.obedience.waits {
             if let Ok(call) = self.begin_next(cx, arguments)? {
                 return Some(call);
@@ -39,7 +39,7 @@ impl<P: Port> Session<P> {
     }
 
     /// The same for emergencies alone, for ports that run those apart from all other calls.
-    pub fn next_emergency(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Call> {
+    pub fn next_emergency(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Incoming> {
         while self.has_next_emergency() {
             if let Ok(call) = self.begin_next(cx, arguments)? {
                 return Some(call);
@@ -49,7 +49,11 @@ impl<P: Port> Session<P> {
     }
 
     /// Begins the next call that may begin, or refuses it; `None` when there is none.
-    fn begin_next(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Result<Call, Error>> {
+    fn begin_next(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        arguments: &mut ParametersView,
+    ) -> Option<Result<Incoming, Error>> {
         let (functions, now, access, remote) = (cx.functions, cx.now, cx.access, self.remote.as_ref());
         let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
             if head.deadline <= now {
@@ -98,7 +102,7 @@ impl<P: Port> Session<P> {
         cx: &mut Context<'_, P>,
         mut head: CallHead,
         attributes: &Attributes,
-    ) -> Result<Call, Error> {
+    ) -> Result<Incoming, Error> {
         let lease = attributes.lease;
         // A command that waited for its turn is no longer wanted once its lease has been given up.
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
@@ -116,7 +120,7 @@ impl<P: Port> Session<P> {
         };
         self.link.counters.count(LinkCounter::RequestsRun);
         let CallHead { slot, priority, wants_reply, deadline, .. } = head;
-        Ok(Call { ticket, slot, priority, wants_reply, deadline, order })
+        Ok(Incoming { ticket, slot, priority, wants_reply, deadline, order })
     }
 
     /// Answers a call. [`Error::Full`] when the answer cannot be kept now: the call stays open, to be answered again

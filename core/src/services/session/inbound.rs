@@ -13,7 +13,7 @@ use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeade
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
-use crate::host::connections::{Incoming, LinkCounter, Place};
+use crate::host::connections::{Inbound, LinkCounter, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
@@ -126,10 +126,10 @@ impl<P: Port> Session<P> {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
         // What a later version says shows no life that this one understands; of a session body it is known once it is read.
-        if !matches!(incoming, Incoming::Skipped | Incoming::Session(_)) {
+        if !matches!(incoming, Inbound::Skipped | Inbound::Session(_)) {
             self.liveness.heard(cx.now);
         }
-        let is_emergency = matches!(incoming, Incoming::Message(Priority::Emergency, _));
+        let is_emergency = matches!(incoming, Inbound::Message(Priority::Emergency, _));
         // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
         // in the same bytes is reached first.
         let at_once = is_emergency || received.consumed == lent.len();
@@ -181,47 +181,47 @@ impl<P: Port> Session<P> {
     fn digest(
         &mut self,
         cx: &mut Context<'_, P>,
-        incoming: Incoming,
+        incoming: Inbound,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
         match (incoming, self.phase) {
             // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
-            (Incoming::Refuse(_), _) if !self.link.cipher().is_sealing() => {
+            (Inbound::Refuse(_), _) if !self.link.cipher().is_sealing() => {
                 self.ended_in_clear(None);
                 None
             }
-            (Incoming::Close(code), _) if !self.link.cipher().is_sealing() => {
+            (Inbound::Close(code), _) if !self.link.cipher().is_sealing() => {
                 self.ended_in_clear(Some(close_reason(code)));
                 None
             }
-            (Incoming::Refuse(code), _) => {
+            (Inbound::Refuse(code), _) => {
                 self.end(CloseReason::Refused(Refusal::from_wire(code)));
                 None
             }
-            (Incoming::Close(code), _) => {
+            (Inbound::Close(code), _) => {
                 self.end(close_reason(code));
                 None
             }
-            (Incoming::Hello(place), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, place, lent),
-            (Incoming::Proof(place), Phase::Proving { .. }) => self.proof_arrived(cx, place, lent),
-            (Incoming::Confirm(place), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
+            (Inbound::Hello(place), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, place, lent),
+            (Inbound::Proof(place), Phase::Proving { .. }) => self.proof_arrived(cx, place, lent),
+            (Inbound::Confirm(place), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
                 self.confirmation_arrived(cx, place, lent)
             }
-            (Incoming::Proof(place), Phase::Live) => self.proof_on_live(cx, place, lent),
-            (Incoming::Confirm(place), Phase::Live) => self.confirmation_on_live(cx, place, lent),
+            (Inbound::Proof(place), Phase::Live) => self.proof_on_live(cx, place, lent),
+            (Inbound::Confirm(place), Phase::Live) => self.confirmation_on_live(cx, place, lent),
             // Answered in the stream as well: only a reply that has passed the same queue shows that the stream moves.
-            (Incoming::Ping, Phase::Live) => {
+            (Inbound::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
                 self.flush(cx);
                 None
             }
-            (Incoming::Pong, Phase::Live) => self.pong_arrived(cx),
-            (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent, Way::Stream),
-            (Incoming::Message(priority, place), Phase::Live) => {
+            (Inbound::Pong, Phase::Live) => self.pong_arrived(cx),
+            (Inbound::Session(place), Phase::Live) => self.session_body(cx, place, lent, Way::Stream),
+            (Inbound::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
             }
-            (Incoming::Skipped, Phase::Live) => {
+            (Inbound::Skipped, Phase::Live) => {
                 self.link.counters.count(LinkCounter::ItemsSkipped);
                 None
             }
@@ -505,7 +505,7 @@ impl<P: Port> Session<P> {
             }
         });
         match result {
-            Ok(Some(call)) => Some(Event::Call(call)),
+            Ok(Some(call)) => Some(Event::Incoming(call)),
             Ok(None) => None,
             Err(error) => {
                 self.refuse_request(cx, header.id, header.slot, priority, header.wants_reply, error);

@@ -1,7 +1,7 @@
 //! One link to one peer: the s_unit's session with its manager, and each peer of an m_unit.
 //!
 //! A [`Session`] turns bytes into [`Event`]s and requests into bytes. It never waits: the port lends it a [`Context`],
-//! runs the handler of an [`Event::Call`] outside of any lock, and brings the answer with [`Session::answer`]. It asks the
+//! runs the handler of an [`Event::Incoming`] outside of any lock, and brings the answer with [`Session::answer`]. It asks the
 //! unit's [`Hub`](super::hub::Hub) by itself, through the [`Door`](super::hub::Door) in its context.
 //!
 //! # What a port does
@@ -111,7 +111,7 @@ pub enum Event {
     /// Both ends have accepted each other: the link is live, and has told the peer what is published to it.
     Joined,
     /// A call whose arguments are in the lent parameters: run its handler, then [`Session::answer`].
-    Call(Call),
+    Incoming(Incoming),
     /// The end of a call of this unit; [`Session::results`] shows what it returned.
     Reply(CallId, Result<Results, Error>),
     /// An asynchronous request was refused by the peer, or its service failed.
@@ -164,7 +164,7 @@ pub enum Event {
 
 /// A call of the peer that is to be run now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Call {
+pub struct Incoming {
     /// Answers it.
     pub ticket: Ticket,
     /// The function of this unit's list.

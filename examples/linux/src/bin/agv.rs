@@ -11,7 +11,8 @@ use cara_apps::agv::{
 use cara_apps::mechanic;
 use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
 use cara_std::{
-    Actuator, Call, Definition, Error, LeaseWatch, ParametersView, Priority, Publisher, ServiceOptions, Unit, UnitEvent,
+    Actuator, Definition, Error, LeaseWatch, ParametersView, Priority, Publisher, Served, ServiceOptions, Unit,
+    UnitEvent,
 };
 use clap::Parser;
 
@@ -62,23 +63,23 @@ fn main() -> Result<()> {
 fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     let own = || agv.clone();
     let agv = own();
-    let pos_info = move |_: &Call, pos: &mut ParametersView| lock(&agv).pos_info(pos);
+    let pos_info = move |_: &Served, pos: &mut ParametersView| lock(&agv).pos_info(pos);
     let agv = own();
-    let go_to = move |call: &Call, pos: &mut ParametersView| {
+    let go_to = move |call: &Served, pos: &mut ParametersView| {
         let mut agv = lock(&agv);
         call.commit(|| agv.go_to(pos, call.lease.clone()).inspect(|()| POWER.store(true, Ordering::Release)))??;
         agv.target().into_iter().for_each(|target| say!("driving to {target}"));
         Ok(())
     };
     let agv = own();
-    let battery = move |_: &Call, charge: &mut ParametersView| lock(&agv).battery(charge);
+    let battery = move |_: &Served, charge: &mut ParametersView| lock(&agv).battery(charge);
     // The order has ended before this runs, and the hook makes the vehicle stand.
-    let stop = move |call: &Call, _: &mut ParametersView| {
+    let stop = move |call: &Served, _: &mut ParametersView| {
         say!("stop: {} said so", call.caller);
         Ok(())
     };
     let agv = own();
-    let reset = move |call: &Call, _: &mut ParametersView| {
+    let reset = move |call: &Served, _: &mut ParametersView| {
         lock(&agv).reset()?;
         say!("reset: {} said so", call.caller);
         Ok(())

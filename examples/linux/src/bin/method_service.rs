@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::{Result, bail};
 use cara_apps::depot::{Depot, STORE, TAKE};
 use cara_examples::{Network, Stop, log_to_stderr, say};
-use cara_std::{Call, CommunicationSystem, Definition, Identity, Parameters, ParametersView, ServiceOptions, Unit};
+use cara_std::{CommunicationSystem, Definition, Identity, Parameters, ParametersView, Served, ServiceOptions, Unit};
 use clap::Parser;
 
 /// How long the two may take to meet.
@@ -34,7 +34,7 @@ fn run(network: Network) -> Result<()> {
     let depot = network.place_with(Unit::builder("depot", 11, "manager", 1)?, ring);
     let depot = depot.state(Depot::default()).build()?;
     let functions = depot.my_function_list();
-    let take = |depot: &mut Depot, _: &Call, parcels: &mut ParametersView| depot.take(parcels);
+    let take = |depot: &mut Depot, _: &Served, parcels: &mut ParametersView| depot.take(parcels);
     functions.add_service(&Definition::parse(STORE)?, ServiceOptions::new(), Depot::store)?;
     functions.add_service(&Definition::parse(TAKE)?, ServiceOptions::new(), take)?;
     depot.publish_my_function_list()?;

@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use anyhow::Result;
 use cara_examples::{Network, Stop, log_to_stderr, say};
-use cara_std::{Call, CommunicationSystem, Definition, Parameters, ParametersView, Peer, ServiceError, ServiceOptions};
+use cara_std::{
+    CommunicationSystem, Definition, Parameters, ParametersView, Peer, Served, ServiceError, ServiceOptions,
+};
 use clap::Parser;
 
 /// Time between two looks and between two calls.
@@ -28,7 +30,7 @@ struct Options {
 
 /// What the other one has done here.
 #[derive(Default)]
-struct Served {
+struct Done {
     calls: AtomicU32,
     finished: AtomicBool,
 }
@@ -63,16 +65,16 @@ fn main() -> Result<()> {
 }
 
 /// Publishes `take_over`, and `finished`, by which the other one says that it needs nothing more.
-fn offer(zone: &CommunicationSystem) -> Result<Arc<Served>> {
-    let served = Arc::new(Served::default());
+fn offer(zone: &CommunicationSystem) -> Result<Arc<Done>> {
+    let served = Arc::new(Done::default());
     let (at_take_over, at_finished) = (served.clone(), served.clone());
-    let take_over = move |call: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+    let take_over = move |call: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
         let agv: i64 = view.variable("agv")?;
         at_take_over.calls.fetch_add(1, Ordering::Relaxed);
         say!("served {}: agv {agv} taken over", call.caller);
         Ok(view.set_value("taken", true)?)
     };
-    let finished = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let finished = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         at_finished.finished.store(true, Ordering::Release);
         Ok(())
     };

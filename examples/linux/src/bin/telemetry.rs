@@ -7,7 +7,7 @@ use anyhow::Result;
 use cara_apps::telemetry::{REPORT, Received, report};
 use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
 use cara_std::{
-    Call, CommunicationSystem, Definition, Delivery, ParametersView, RequestOptions, ServiceOptions, Unit, UnitEvent,
+    CommunicationSystem, Definition, Delivery, ParametersView, RequestOptions, Served, ServiceOptions, Unit, UnitEvent,
 };
 use clap::{Parser, Subcommand};
 
@@ -61,7 +61,7 @@ fn main() -> Result<()> {
 fn receive(name: &str, id: u32, network: Network, stop: &Stop) -> Result<()> {
     let builder = network.place(CommunicationSystem::builder(name, id)?);
     let manager = builder.state(Received::default()).build()?;
-    let take = |received: &mut Received, _: &Call, view: &mut ParametersView| received.report(view);
+    let take = |received: &mut Received, _: &Served, view: &mut ParametersView| received.report(view);
     manager.my_function_list().add_service(&Definition::parse(REPORT)?, ServiceOptions::new(), take)?;
     manager.publish_my_function_list()?;
     let (events, stopper) = (manager.events(), stop.stopper());

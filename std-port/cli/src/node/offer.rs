@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use cara_std::{Call, Definition, Error, MyFunctionList, ParametersView, ServiceError, ServiceOptions, Shown};
+use cara_std::{Definition, Error, MyFunctionList, ParametersView, Served, ServiceError, ServiceOptions, Shown};
 
 use super::functions::{Service, Work};
 use super::json;
@@ -29,12 +29,12 @@ pub(super) fn offer(
     match &service.work {
         Work::Echo => list.add_service(&service.definition, options, echo)?,
         Work::Log => {
-            let log = move |call: &Call, view: &mut ParametersView| log(&definition, call, view);
+            let log = move |call: &Served, view: &mut ParametersView| log(&definition, call, view);
             list.add_service(&service.definition, options, log)?
         }
         Work::Program { command, timeout } => {
             let (command, timeout, programs) = (command.clone(), (*timeout).into(), programs.clone());
-            let run = move |call: &Call, view: &mut ParametersView| {
+            let run = move |call: &Served, view: &mut ParametersView| {
                 let task = Serving { number, definition: &definition, command: &command, timeout };
                 task.run(&programs, call, view)
             };
@@ -44,11 +44,11 @@ pub(super) fn offer(
     Ok(())
 }
 
-fn echo(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn echo(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     Ok(())
 }
 
-fn log(definition: &Definition, call: &Call, view: &ParametersView) -> Result<(), ServiceError> {
+fn log(definition: &Definition, call: &Served, view: &ParametersView) -> Result<(), ServiceError> {
     let mut arguments = json::arguments(definition.signature(), view).to_string();
     arguments.truncate(arguments.floor_char_boundary(LOGGED_BYTES));
     tracing::info!(function = definition.name(), caller = %call.caller, arguments = %Shown(&arguments), "called");
@@ -75,7 +75,7 @@ struct Serving<'a> {
 }
 
 impl Serving<'_> {
-    fn run(&self, programs: &Arc<Programs>, call: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+    fn run(&self, programs: &Arc<Programs>, call: &Served, view: &mut ParametersView) -> Result<(), ServiceError> {
         let signature = self.definition.signature();
         let function = signature.name();
         let input = json::arguments(signature, view).to_string();

@@ -264,7 +264,7 @@ fn as_file(bytes: &[u8]) -> io::Result<File> {
 
 #[cfg(test)]
 mod tests {
-    use cara_std::{Call, CommunicationSystem, Definition, Interfaces, ParametersView, ServiceOptions};
+    use cara_std::{CommunicationSystem, Definition, Interfaces, ParametersView, Served, ServiceOptions};
 
     use super::*;
 
@@ -288,7 +288,7 @@ mod tests {
     fn nothing_is_started_for_a_lease_that_has_ended_or_a_node_that_ends() {
         let system = CommunicationSystem::builder("program", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
         let system = system.build().unwrap();
-        let nothing = |_: &Call, _: &mut ParametersView| Ok(());
+        let nothing = |_: &Served, _: &mut ParametersView| Ok(());
         let options = ServiceOptions::new().lease(LONG, || {});
         let dead = system.my_function_list().add_service(&Definition::parse("f()").unwrap(), options, nothing).unwrap();
         let programs = Arc::default();

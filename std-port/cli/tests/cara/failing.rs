@@ -1,6 +1,6 @@
 //! What `cara call` tells of a call beside its results: how far it is, and why it fails.
 
-use cara_std::{Call, Failure, Parameters, ParametersView, ServiceError, ServiceOptions};
+use cara_std::{Failure, Parameters, ParametersView, Served, ServiceError, ServiceOptions};
 
 use crate::support::{Stage, until};
 
@@ -18,7 +18,7 @@ fn stage() -> (Stage, cara_std::Unit) {
     (stage, agv)
 }
 
-fn go(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+fn go(call: &Served, parameters: &mut ParametersView) -> Result<(), ServiceError> {
     let mut left = Parameters::new();
     left.add_int("left", 1)?;
     for metres in [12, 5] {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use cara_std::{Call, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{Definition, ParametersView, Served, ServiceError, ServiceOptions, Unit};
 
 use crate::support::{PATIENCE, Running, Stage, until};
 
@@ -32,7 +32,7 @@ impl Lifter {
         let unit = stage.vehicle("lifter", 98).build().unwrap();
         let log = Arc::new(EventLog::default());
         let (moved, stopped) = (log.clone(), log.clone());
-        let lift = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let lift = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             moved.began.fetch_add(1, Ordering::SeqCst);
             call.lease.as_ref().unwrap().wait_until_ended();
             moved.ended.fetch_add(1, Ordering::SeqCst);

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Call, Definition, Error, LeaseWatch, Parameters, ParametersView, Renew, RequestOptions, ServiceError,
+    Definition, Error, LeaseWatch, Parameters, ParametersView, Renew, RequestOptions, Served, ServiceError,
     ServiceOptions, Unit,
 };
 
@@ -28,11 +28,11 @@ impl Driver {
         let unit = stage.vehicle("driver", 99).build().unwrap();
         let order = Arc::<Mutex<Option<LeaseWatch>>>::default();
         let newest = order.clone();
-        let drive = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let drive = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             newest.lock().unwrap().clone_from(&call.lease);
             Ok(())
         };
-        let look = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let look = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let made_safe = Arc::new(AtomicU32::new(0));
         let counted = made_safe.clone();
         let safe = move || {
@@ -41,7 +41,7 @@ impl Driver {
         let options = ServiceOptions::new().lease(LEASE, safe);
         let functions = unit.my_function_list();
         let lease = functions.add_service(&Definition::parse("drive()").unwrap(), options, drive).unwrap();
-        let carry = |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let carry = |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             call.lease.as_ref().unwrap().wait_until_ended();
             // As a program that was killed.
             Err(ServiceError::Failed(137))
@@ -127,7 +127,7 @@ fn who_goes_away_is_noticed_among_many_events() {
     let goes_on = busy.clone();
     let events = std::thread::spawn(move || {
         let functions = unit.my_function_list();
-        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         while goes_on.load(Ordering::SeqCst) {
             functions.add_service(&Definition::parse("news()").unwrap(), ServiceOptions::new(), nothing).unwrap();
             unit.publish_my_function_list().unwrap();

@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{Definition, LeaseWatch, ParametersView, Served, ServiceError, ServiceOptions, Unit};
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 
 use crate::support::{Running, Stage, until};
@@ -30,7 +30,7 @@ impl Vehicle {
         let safe = move || {
             counted.fetch_add(1, Ordering::SeqCst);
         };
-        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let functions = unit.my_function_list();
         let wheels = functions.actuator(safe).unwrap();
         let moves = ServiceOptions::new().moves(&wheels, LEASE);

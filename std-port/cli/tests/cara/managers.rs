@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Claim, ParametersView, ServiceError, ServiceOptions};
+use cara_std::{Claim, ParametersView, Served, ServiceError, ServiceOptions};
 use serde_json::Value;
 
 use crate::support::{PATIENCE, Ran, Running, Stage, agv, private_folder, until};
@@ -240,7 +240,7 @@ fn what_a_vehicle_has_obeyed_is_forgotten_while_it_does_not_run() {
     let start = |stage: &Stage| {
         let agv = stage.vehicle("agv-1", 11).state_folder(state.path()).build().unwrap();
         let options = ServiceOptions::new().lease(Duration::from_secs(5), || {});
-        let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let drive = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         agv.my_function_list().add_service(&"drive()".parse().unwrap(), options, drive).unwrap();
         agv.publish_my_function_list().unwrap();
         agv.start().unwrap();

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::Duration;
 
 use cara_std::access::AccessTable;
-use cara_std::{Call, Definition, ParametersView, Priority, ServiceError, ServiceOptions, Unit};
+use cara_std::{Definition, ParametersView, Priority, Served, ServiceError, ServiceOptions, Unit};
 use rustix::process::Signal;
 
 use crate::support::{Running, Stage, private_folder, until};
@@ -28,7 +28,7 @@ fn vehicle(stage: &Stage, table: Option<&str>) -> (Unit, Arc<AtomicI64>) {
     let place = Arc::new(AtomicI64::new(0));
     let drive = functions.actuator(|| ()).unwrap();
     let moved = place.clone();
-    let go = move |_: &Call, arguments: &mut ParametersView| -> Result<(), ServiceError> {
+    let go = move |_: &Served, arguments: &mut ParametersView| -> Result<(), ServiceError> {
         let mut x = [0_i64];
         arguments.variable_into("x", &mut x).unwrap();
         moved.store(x[0], Ordering::SeqCst);
@@ -36,7 +36,7 @@ fn vehicle(stage: &Stage, table: Option<&str>) -> (Unit, Arc<AtomicI64>) {
     };
     let moves = ServiceOptions::new().moves(&drive, Duration::from_secs(600));
     functions.add_service(&Definition::parse("go(x: int)").unwrap(), moves, go).unwrap();
-    let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     functions.add_service(&Definition::parse("turn(x: int)").unwrap(), ServiceOptions::new(), nothing).unwrap();
     let stops = ServiceOptions::new().stops(&drive).priority(Priority::Emergency);
     functions.add_service(&Definition::parse("halt()").unwrap(), stops, nothing).unwrap();

@@ -4,7 +4,7 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-use cara_std::{Call, Constraints, Definition, ParametersView, Priority, ServiceError, ServiceOptions, Unit};
+use cara_std::{Constraints, Definition, ParametersView, Priority, Served, ServiceError, ServiceOptions, Unit};
 
 use crate::support::{Ran, Stage, until};
 
@@ -24,11 +24,11 @@ impl Vehicle {
         let functions = unit.my_function_list();
         let define = |text: String| Definition::parse(&text).unwrap();
         // So that the calls of several functions meet.
-        let slow = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let slow = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             std::thread::sleep(std::time::Duration::from_millis(100));
             Ok(())
         };
-        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         for (number, stop) in stops.iter().enumerate() {
             let drive = functions.actuator(|| ()).unwrap();
             let moves = ServiceOptions::new().moves(&drive, std::time::Duration::from_secs(600));
@@ -38,7 +38,7 @@ impl Vehicle {
             functions.add_service(&define(format!("{stop}()")), options, slow).unwrap();
         }
         let safe = is_safe.clone();
-        let free = move |_: &Call, _: &mut ParametersView| match safe.load(Ordering::SeqCst) {
+        let free = move |_: &Served, _: &mut ParametersView| match safe.load(Ordering::SeqCst) {
             true => Ok(()),
             false => Err(ServiceError::Failed(2)),
         };
@@ -218,7 +218,7 @@ fn a_stop_that_is_not_answered_is_sent_one_way_as_well_and_says_so() {
     let count = Arc::<AtomicU32>::default();
     let (counted, hangs) = (count.clone(), Arc::<AtomicBool>::new(true.into()));
     let goes_on = hangs.clone();
-    let halt = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let halt = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         counted.fetch_add(1, Ordering::SeqCst);
         while goes_on.load(Ordering::SeqCst) {
             std::thread::sleep(std::time::Duration::from_millis(10));
@@ -273,7 +273,7 @@ fn all_are_stopped_also_those_that_are_not_on_the_roster() {
     let door = stage.m_unit("other", 2).m_units([("manager", 1)]).unwrap().build().unwrap();
     let count = Arc::<AtomicU32>::default();
     let counted = count.clone();
-    let halt = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let halt = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         counted.fetch_add(1, Ordering::SeqCst);
         Ok(())
     };

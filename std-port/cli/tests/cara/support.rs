@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
 use cara_std::{
-    Builder, Call, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, SUnit, ServiceError,
+    Builder, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, SUnit, Served, ServiceError,
     ServiceOptions, Unit,
 };
 use cara_test_keys::KeyFolder;
@@ -335,15 +335,15 @@ pub(crate) fn agv(builder: Builder<(), SUnit>) -> Unit {
     unit
 }
 
-fn unchanged(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn unchanged(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     Ok(())
 }
 
-fn failing(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn failing(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     Err(ServiceError::Failed(7))
 }
 
-fn slow(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn slow(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     std::thread::sleep(Duration::from_secs(3));
     Ok(())
 }

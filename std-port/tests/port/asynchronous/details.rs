@@ -2,7 +2,9 @@
 
 use std::ops::ControlFlow;
 
-use cara_std::{Call, CallError, Definition, Error, Failure, Parameters, RequestOptions, ServiceError, ServiceOptions};
+use cara_std::{
+    CallError, Definition, Error, Failure, Parameters, RequestOptions, Served, ServiceError, ServiceOptions,
+};
 
 use super::{patient, runtime};
 use crate::details::{assert_blocked, blocked, left, serve};
@@ -17,7 +19,7 @@ fn watched() -> RequestOptions {
 fn a_failure_tells_its_text_and_its_values_to_a_task() {
     let (manager, agv) = pair();
     serve(&agv, "says", ServiceOptions::new(), |call, _| Err(call.fail(blocked())));
-    async fn is_a_future(call: Call, _: Parameters) -> Result<Parameters, ServiceError> {
+    async fn is_a_future(call: Served, _: Parameters) -> Result<Parameters, ServiceError> {
         call.progress(&left(3)).map_err(|_| ServiceError::Failed(1))?;
         tokio::task::yield_now().await;
         Err(call.fail(Failure::new(9, "on its way")))
@@ -78,7 +80,7 @@ fn a_task_hears_progress_and_gives_its_call_up() {
         (0..3).try_for_each(|metres| call.progress(&left(metres))).map_err(|_| ServiceError::Failed(1))?;
         parameters.set_value("number", 10 * value(parameters)).map_err(|_| ServiceError::BadResults)
     });
-    let is_told = |call: Call, parameters: Parameters| async move {
+    let is_told = |call: Served, parameters: Parameters| async move {
         call.progress(&left(5)).map_err(|_| ServiceError::Failed(1))?;
         call.given_up().await;
         assert!(call.is_cancelled());

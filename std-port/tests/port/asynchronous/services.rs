@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use cara_std::{
-    Call, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions, ServiceError,
+    Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions, Served, ServiceError,
     ServiceOptions, Unit,
 };
 
@@ -61,20 +61,20 @@ fn each_form_of_a_handler_answers() {
         parameters.set_value("number", 10 * value(&parameters)).unwrap();
         parameters
     }
-    async fn checked(call: Call, parameters: Parameters) -> Result<Parameters, ServiceError> {
+    async fn checked(call: Served, parameters: Parameters) -> Result<Parameters, ServiceError> {
         assert_eq!(call.caller.name(), "manager");
         tokio::task::yield_now().await;
         if value(&parameters) == 0 { Err(ServiceError::Failed(3)) } else { Ok(parameters) }
     }
     list.add_function("plain", &number(0), plain).unwrap();
     list.add_function("checked", &number(0), checked).unwrap();
-    let any_size = |_: Call, mut view: Box<ParametersView>| async move {
+    let any_size = |_: Served, mut view: Box<ParametersView>| async move {
         let twice = 2 * value(&view);
         view.set_value("number", twice)?;
         Ok(view)
     };
     list.add_service(&definition("any_size"), ServiceOptions::new().idempotent(), any_size).unwrap();
-    let panics = |_: Call, parameters: Parameters| async move {
+    let panics = |_: Served, parameters: Parameters| async move {
         if value(&parameters) == 1 {
             panic!("a handler")
         }
@@ -143,7 +143,7 @@ fn waiting(agv: &Unit, told: bool) -> Arc<Seen> {
     let options = || if told { ServiceOptions::new().runs_to_its_end() } else { ServiceOptions::new() };
     let handler = |seen: &Arc<Seen>| {
         let seen = seen.clone();
-        move |call: Call, parameters: Parameters| {
+        move |call: Served, parameters: Parameters| {
             let guard = Inside::new(&seen);
             async move {
                 call.given_up().await;

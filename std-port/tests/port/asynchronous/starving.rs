@@ -123,7 +123,7 @@ fn a_service_that_waits_and_its_caller_share_a_thread() {
     };
     agv.my_function_list().add_function("waits", &number(0), waits).unwrap();
     let definition = "leased(number: int) -> (number: int)".parse().unwrap();
-    let ends = |call: cara_std::Call, parameters: cara_std::Parameters| async move {
+    let ends = |call: cara_std::Served, parameters: cara_std::Parameters| async move {
         call.lease_ended().await;
         Ok(parameters)
     };

@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use cara_bench_ends::{Place, answer_all, clock, pin, text};
 use cara_std::keys::{FleetKeys, Store, place::file_name};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, Parameters, ParametersView, Peer,
-    RequestOptions, ServiceError, Threads, Unit,
+    Builder, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, Parameters, ParametersView, Peer,
+    RequestOptions, Served, ServiceError, Threads, Unit,
 };
 use clap::Args;
 use serde::{Deserialize, Serialize};
@@ -165,7 +165,7 @@ fn unit(nodes: &Nodes, id: u32, threads: &Threads) -> Result<Unit> {
     Ok(unit)
 }
 
-fn same(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn same(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     Ok(())
 }
 

@@ -235,7 +235,7 @@ pub(crate) fn units(part: &Part) -> Result<()> {
         let functions = unit.my_function_list();
         functions.add_function("touch", &number()?, |parameters: Parameters| parameters)?;
         let halts = ServiceOptions::new().idempotent().priority(Priority::Emergency);
-        functions.add_service(&Definition::parse("halt()")?, halts, |_: &cara_std::Call, _: &mut _| Ok(()))?;
+        functions.add_service(&Definition::parse("halt()")?, halts, |_: &cara_std::Served, _: &mut _| Ok(()))?;
         streams.push(functions.add_stream(&Definition::stream(POSE)?, LEAST)?);
         unit.publish_my_function_list()?;
         unit.start()?;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use anyhow::Result;
-use cara_std::{Call, Interfaces, Parameters, ParametersView, ServiceError, Threads, Unit};
+use cara_std::{Interfaces, Parameters, ParametersView, Served, ServiceError, Threads, Unit};
 use serde_json::json;
 
 use crate::child::{self, Counters, Question};
@@ -43,7 +43,7 @@ fn start(arguments: &crate::Units, id: u32, threads: &Threads) -> Result<Node> {
     let unit = builder.threads(threads).build()?;
     let runs = Arc::new(AtomicU32::new(0));
     let counted = runs.clone();
-    let touch = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+    let touch = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         counted.fetch_add(1, Ordering::Relaxed);
         Ok(())
     };
@@ -62,7 +62,7 @@ pub(crate) fn name(id: u32) -> String {
     format!("agv-{id}")
 }
 
-fn echo(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+fn echo(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {
     Ok(())
 }
 

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, ensure};
 use cara_std::typed::CallError;
 use cara_std::{
-    Call, Definition, Error, ParametersView, Peer, ServiceError, ServiceOptions, UnitEvent, Variables, interface,
+    Definition, Error, ParametersView, Peer, Served, ServiceError, ServiceOptions, UnitEvent, Variables, interface,
 };
 
 use crate::board::{Bench, Who};
@@ -94,7 +94,7 @@ pub(super) fn unreadable_function(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
     let manager = Manager::start(&bench.keys)?;
     let route: Definition = "route(places: {x: float, y: float}[..8])".parse()?;
-    let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
     manager.system.my_function_list().add_service(&route, ServiceOptions::new(), nothing)?;
     manager.system.publish_my_function_list()?;
     let _board = bench.board(&cable, &Who::agv(17))?;

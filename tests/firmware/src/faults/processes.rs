@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::agv::{GO_TO, GO_TO_LEASE};
 use cara_processes::Process;
-use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceOptions, Unit};
+use cara_std::{Definition, LeaseWatch, ParametersView, Served, ServiceOptions, Unit};
 use rustix::time::{ClockId, clock_gettime};
 
 use super::inject::{STANDS, TRIES, pause};
@@ -152,7 +152,7 @@ pub(crate) fn stand_alone() -> Result<()> {
     let late = Arc::new(AtomicU64::new(0));
     let canary = late.clone();
     let safe = move || println!("{SAFE} {} {}", now(), canary.load(Ordering::Relaxed));
-    let go_to = |_: &Call, _: &mut ParametersView| Ok(());
+    let go_to = |_: &Served, _: &mut ParametersView| Ok(());
     let functions = unit.my_function_list();
     let lease =
         functions.add_service(&Definition::parse(GO_TO)?, ServiceOptions::new().lease(GO_TO_LEASE, safe), go_to)?;

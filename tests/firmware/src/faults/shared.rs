@@ -10,7 +10,7 @@ use cara_processes::Process;
 use cara_std::access::AccessTable;
 use cara_std::control::Control;
 use cara_std::{
-    Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, ServiceOptions,
+    CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Served, ServiceOptions,
 };
 
 use super::inject::{STANDS, pause};
@@ -122,7 +122,7 @@ pub(crate) fn stand_alone() -> Result<()> {
     let canary = late.clone();
     let functions = unit.my_function_list();
     let drive = functions.actuator(move || println!("{SAFE} {} {}", now(), canary.load(Ordering::Relaxed)))?;
-    let nothing = |_: &Call, _: &mut ParametersView| Ok(());
+    let nothing = |_: &Served, _: &mut ParametersView| Ok(());
     let stops = ServiceOptions::new().stops(&drive).priority(Priority::Emergency);
     functions.add_service(&Definition::parse(GO_TO)?, ServiceOptions::new().moves(&drive, GO_TO_LEASE), nothing)?;
     functions.add_service(&Definition::parse(STOP)?, stops, nothing)?;

@@ -27,7 +27,7 @@ use cara_core::time::{Duration, Instant};
 use cara_sim::Sample;
 use cara_std::access::AccessTable;
 use cara_std::{
-    BuildError, Builder, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer,
+    BuildError, Builder, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, Served,
     ServiceOptions, Unit as SUnit, UnitEvent,
 };
 use tempfile::TempDir;
@@ -397,7 +397,7 @@ impl LinuxNode {
         }
         let (kept, node) = (service.clone(), Arc::downgrade(self));
         let in_turns = service.in_turns;
-        let free = move |call: &Call, parameters: &mut ParametersView| serve(&kept, &node, call, parameters);
+        let free = move |call: &Served, parameters: &mut ParametersView| serve(&kept, &node, call, parameters);
         let machine = self.machine()?;
         let list = machine.functions();
         let watch = match (in_turns, replace) {
@@ -413,15 +413,15 @@ impl LinuxNode {
 
 /// The form of a handler that takes the application's state.
 fn with_state(
-    free: impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError>,
-) -> impl Fn(&mut (), &Call, &mut ParametersView) -> Result<(), ServiceError> {
+    free: impl Fn(&Served, &mut ParametersView) -> Result<(), ServiceError>,
+) -> impl Fn(&mut (), &Served, &mut ParametersView) -> Result<(), ServiceError> {
     move |(), call, parameters| free(call, parameters)
 }
 
 fn serve(
     service: &Service,
     node: &Weak<LinuxNode>,
-    call: &Call,
+    call: &Served,
     parameters: &mut ParametersView,
 ) -> Result<(), ServiceError> {
     let node = node.upgrade().ok_or(ServiceError::NotReady)?;

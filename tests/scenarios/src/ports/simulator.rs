@@ -350,7 +350,7 @@ impl SimWorld {
 fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
     let log = service.log();
     let (orders, name) = (Rc::clone(orders), service.name().to_owned());
-    let begins = move |call: &cara_sim::Call| {
+    let begins = move |call: &cara_sim::Served| {
         orders.borrow_mut().entry(name.clone()).or_default().extend(call.lease.clone());
     };
     let kept = service.clone();

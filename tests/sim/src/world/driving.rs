@@ -17,7 +17,7 @@ use cara_core::services::session::Event;
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
 use super::replies::Promise;
-use super::service::{BoxedParameters, Call, Handler, LeaseWatch, Serving};
+use super::service::{BoxedParameters, Handler, LeaseWatch, Served, Serving};
 use super::state::{NODE_TIMER, Storing};
 use super::streams::Sample;
 use super::tasks::Owner;
@@ -248,7 +248,7 @@ impl Inner {
 
     fn one_happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Happened) {
         match happened {
-            (Event::Call(call), Some(parameters)) => self.serve(shared, host, index, &call, parameters),
+            (Event::Incoming(call), Some(parameters)) => self.serve(shared, host, index, &call, parameters),
             (Event::Closed(reason), _) => self.closed(shared, host, index, reason),
             (Event::Sample(sample), Some(values)) => {
                 let (at, age) = (self.network.now(), sample.age);
@@ -328,7 +328,7 @@ impl Inner {
         shared: &Rc<Shared>,
         host: HostId,
         index: u16,
-        call: &cara_core::services::session::Call,
+        call: &cara_core::services::session::Incoming,
         parameters: BoxedParameters,
     ) {
         let unit = &mut self.units[host.index()];
@@ -343,7 +343,7 @@ impl Inner {
         let (failure, cancelled) = (RefCell::default(), Promise::new());
         let running = Rc::new(Serving { stream, ticket, failure, cancelled });
         machine.links.runs(index, &running);
-        let told = Call {
+        let told = Served {
             running: running.clone(),
             caller: caller.clone(),
             priority: call.priority,

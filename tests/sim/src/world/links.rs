@@ -359,7 +359,7 @@ impl Links {
     fn begin_calls(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) {
         let mut arguments = std::mem::replace(&mut self.arguments, super::service::boxed_parameters(0));
         while let Some(Some(call)) = self.with(network, index, |session, cx| session.next_call(cx, &mut arguments)) {
-            happened.push((Event::Call(call), Some(own(&self.functions, call.slot, &arguments))));
+            happened.push((Event::Incoming(call), Some(own(&self.functions, call.slot, &arguments))));
         }
         self.arguments = arguments;
     }
@@ -526,7 +526,7 @@ fn note(
             block.read_into(&mut values).expect("it was checked");
             happened.push((event, Some(values)));
         }
-        Some(event @ Event::Call(call)) => happened.push((event, Some(own(functions, call.slot, arguments)))),
+        Some(event @ Event::Incoming(call)) => happened.push((event, Some(own(functions, call.slot, arguments)))),
         Some(event) => happened.push((event, None)),
     }
 }

@@ -31,16 +31,16 @@ pub type Outcome = Result<BoxedParameters, ServiceError>;
 
 type Running = Pin<Box<dyn Future<Output = Outcome>>>;
 
-type AtOnce = dyn FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError>;
+type AtOnce = dyn FnMut(&Served, &mut ParametersView) -> Result<(), ServiceError>;
 
 enum Body {
     AtOnce(Box<RefCell<AtOnce>>),
-    Future(Box<dyn Fn(Call, BoxedParameters) -> Running>),
+    Future(Box<dyn Fn(Served, BoxedParameters) -> Running>),
 }
 
 /// What a handler is told about the call that it serves.
 #[derive(Clone, Debug)]
-pub struct Call {
+pub struct Served {
     /// The caller.
     pub caller: Identity,
     /// The call's class.
@@ -56,7 +56,7 @@ pub struct Call {
     pub(super) running: Rc<Serving>,
 }
 
-impl Call {
+impl Served {
     /// What the handler is to return for this failure, whose text and values go to the caller.
     pub fn fail(&self, failure: Failure) -> ServiceError {
         let error = failure.error();
@@ -172,7 +172,7 @@ pub struct Service {
 
 impl Service {
     /// A service in place: arguments come in the parameters, results go there.
-    pub fn new(body: impl FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError> + 'static) -> Self {
+    pub fn new(body: impl FnMut(&Served, &mut ParametersView) -> Result<(), ServiceError> + 'static) -> Self {
         Self::with(Body::AtOnce(Box::new(RefCell::new(body))))
     }
 
@@ -188,7 +188,7 @@ impl Service {
     }
 
     /// A service that lives through virtual time: it may sleep and call others, while its unit goes on serving.
-    pub fn future<F>(body: impl Fn(Call, BoxedParameters) -> F + 'static) -> Self
+    pub fn future<F>(body: impl Fn(Served, BoxedParameters) -> F + 'static) -> Self
     where
         F: Future<Output = Outcome> + 'static,
     {
@@ -272,7 +272,7 @@ impl Service {
         self.actuator.as_ref().map(|actuator| actuator.word().is_live(now))
     }
 
-    pub(super) async fn run(self: Rc<Self>, call: Call, mut parameters: BoxedParameters) -> Outcome {
+    pub(super) async fn run(self: Rc<Self>, call: Served, mut parameters: BoxedParameters) -> Outcome {
         let unit = call.unit.clone();
         let outcome = match &self.body {
             Body::Future(start) => start(call, parameters).await,

@@ -376,7 +376,7 @@ fn mover(watch: &Shared, number: usize, actuator: usize, actuators: &[Actuator; 
 }
 
 /// The loop of one order.
-async fn moving(watch: Shared, n: usize, actuator: usize, actuators: [Actuator; 2], call: cara_sim::Call) {
+async fn moving(watch: Shared, n: usize, actuator: usize, actuators: [Actuator; 2], call: cara_sim::Served) {
     let order = call.lease.clone().expect("it has a lease");
     for turn in 0_u64.. {
         call.unit.sleep(PULSE).await;

@@ -191,7 +191,7 @@ impl End {
             let receipt = self.session.receive(context!(self), &mut bytes, Some(&mut arguments));
             let quiet = receipt.consumed == 0 && receipt.event.is_none();
             let consumed = receipt.consumed;
-            if let Some(Event::Call(call)) = receipt.event {
+            if let Some(Event::Incoming(call)) = receipt.event {
                 self.ran += 1;
                 let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
             }

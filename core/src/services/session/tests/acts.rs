@@ -5,7 +5,7 @@ use std::rc::Rc;
 use std::vec;
 use std::vec::Vec;
 
-use super::super::{Call, Event, RequestOptions};
+use super::super::{Event, Incoming, RequestOptions};
 use super::setup::{self, Handler, Run};
 use super::side::{Arguments, Begun, Side, Table, context};
 use crate::config::{Constraints, Priority};
@@ -168,7 +168,7 @@ impl Side {
     }
 
     /// Whether an order of a function may go on, by its own look.
-    pub(super) fn goes_on(&self, call: &Call) -> bool {
+    pub(super) fn goes_on(&self, call: &Incoming) -> bool {
         let lease = &self.functions.function(call.slot).unwrap().handler.lease;
         lease.as_ref().unwrap().is_live_for(call.order.unwrap(), self.now)
     }

@@ -2,7 +2,7 @@
 
 use std::string::String;
 
-use super::super::{Call, Event, RequestOptions};
+use super::super::{Event, Incoming, RequestOptions};
 use super::net::Datagrams;
 use super::pair::Pair;
 use super::setup::Setup;
@@ -31,7 +31,7 @@ impl Side {
         self.session.answer_failed(context!(self), call.ticket, failure)
     }
 
-    fn tell_progress(&mut self, call: &Call, value: i64) -> Result<(), Error> {
+    fn tell_progress(&mut self, call: &Incoming, value: i64) -> Result<(), Error> {
         self.session.progress(context!(self), call.ticket, &x(value))
     }
 
@@ -71,7 +71,7 @@ fn moving() -> (Pair, Slot) {
     (pair, slot)
 }
 
-fn begin(pair: &mut Pair, function: &str) -> (CallId, Call) {
+fn begin(pair: &mut Pair, function: &str) -> (CallId, Incoming) {
     let id = pair.manager.watched(function);
     pair.settle();
     (id, *pair.agv.held.last().unwrap())

@@ -3,7 +3,7 @@
 use std::vec::Vec;
 
 use super::super::Event;
-use super::super::{Call, RequestOptions};
+use super::super::{Incoming, RequestOptions};
 use super::net::Datagrams;
 use super::pair::Pair;
 use super::{none, x};
@@ -40,7 +40,7 @@ fn go(pair: &mut Pair, class: Priority, renew: Renew) -> CallId {
 }
 
 /// The same, begun; what its handler was given.
-fn begun(pair: &mut Pair, class: Priority) -> (CallId, Call) {
+fn begun(pair: &mut Pair, class: Priority) -> (CallId, Incoming) {
     let id = go(pair, class, Renew::Process);
     pair.settle();
     (id, *pair.agv.held.last().unwrap())

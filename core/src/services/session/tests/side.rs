@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::string::{String, ToString};
 use std::vec::Vec;
 
-use super::super::{Call, Event, Session, SessionConfig};
+use super::super::{Event, Incoming, Session, SessionConfig};
 use super::net::{DATAGRAM_PORT, Net};
 use super::setup::{self, Handler, Run, Setup};
 use crate::config::Priority;
@@ -86,7 +86,7 @@ pub(super) struct Side {
     /// Handlers that were begun.
     pub(super) ran: Vec<Begun>,
     /// Calls that wait for an answer of the test.
-    pub(super) held: Vec<Call>,
+    pub(super) held: Vec<Incoming>,
     pub(super) hub: Lobby,
     pub(super) inbox: Vec<u8>,
     /// What comes stays in the inbox.
@@ -95,7 +95,7 @@ pub(super) struct Side {
     /// Where the results of calls go.
     pub(super) results: BTreeMap<CallId, Arguments>,
     /// Answers that could not be kept yet.
-    unanswered: Vec<(Call, Result<Arguments, Error>)>,
+    unanswered: Vec<(Incoming, Result<Arguments, Error>)>,
     pub(super) buffers: usize,
     pub(super) base: Duration,
     /// Why calls have failed, and what they have told.
@@ -228,7 +228,7 @@ impl Side {
         worked
     }
 
-    fn run(&mut self, call: Call, arguments: &mut Arguments) {
+    fn run(&mut self, call: Incoming, arguments: &mut Arguments) {
         let function = self.functions.function(call.slot).unwrap();
         self.ran.push(Begun {
             function: function.name().to_string(),
@@ -246,7 +246,7 @@ impl Side {
         }
     }
 
-    pub(super) fn answer(&mut self, call: Call, result: Result<Arguments, Error>) {
+    pub(super) fn answer(&mut self, call: Incoming, result: Result<Arguments, Error>) {
         let lent = result.as_ref().map(|results| results.as_view()).map_err(|error| *error);
         if self.session.answer(context!(self), call.ticket, lent).is_err() {
             self.unanswered.push((call, result));
@@ -261,7 +261,7 @@ impl Side {
         }
         match event {
             None => {}
-            Some(Event::Call(call)) => self.run(call, arguments),
+            Some(Event::Incoming(call)) => self.run(call, arguments),
             Some(Event::Reply(id, outcome)) => {
                 let outcome = outcome.and_then(|results| {
                     let block = self.session.results(&results, &self.inbox)?;

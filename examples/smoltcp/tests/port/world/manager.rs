@@ -274,7 +274,7 @@ impl Manager {
         while let Some(session) = &mut self.sessions[index]
             && let Some(call) = session.next_call(context!(self, now), &mut *self.arguments)
         {
-            self.happened(now, index, Some(Event::Call(call)), &[]);
+            self.happened(now, index, Some(Event::Incoming(call)), &[]);
         }
         self.poll_session(now, index);
     }
@@ -334,7 +334,7 @@ impl Manager {
     fn happened(&mut self, now: Instant, index: usize, event: Option<Event>, lent: &[u8]) {
         match event {
             Some(Event::Joined) => self.live[index] = true,
-            Some(Event::Call(call)) => {
+            Some(Event::Incoming(call)) => {
                 self.served += 1;
                 let Some(session) = &mut self.sessions[index] else { return };
                 session.answer(context!(self, now), call.ticket, Ok(&*self.arguments)).unwrap();

@@ -11,9 +11,9 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::Ticket;
 use cara_core::services::lease::{Lease, Order};
 use cara_core::services::requests::CallId;
-use cara_core::services::session::{Call, Event, ReplyBlock};
+use cara_core::services::session::{Event, Incoming, ReplyBlock};
 use cara_core::time::{Duration, Instant};
-use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
+use cara_smoltcp::{Outcome, Program, Resources, SUnit, Settings};
 
 use super::{Cable, SharedSwitch, manager};
 
@@ -53,19 +53,19 @@ pub(crate) struct Notes {
 }
 
 impl Program for Notes {
-    fn serve(&mut self, call: &Call, parameters: &mut ParametersView) -> Served {
+    fn serve(&mut self, call: &Incoming, parameters: &mut ParametersView) -> Outcome {
         if Some(call.slot) == self.slow {
             self.waiting = Some(call.ticket);
-            return Served::Later;
+            return Outcome::Later;
         }
         if Some(call.slot) == self.report {
             self.reports += 1;
             let text = "r".repeat(900);
-            return Served::Now(parameters.set_value("report", &text[..]).map_err(|_| ServiceError::BadResults));
+            return Outcome::Now(parameters.set_value("report", &text[..]).map_err(|_| ServiceError::BadResults));
         }
         let [number] = match parameters.variable::<[i64; 1]>("number") {
             Ok(number) => number,
-            Err(_) => return Served::Now(Err(ServiceError::Failed(1))),
+            Err(_) => return Outcome::Now(Err(ServiceError::Failed(1))),
         };
         if Some(call.slot) == self.go_to {
             (self.driving, self.drives_for) = (true, call.order);
@@ -73,7 +73,7 @@ impl Program for Notes {
             self.echoed.push(number);
             self.order.push("echo");
         }
-        Served::Now(if number < 0 { Err(ServiceError::Failed(2)) } else { Ok(()) })
+        Outcome::Now(if number < 0 { Err(ServiceError::Failed(2)) } else { Ok(()) })
     }
 
     fn make_safe(&mut self, function: Slot) {

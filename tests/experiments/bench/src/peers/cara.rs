@@ -14,8 +14,8 @@ use anyhow::{Context, Result, ensure};
 use cara_bench_ends::{Caller, Delivery, Executed, Limits, Peer, Place, Printer, Server, cable_end};
 use cara_std::keys::{FleetKeys, Store, place::file_name};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Constraints, Delivery as CaraDelivery, Fleet, Identity, Interfaces, Parameters,
-    ParametersView, Peer as Node, RequestOptions, ServiceError, Threads, Unit, UnitEvent,
+    Builder, CommunicationSystem, Constraints, Delivery as CaraDelivery, Fleet, Identity, Interfaces, Parameters,
+    ParametersView, Peer as Node, RequestOptions, Served, ServiceError, Threads, Unit, UnitEvent,
 };
 
 /// Longest text in bytes.
@@ -164,8 +164,8 @@ impl Peer for Cara {
         let (text, printer, executed) = (parameters()?, place.printer(), Arc::new(Executed::default()));
         let counted = executed.clone();
         let functions = passive.my_function_list();
-        functions.add_function("echo", &*text, move |_: &Call, view: &mut ParametersView| look_at(view, printer))?;
-        functions.add_function("take", &*text, move |_: &Call, view: &mut ParametersView| {
+        functions.add_function("echo", &*text, move |_: &Served, view: &mut ParametersView| look_at(view, printer))?;
+        functions.add_function("take", &*text, move |_: &Served, view: &mut ParametersView| {
             counted.note();
             look_at(view, printer)
         })?;

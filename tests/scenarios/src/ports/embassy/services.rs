@@ -45,7 +45,7 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
 }
 
 fn at_once(node: Weak<BoardNode>, service: Service) -> Handler<()> {
-    Handler::free(Box::leak(Box::new(move |call: &cara_embassy::Call<()>, parameters: &mut _| {
+    Handler::free(Box::leak(Box::new(move |call: &cara_embassy::Served<()>, parameters: &mut _| {
         service.log().begin(now());
         node.upgrade().into_iter().for_each(|node| node.begins(service.name(), call.lease));
         let result = (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters);
