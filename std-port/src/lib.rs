@@ -3,6 +3,44 @@
 //! Units prove their identity and seal their frames. A unit's [keys] are in a file that `cara keys` makes; without one,
 //! building the unit is an error that names the command. [`Builder::insecure`] opts out.
 //!
+//! A vehicle and its manager share a trait, which [`interface`](macro@interface) makes a server and a client of:
+//!
+//! ```no_run
+//! use std::time::Duration;
+//! use cara_std::{CommunicationSystem, Unit, interface};
+//!
+//! #[interface]
+//! trait Agv {
+//!     /// Tells its charge in percent.
+//!     #[returns(percent)]
+//!     fn battery(&mut self) -> i64;
+//! }
+//!
+//! struct Vehicle {
+//!     charge: i64,
+//! }
+//!
+//! impl Agv for Vehicle {
+//!     fn battery(&mut self) -> i64 {
+//!         self.charge
+//!     }
+//! }
+//!
+//! let vehicle = Unit::builder("agv-17", 17, "depot", 1)?.state(Vehicle { charge: 80 }).build()?;
+//! vehicle.my_function_list().serve(AgvServer)?;
+//! vehicle.publish_my_function_list()?;
+//! vehicle.start()?;
+//!
+//! let depot = CommunicationSystem::new("depot", 1)?;
+//! depot.start()?;
+//! let agv = depot.wait_for_s_unit("agv-17", Duration::from_secs(10))?;
+//! agv.wait_for_function("battery", Duration::from_secs(10));
+//! println!("{} %", AgvClient::at(&agv).battery()?);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! Functions can also be named and found while the program runs, as in the paper's listing:
+//!
 //! ```no_run
 //! use cara_std::{CommunicationSystem, Parameters};
 //!

@@ -15,6 +15,25 @@ use quote::quote;
 
 /// As `cara_core::Variables`: the fields of a struct are variables by their names, an enum without fields is one integer.
 ///
+/// ```
+/// use cara_core::Variables;
+/// use cara_core::distribution::parameters::Parameters;
+///
+/// #[derive(Variables, Debug, PartialEq)]
+/// struct Target {
+///     #[unit = "m"]
+///     position: [f64; 2],
+///     fast: bool,
+/// }
+///
+/// let target = Target { position: [1.5, 2.0], fast: true };
+/// let mut parameters = Parameters::new();
+/// target.to_parameters(&mut parameters)?;
+/// assert_eq!(parameters.variable::<[f64; 2]>("position")?, [1.5, 2.0]);
+/// assert_eq!(Target::from_parameters(&parameters)?, target);
+/// # Ok::<(), cara_core::error::Error>(())
+/// ```
+///
 /// With the feature `nested` of the core, which Linux has always, a field that is such a struct itself is a record, `Vec<T>`
 /// and `heapless::Vec<T, N>` are lists, and `Option<T>` is a list of one at most.
 ///
@@ -41,6 +60,24 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 }
 
 /// As `cara_core::interface`: makes `DriveServer`, `DriveClient` and `DriveAsyncClient` of a trait `Drive`.
+///
+/// ```
+/// use cara_core::error::ServiceError;
+/// use cara_core::interface;
+///
+/// /// What a vehicle offers. Its state implements this, a port's list of functions serves `AgvServer`, and
+/// /// `AgvClient::at(&peer)` has a method of the same name for each function.
+/// #[interface]
+/// trait Agv {
+///     /// Tells where it is, in metres.
+///     #[idempotent]
+///     #[returns(#[unit = "m"] position)]
+///     fn position(&mut self) -> [f64; 2];
+///
+///     /// Shows a text.
+///     fn show(&mut self, #[size(40)] text: &str) -> Result<(), ServiceError>;
+/// }
+/// ```
 ///
 /// | attribute of a function | means |
 /// |---|---|
