@@ -146,7 +146,6 @@ impl Inner {
         let unit = &mut self.units[host.index()];
         let storing = unit.settings.storing;
         let Some(machine) = &mut unit.machine else { return false };
-        let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
         match machine.links.hub.node.take_claim_event() {
             None => return false,
             Some(ClaimEvent::Keep(manager, tagged)) if storing != Storing::Hangs => {
@@ -159,6 +158,7 @@ impl Inner {
                 unit.claims.own = above.raised(self.network.random().bits());
                 let tagged = unit.claims.own.tagged(&unit.settings.identity, &machine.links.keys.codes);
                 machine.links.hub.node.set_claim(tagged.unwrap_or_default());
+                let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
                 for index in links {
                     machine.links.with(&mut self.network, index, |session, cx| session.announce_claim(cx));
                 }
@@ -171,6 +171,7 @@ impl Inner {
             Some(ClaimEvent::StepDown(by)) => {
                 // Stored, so that its next start claims above it.
                 unit.claims.own = unit.claims.own.max(by.claim);
+                let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
                 for index in links {
                     machine
                         .links
