@@ -15,7 +15,7 @@ use cara_core::error::Refusal;
 use cara_core::services::access::{self, Access, Bucket, Functions, Principal, Rate, Rule, Verbs, Who};
 use cara_core::services::event::UnitEvent;
 use cara_core::services::heart::Heart;
-use cara_core::services::lease::{Lease, Service};
+use cara_core::services::lease::{LastOrder, Lease, Service, trace_id};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
 use cara_core::services::session::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
@@ -261,6 +261,7 @@ entry!(leases, {
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
     keep((lease.left(*unknown()), lease.end(*unknown(), *unknown(), *unknown())));
     keep((lease.state(), lease.state().outcome_of(*unknown(), *unknown())));
+    keep((unknown::<LastOrder>().trace(), trace_id(*unknown(), *unknown())));
     lease.set_ramp(*unknown());
     keep((lease.stage(*unknown()), lease.stage_for(*unknown(), *unknown())));
     lease.cut(*unknown());
