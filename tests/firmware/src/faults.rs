@@ -46,7 +46,7 @@ pub(crate) struct Stop {
     announced: u64,
     /// From the last renewal of the lease until then.
     renewed: u64,
-    /// From the first datagram behind that call until then; 0 where none came.
+    /// From the first datagram behind that call which ends a motion until then; 0 where the stream was ahead of it.
     heard: u64,
     /// The longest turn of the executor so far.
     turn: u64,

@@ -45,7 +45,7 @@ static RECORD: Mutex<Cell<Record>> = Mutex::new(Cell::new(Record::NEW));
 struct Record {
     /// When the fault was announced.
     marked: Instant,
-    /// When the first datagram behind that was taken from the network's controller.
+    /// When the first datagram behind that which ends a motion was taken from the network's controller.
     heard: Option<Instant>,
     /// The last tick before which a renewal of the lease was seen.
     renewed: Instant,
@@ -250,10 +250,16 @@ pub(crate) fn tick() {
     });
 }
 
-/// A frame was taken from the network's controller.
+/// A frame was taken from the network's controller. What is in it is sealed, and told by its length: renewals and
+/// keep-alives come in datagrams as well, and say nothing of when a stop came.
 pub(crate) fn received(frame: &[u8]) {
     const IPV4: [u8; 2] = [8, 0];
     const UDP: u8 = 17;
+    /// The call of `stop`, and the release of an order.
+    const ENDS: [usize; 2] = [125, 97];
+    if !ENDS.contains(&frame.len()) {
+        return;
+    }
     let is_own = frame.first().is_some_and(|first| first & 1 == 0);
     if is_own && frame.get(12..14) == Some(&IPV4) && frame.get(23) == Some(&UDP) {
         Record::change(|record| record.heard = record.heard.or(Some(now())));

@@ -101,9 +101,11 @@ impl EmulatedBoard {
             drop(held);
             let (behind, stop) = self.stopped(line)?;
             self.stands(&agv, line, behind)?;
-            return Ok(stop);
+            if stop.heard > 0 {
+                return Ok(stop);
+            }
         }
-        bail!("in {TRIES} tries no lease was renewed in time")
+        bail!("in {TRIES} tries no lease was renewed in time, or no datagram that releases came first")
     }
 }
 

@@ -119,9 +119,8 @@ impl Kind {
             Failing::Bumper => stop.announced,
             // The other loop's renewals go on. The beat from which the last one of this loop counts came behind the announcement.
             Failing::Loop => stop.announced,
-            // From when the board took the datagram of the stop or release, if that came before the same in the stream.
-            Failing::Flooded | Failing::Guard if stop.heard > 0 => stop.heard,
-            Failing::Flooded | Failing::Guard => stop.announced,
+            // From when the board took the datagram of the stop or release: the manager's machine may be late to send it.
+            Failing::Flooded | Failing::Guard => stop.heard,
             _ => stop.announced.min(stop.renewed),
         }
     }

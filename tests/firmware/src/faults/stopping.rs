@@ -30,11 +30,11 @@ impl EmulatedBoard {
             self.stands(&agv, line, behind)?;
             reset(&agv)?;
             self.stands(&agv, line, behind)?;
-            if !is_late {
+            if !is_late && stop.heard > 0 {
                 return Ok(stop);
             }
         }
-        bail!("in {TRIES} tries no lease was renewed in time")
+        bail!("in {TRIES} tries no lease was renewed in time, or no datagram that stops came first")
     }
 
     /// Whether this machine was too busy to renew the lease until then.
