@@ -1,6 +1,6 @@
 //! Calls of the peer: which one begins, and how it is answered or refused.
 
-use super::permitting::{decide, log_refusal};
+use super::permitting::{decide_call, log_refusal};
 use super::{Incoming, Phase, Session};
 use crate::config::Priority;
 use crate::distribution::block;
@@ -11,7 +11,6 @@ use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
-use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Ticket};
 use crate::services::{Context, Port};
 
@@ -61,8 +60,7 @@ impl<P: Port> Session<P> {
             }
             let function = functions.lookup(head.slot, head.generation)?;
             // The table may have changed while the call waited.
-            let may = |verb| decide(access, remote, function.name(), verb).is_allowed();
-            if !may(Verb::Call) || head.takes_over && !may(Verb::TakeOver) {
+            if !decide_call(access, remote, function.name(), head.takes_over).is_allowed() {
                 return Err(Error::NotAllowed);
             }
             read_arguments(function.signature, block, arguments).map(|()| function.attributes)

@@ -17,7 +17,6 @@ use crate::host::connections::{Inbound, LinkCounter, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
-use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Cancelled, Seen};
 use crate::services::lease::ActuatorState;
 use crate::services::lease::Service;
@@ -122,18 +121,18 @@ impl<P: Port> Session<P> {
             }
         };
         self.holds = received.paused;
-        let Some(incoming) = received.incoming else {
+        let Some(inbound) = received.inbound else {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
         // What a later version says shows no life that this one understands; of a session body it is known once it is read.
-        if !matches!(incoming, Inbound::Skipped | Inbound::Session(_)) {
+        if !matches!(inbound, Inbound::Skipped | Inbound::Session(_)) {
             self.liveness.heard(cx.now);
         }
-        let is_emergency = matches!(incoming, Inbound::Message(Priority::Emergency, _));
+        let is_emergency = matches!(inbound, Inbound::Message(Priority::Emergency, _));
         // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
         // in the same bytes is reached first.
         let at_once = is_emergency || received.consumed == lent.len();
-        let event = self.digest(cx, incoming, lent, arguments.filter(|_| at_once));
+        let event = self.digest(cx, inbound, lent, arguments.filter(|_| at_once));
         Receipt { consumed: received.consumed, event, paused: received.paused }
     }
 
@@ -181,11 +180,11 @@ impl<P: Port> Session<P> {
     fn digest(
         &mut self,
         cx: &mut Context<'_, P>,
-        incoming: Inbound,
+        inbound: Inbound,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
-        match (incoming, self.phase) {
+        match (inbound, self.phase) {
             // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
             (Inbound::Refuse(_), _) if !self.link.cipher().is_sealing() => {
                 self.ended_in_clear(None);
@@ -527,7 +526,7 @@ impl<P: Port> Session<P> {
         // First of all what a stop stops, however late it is and whatever its handler has to wait for, or is refused for.
         let stops = function.as_ref().ok().filter(|function| function.attributes.stop);
         if let Some(function) = stops.filter(|_| self.publishing.told(header.slot, header.generation) == Told::Now)
-            && self.permit_call(cx, function, priority).is_ok()
+            && self.permit_call(cx, function, priority, false).is_ok()
         {
             self.stop_orders(cx, header);
         }
@@ -563,10 +562,7 @@ impl<P: Port> Session<P> {
             return Err(Error::UnknownFunction);
         }
         if cx.access.is_some() {
-            self.permit_call(cx, &function, priority)?;
-            if header.takes_over && !self.may(cx, header.slot, Verb::TakeOver) {
-                return Err(Error::NotAllowed);
-            }
+            self.permit_call(cx, &function, priority, header.takes_over)?;
         }
         if priority != Priority::Emergency && !function.attributes.stop {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;

@@ -24,6 +24,19 @@ pub(super) fn decide<E>(
     }
 }
 
+/// Whether the peer may make this call; taking over is a right of its own.
+pub(super) fn decide_call<E>(
+    access: Option<&dyn Access>,
+    remote: Option<&Remote<E>>,
+    function: &str,
+    takes_over: bool,
+) -> Decision {
+    if takes_over && !decide(access, remote, function, Verb::TakeOver).is_allowed() {
+        return Decision::Denied;
+    }
+    decide(access, remote, function, Verb::Call)
+}
+
 impl<P: Port> Session<P> {
     /// The access table of the context is another one than before: the peer is told what it may see from here on,
     /// leases end that it may not hold any more, and of what it has published this unit sees what it may. For a live link; before that, what is published is under the new table anyway.
@@ -50,7 +63,7 @@ impl<P: Port> Session<P> {
         cx.access.is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
     }
 
-    pub(super) fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
+    fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
         let function = cx.functions.function(slot);
         function.is_none_or(|function| decide(cx.access, self.remote.as_ref(), function.name(), verb).is_allowed())
     }
@@ -61,8 +74,9 @@ impl<P: Port> Session<P> {
         cx: &Context<'_, P>,
         function: &Function<'_, dyn Service>,
         priority: Priority,
+        takes_over: bool,
     ) -> Result<(), Error> {
-        match decide(cx.access, self.remote.as_ref(), function.name(), Verb::Call) {
+        match decide_call(cx.access, self.remote.as_ref(), function.name(), takes_over) {
             Decision::Denied => Err(Error::NotAllowed),
             Decision::Allowed { rate: None, .. } => Ok(()),
             // A stop never comes too often, nor does another emergency.
