@@ -41,13 +41,13 @@ pub(crate) fn decode(context: &Context, bytes: &[u8]) -> Value {
         match link.receive(&mut pool, &mut frame) {
             Err(reason) => return ended(seen, reason),
             Ok(received) => {
-                let Some(incoming) = received.incoming else {
+                let Some(inbound) = received.inbound else {
                     if !whole {
                         seen.push(json!({ "incomplete": frame.len() }));
                     }
                     continue;
                 };
-                match value(&link, incoming, &frame) {
+                match value(&link, inbound, &frame) {
                     Some(value) => seen.push(value),
                     None => return ended(seen, CloseReason::Protocol),
                 }
@@ -65,8 +65,8 @@ fn ended(mut seen: Vec<Value>, reason: CloseReason) -> Value {
 
 /// `None` for what ends the link. An unreadable hello is refused and an unreadable session body dropped, so both show
 /// their bytes.
-fn value(link: &Link<Boxed, Plain>, incoming: Inbound, lent: &[u8]) -> Option<Value> {
-    Some(match incoming {
+fn value(link: &Link<Boxed, Plain>, inbound: Inbound, lent: &[u8]) -> Option<Value> {
+    Some(match inbound {
         Inbound::Hello(place) => {
             let bytes = link.view(place, lent);
             json!({ "hello": decoded::hello(bytes).unwrap_or_else(|| unreadable(bytes)) })

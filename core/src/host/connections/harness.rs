@@ -117,21 +117,21 @@ pub(super) fn offer<C: Seal>(
 ) -> Result<bool, CloseReason> {
     loop {
         let received = link.receive(pool, piece)?;
-        if let Some(incoming) = received.incoming {
-            items.push(item(link, incoming, piece));
+        if let Some(inbound) = received.inbound {
+            items.push(item(link, inbound, piece));
         }
         piece.drain(..received.consumed);
         if received.paused {
             return Ok(false);
         }
-        if received.consumed == 0 && received.incoming.is_none() {
+        if received.consumed == 0 && received.inbound.is_none() {
             return Ok(true);
         }
     }
 }
 
-fn item<C: Seal>(link: &Link<Boxed, C>, incoming: Inbound, lent: &[u8]) -> Item {
-    match incoming {
+fn item<C: Seal>(link: &Link<Boxed, C>, inbound: Inbound, lent: &[u8]) -> Item {
+    match inbound {
         Inbound::Message(priority, place) => Item::Message(priority, link.view(place, lent).to_vec()),
         Inbound::Session(place) => Item::Session(link.view(place, lent).to_vec()),
         Inbound::Hello(place) => Item::Hello(link.view(place, lent).to_vec()),

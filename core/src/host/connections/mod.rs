@@ -99,7 +99,7 @@ pub struct Received {
     /// How many of the lent bytes are used up.
     pub consumed: usize,
     /// What they completed.
-    pub incoming: Option<Inbound>,
+    pub inbound: Option<Inbound>,
     /// No message buffer is free: stop reading, and offer the rest again later.
     pub paused: bool,
 }
@@ -159,16 +159,16 @@ impl<S: Storage, C: Seal> Link<S, C> {
     /// completes nothing: that last call returns the buffer of the last message.
     pub fn receive(&mut self, buffers: &mut dyn Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
         let available = bytes.len();
-        let mut received = Received { consumed: 0, incoming: None, paused: false };
+        let mut received = Received { consumed: 0, inbound: None, paused: false };
         self.receiver.receive(&mut self.cipher, buffers, bytes, &mut received)?;
         self.counters.add(LinkCounter::BytesReceived, received.consumed as u64);
         if received.paused && available > 0 {
             self.counters.count(LinkCounter::ReadPaused);
         }
-        if received.incoming.is_some() {
+        if received.inbound.is_some() {
             self.counters.count(LinkCounter::FramesReceived);
         }
-        if let Some(Inbound::Message(..)) = received.incoming {
+        if let Some(Inbound::Message(..)) = received.inbound {
             self.counters.count(LinkCounter::MessagesReceived);
         }
         Ok(received)

@@ -105,7 +105,7 @@ impl<S: Storage> Receiver<S> {
             // left to do.
             let progress = received.consumed > before;
             let goes_on = if progress { received.consumed < lent.len() } else { self.partial.done };
-            if !goes_on || received.paused || received.incoming.is_some() {
+            if !goes_on || received.paused || received.inbound.is_some() {
                 return Ok(());
             }
         }
@@ -276,7 +276,7 @@ impl<S: Storage> Receiver<S> {
         received: &mut Received,
     ) -> Result<(), CloseReason> {
         // Totals and lengths are the peer's word. Each arm compares them with the limits before a byte is copied.
-        received.incoming = Some(match content {
+        received.inbound = Some(match content {
             Content::Hello => Inbound::Hello(place),
             Content::Refuse(code) => Inbound::Refuse(code),
             Content::Close(code) => Inbound::Close(code),
