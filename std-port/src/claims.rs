@@ -7,9 +7,10 @@ use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
 use rustix::fs::{FlockOperation, flock};
 
+use crate::NameAndId;
 use crate::file_name::escape;
 use crate::keys::{self, KeptClaims, KeyError};
 
@@ -18,8 +19,8 @@ pub(crate) const VARIABLE: &str = "CARA_STATE";
 /// The same as systemd sets it for `StateDirectory=`.
 const OF_SYSTEMD: &str = "STATE_DIRECTORY";
 
-/// The folder of state that the environment names.
-pub(crate) fn folder() -> Option<PathBuf> {
+/// The folder of state that the environment names: `CARA_STATE`, or else systemd's `STATE_DIRECTORY`.
+pub fn folder() -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set(VARIABLE).or_else(|| set(OF_SYSTEMD))
 }
@@ -35,6 +36,15 @@ impl ClaimFile {
         let role = identity.role().as_str();
         let name = format!("{}-{}-{role}-{}.claims", escape(identity.name()), identity.id(), fleet.0);
         Self { path: folder.join(name) }
+    }
+
+    /// The unit's file at this path, and its fleet; `None` for any other file.
+    pub(crate) fn at(path: PathBuf, unit: &NameAndId) -> Option<(u32, Self)> {
+        let name = path.file_name()?.to_str()?;
+        let rest = name.strip_prefix(&format!("{}-{}-", escape(&unit.name), unit.id))?.strip_suffix(".claims")?;
+        let (role, fleet) = rest.split_once('-')?;
+        let fleet = [Role::MUnit, Role::SUnit].iter().any(|of| of.as_str() == role).then(|| fleet.parse().ok())??;
+        Some((fleet, Self { path }))
     }
 
     /// What is kept. A file that is missing, or damaged, keeps nothing: that locks no unit out, and is reported in the log.

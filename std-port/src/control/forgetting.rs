@@ -10,7 +10,6 @@ use rustix::fs::FlockOperation;
 use super::audit;
 use crate::NameAndId;
 use crate::claims::ClaimFile;
-use crate::file_name::escape;
 use crate::keys::{self, KeyError};
 
 /// What a unit had obeyed.
@@ -55,8 +54,8 @@ pub fn forget_claims(
     let mut all = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(wrong)? {
         let path = entry.map_err(wrong)?.path();
-        let Some(of) = fleet_of(&path, unit).filter(|of| fleet.is_none_or(|fleet| fleet == *of)) else { continue };
-        let file = ClaimFile { path };
+        let found = ClaimFile::at(path, unit).filter(|(of, _)| fleet.is_none_or(|fleet| fleet == *of));
+        let Some((of, file)) = found else { continue };
         let _lock = file.lock(FlockOperation::NonBlockingLockExclusive).map_err(|error| {
             if error.kind() == io::ErrorKind::WouldBlock { ForgetError::Runs(unit.clone()) } else { wrong(error) }
         })?;
@@ -73,14 +72,6 @@ pub fn forget_claims(
         all.extend(forgotten);
     }
     Ok(all)
-}
-
-/// The fleet in the name of a unit's file of claims.
-fn fleet_of(path: &Path, unit: &NameAndId) -> Option<u32> {
-    let name = path.file_name()?.to_str()?;
-    let rest = name.strip_prefix(&format!("{}-{}-", escape(&unit.name), unit.id))?.strip_suffix(".claims")?;
-    let (role, fleet) = rest.split_once('-')?;
-    ["m_unit", "s_unit"].contains(&role).then(|| fleet.parse().ok())?
 }
 
 #[cfg(test)]

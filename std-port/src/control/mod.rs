@@ -33,6 +33,7 @@ mod values;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+pub use crate::claims::folder as state_folder;
 pub use answering::{execute, execute_while};
 pub(crate) use audit::{Audit, ProgramCall};
 pub use client::{

@@ -119,6 +119,10 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn claim(&self, heard: Claim) -> Result<(), StartError> {
         let (identity, _) = self.identity();
         let file = self.claim_file();
+        if let Some(file) = &file {
+            // Before it is read: what is forgotten later would be written back. Where nothing can be written, nothing can be forgotten.
+            *lock(&self.claims.held) = file.hold().ok();
+        }
         let mut kept = file.as_ref().map(ClaimFile::read).unwrap_or_default();
         let codes = self.keys().codes();
         if identity.role() == Role::MUnit {
@@ -150,10 +154,6 @@ impl<T: Send + 'static> Engine<T> {
             if file.is_some() {
                 cell.hub.node.store_claims();
             }
-        }
-        if let Some(file) = &file {
-            // Where nothing can be written, nothing can be forgotten.
-            *lock(&self.claims.held) = file.hold().ok();
         }
         lock(&self.claims.writer).kept = kept;
         Ok(())

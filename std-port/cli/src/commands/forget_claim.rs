@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use cara_std::control::{ForgetError, Forgotten, forget_claims};
+use cara_std::control::{ForgetError, Forgotten, forget_claims, state_folder};
 use serde_json::json;
 
 use cara_tools::exit::{Ended, Exit};
@@ -20,7 +20,7 @@ use cara_tools::output;
 pub(crate) struct Arguments {
     /// The unit: NAME/ID.
     node: NameAndId,
-    /// Its folder of state; what CARA_STATE names unless told.
+    /// Its folder of state; CARA_STATE or STATE_DIRECTORY unless told.
     #[arg(long, value_name = "FOLDER")]
     state: Option<PathBuf>,
     /// The audit log; `audit.log` in the folder of state unless told.
@@ -29,8 +29,7 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(Arguments { node, state, audit }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let named = || std::env::var_os("CARA_STATE").filter(|value| !value.is_empty()).map(PathBuf::from);
-    let state = state.or_else(named);
+    let state = state.or_else(state_folder);
     let state = state.ok_or_else(|| Ended::usage("say which folder of state the unit has: --state FOLDER"))?;
     let audit = audit.unwrap_or_else(|| state.join("audit.log"));
     let forgotten = forget_claims(&state, &node, global.fleet, &audit).map_err(|error| match error {
