@@ -158,8 +158,7 @@ impl Inner {
                 unit.claims.own = above.raised(self.network.random().bits());
                 let tagged = unit.claims.own.tagged(&unit.settings.identity, &machine.links.keys.codes);
                 machine.links.hub.node.set_claim(tagged.unwrap_or_default());
-                let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
-                for index in links {
+                for index in machine.links.indices() {
                     machine.links.with(&mut self.network, index, |session, cx| session.announce_claim(cx));
                 }
                 machine.links.hub.node.broadcast(self.network.clock(host));
@@ -171,8 +170,7 @@ impl Inner {
             Some(ClaimEvent::StepDown(by)) => {
                 // Stored, so that its next start claims above it.
                 unit.claims.own = unit.claims.own.max(by.claim);
-                let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
-                for index in links {
+                for index in machine.links.indices() {
                     machine
                         .links
                         .with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::StoppedHere));
@@ -242,8 +240,7 @@ impl Inner {
     fn look_at_stops(&mut self, shared: &Rc<Shared>, host: HostId) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
         if machine.links.take_stopped() {
-            let live: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
-            live.into_iter().for_each(|index| self.work(shared, host, index));
+            machine.links.indices().into_iter().for_each(|index| self.work(shared, host, index));
         }
     }
 

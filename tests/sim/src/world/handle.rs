@@ -377,7 +377,7 @@ impl UnitHandle {
 
     /// Does something on each link; one that is not live yet may have told its list.
     pub(super) fn each_link(&self, mut act: impl FnMut(&mut Links, &mut Network, u16)) {
-        let all = self.machine(|machine, _| machine.links.iter().map(|(index, _)| index).collect::<Vec<_>>());
+        let all = self.machine(|machine, _| machine.links.indices());
         for index in all.unwrap_or_default() {
             let _ = self.machine(|machine, network| act(&mut machine.links, network, index));
             self.work(index);

@@ -151,6 +151,11 @@ impl Links {
         self.links.get_mut(usize::from(index))?.as_mut()
     }
 
+    /// Where there are links.
+    pub(super) fn indices(&self) -> Vec<u16> {
+        self.iter().map(|(index, _)| index).collect()
+    }
+
     /// Links with their indices.
     pub(super) fn iter(&self) -> impl Iterator<Item = (u16, &Link)> {
         self.links.iter().enumerate().filter_map(|(index, link)| Some((index as u16, link.as_ref()?)))
