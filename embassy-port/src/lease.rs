@@ -52,7 +52,7 @@ impl LeaseWatch {
 }
 
 impl<T> Handle<T> {
-    /// What an order ([`Incoming::lease`](crate::Served::lease)) has started is finished: it ends, no hook runs, and its caller is told
+    /// What an order ([`Served::lease`](crate::Served::lease)) has started is finished: it ends, no hook runs, and its caller is told
     /// so. `false` for one that has ended before, as when a newer call has replaced it.
     pub fn end_order(&self, order: &LeaseWatch) -> bool {
         self.act(|machine| {

@@ -257,11 +257,8 @@ pub(crate) fn received(frame: &[u8]) {
     const UDP: u8 = 17;
     /// The call of `stop`, and the release of an order.
     const ENDS: [usize; 2] = [125, 97];
-    if !ENDS.contains(&frame.len()) {
-        return;
-    }
     let is_own = frame.first().is_some_and(|first| first & 1 == 0);
-    if is_own && frame.get(12..14) == Some(&IPV4) && frame.get(23) == Some(&UDP) {
+    if ENDS.contains(&frame.len()) && is_own && frame.get(12..14) == Some(&IPV4) && frame.get(23) == Some(&UDP) {
         Record::change(|record| record.heard = record.heard.or(Some(now())));
     }
 }
