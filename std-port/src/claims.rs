@@ -7,10 +7,9 @@ use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use cara_core::distribution::identity::{Fleet, Identity, Role};
+use cara_core::distribution::identity::{Fleet, Identity};
 use rustix::fs::{FlockOperation, flock};
 
-use crate::NameAndId;
 use crate::file_name::escape;
 use crate::keys::{self, KeptClaims, KeyError};
 
@@ -20,7 +19,7 @@ pub(crate) const VARIABLE: &str = "CARA_STATE";
 const OF_SYSTEMD: &str = "STATE_DIRECTORY";
 
 /// The folder of state that the environment names: `CARA_STATE`, or else systemd's `STATE_DIRECTORY`.
-pub fn folder() -> Option<PathBuf> {
+pub(crate) fn folder() -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set(VARIABLE).or_else(|| set(OF_SYSTEMD))
 }
@@ -39,11 +38,12 @@ impl ClaimFile {
     }
 
     /// The unit's file at this path, and its fleet; `None` for any other file.
-    pub(crate) fn at(path: PathBuf, unit: &NameAndId) -> Option<(u32, Self)> {
+    #[cfg(feature = "control")]
+    pub(crate) fn at(path: PathBuf, unit: &crate::NameAndId) -> Option<(u32, Self)> {
         let name = path.file_name()?.to_str()?;
         let rest = name.strip_prefix(&format!("{}-{}-", escape(&unit.name), unit.id))?.strip_suffix(".claims")?;
         let (role, fleet) = rest.split_once('-')?;
-        let fleet = [Role::MUnit, Role::SUnit].iter().any(|of| of.as_str() == role).then(|| fleet.parse().ok())??;
+        let fleet = ["m_unit", "s_unit"].contains(&role).then(|| fleet.parse().ok())??;
         Some((fleet, Self { path }))
     }
 

@@ -149,6 +149,8 @@ fn plain_mode_is_asked_for_and_warns_once() {
     let user = User::new();
     let mut manager = user.runs(&format!("{MANAGER} --insecure"));
     manager.expect(&format!("fleet {}, plain, discovery port 21970", user.fleet), PATIENCE).unwrap();
+    // It comes on another stream, which may be read later.
+    manager.seen("plain mode", PATIENCE).unwrap();
     let lines = manager.lines();
     let warnings: Vec<_> = lines.iter().filter(|line| line.text.contains("plain mode")).collect();
     let [warning] = warnings[..] else { panic!("{lines:?}") };

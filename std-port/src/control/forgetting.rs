@@ -9,7 +9,7 @@ use rustix::fs::FlockOperation;
 
 use super::audit;
 use crate::NameAndId;
-use crate::claims::ClaimFile;
+use crate::claims::{self, ClaimFile};
 use crate::keys::{self, KeyError};
 
 /// What a unit had obeyed.
@@ -39,6 +39,11 @@ pub enum ForgetError {
     /// Nothing is forgotten that is not written down.
     #[error("nothing is forgotten, since the audit log {0} takes no line: {1}")]
     Audit(PathBuf, io::Error),
+}
+
+/// The folder of state that a unit has unless it is told another: what `CARA_STATE` names, or else systemd's `STATE_DIRECTORY`.
+pub fn state_folder() -> Option<PathBuf> {
+    claims::folder()
 }
 
 /// Forgets the claims that a unit with this [folder of state](crate::Builder::state_folder) has obeyed, of one fleet or of all, while

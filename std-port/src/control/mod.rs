@@ -33,14 +33,13 @@ mod values;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-pub use crate::claims::folder as state_folder;
 pub use answering::{execute, execute_while};
 pub(crate) use audit::{Audit, ProgramCall};
 pub use client::{
     Answers, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called, running_in,
 };
 pub use elsewhere::{Elsewhere, elsewhere};
-pub use forgetting::{ForgetError, Forgotten, forget_claims};
+pub use forgetting::{ForgetError, Forgotten, forget_claims, state_folder};
 pub use place::{directories, directory};
 pub(crate) use server::Server;
 
