@@ -265,6 +265,30 @@ pub enum ServiceError {
     BadResults,
 }
 
+/// What a variable is in a signature.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Part {
+    /// What a caller passes.
+    Argument,
+    /// What it gets back.
+    Result,
+    /// What it is told meanwhile.
+    Progress,
+    /// What it is told of a failure.
+    Failure,
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Argument => "argument",
+            Self::Result => "result",
+            Self::Progress => "progress",
+            Self::Failure => "failure's",
+        })
+    }
+}
+
 /// An error of any operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 // A wide tag: the rest is then moved in words, and not byte by byte.
@@ -277,6 +301,9 @@ pub enum Error {
         "the peer has not published this function to this unit: check the name against its list, and publish it there"
     )]
     UnknownFunction,
+    /// The peer's function is of another version than the interface here; nothing was sent.
+    #[error("the peer's function is of another version: its {0} differs: update one of the two")]
+    Mismatch(Part),
     /// The function was removed or changed since its list was read; the news follows.
     #[error("the function was removed or changed: look at the new list and call again")]
     StaleFunction,
@@ -479,10 +506,28 @@ pub enum Error {
 }
 
 impl Error {
+    /// Whether the service of a call that ended so may have run. `false` is certain.
+    pub const fn may_have_run(&self) -> bool {
+        matches!(
+            self,
+            Self::TimedOut
+                | Self::Cancelled
+                | Self::Interrupted
+                | Self::ResultLost
+                | Self::ResultWouldNotFit { .. }
+                | Self::TooLarge { .. }
+                | Self::WrongType { .. }
+                | Self::WrongSize { .. }
+                | Self::OutOfRange
+                | Self::Service(ServiceError::Failed(_) | ServiceError::Panicked | ServiceError::BadResults)
+        )
+    }
+
     /// Where the remedy lies.
     pub const fn cause(&self) -> Cause {
         match self {
             Self::UnknownFunction
+            | Self::Mismatch(_)
             | Self::StaleFunction
             | Self::MissingArgument { .. }
             | Self::WrongType { .. }

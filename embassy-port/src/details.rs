@@ -1,5 +1,6 @@
 //! What is told of calls beside their results: why they fail, how far they are, and that their callers have given them up.
 
+use core::convert::Infallible;
 use core::future::poll_fn;
 use core::ops::ControlFlow;
 use core::task::Poll;
@@ -8,11 +9,14 @@ use cara_core::config::FAILURE_VALUES_BYTES;
 use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::session::RequestOptions;
+use cara_core::services::call::{Callee, Detail, Outgoing};
 
+use crate::calls::CallError;
+use crate::handle::Handle;
 use crate::handler::Served;
 use crate::machine::{LinkContext, LinkSession, Machine};
 use crate::peer::Peer;
+use crate::replies::InFlight;
 use crate::taken::{PAUSE, Running, TakenCall};
 use crate::time::{now, timer};
 
@@ -68,69 +72,42 @@ impl<T> TakenCall<T> {
     }
 }
 
-impl<T> Peer<T> {
-    /// As [`block_request_with`](Self::block_request_with), with what the service has said of a failure in `why`. The unit has
-    /// room for one of them: where another call fails before the task has looked, it stays `None`.
-    pub async fn block_request_explained(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        // Nothing here would look at it.
-        let options = &RequestOptions { progress: false, ..*options };
-        self.await_told(function, parameters, options, |_| ControlFlow::Continue(()), why).await
-    }
+/// What is known of a failed call.
+pub(crate) type Kept = Option<Detail>;
 
-    /// The same, with what the call tells while it runs: the newest progress that the task has not looked at, and none after
-    /// the reply. Where `on_progress` returns `Break`, the call is given up and ends with [`Error::Cancelled`]: what it moves
-    /// stops, and its handler is told.
+impl<T> Peer<T> {
+    /// Why a request was not sent, with where the peer's version of the function differs.
+    pub(crate) fn explained(&self, callee: Callee<'_>, error: Error) -> CallError {
+        let differs = |session: &LinkSession| {
+            let published = session.their_function_list().named(callee.name())?;
+            callee.check(published.signature).err()
+        };
+        let found = if let Error::Mismatch(_) = error { self.session(differs).flatten() } else { None };
+        CallError::new(error, found.map(Detail::Version))
+    }
+}
+
+impl<T> Handle<T> {
+    /// Lends what a call has told last to what hears it.
     ///
     /// The unit has room for what one call tells, and none while a reply waits there: what another call tells before the task
     /// has looked takes its place. Values that take more than [`FAILURE_VALUES_BYTES`] are passed over.
-    pub async fn block_request_with_progress(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        let options = &RequestOptions { progress: true, ..*options };
-        self.await_told(function, parameters, options, on_progress, why).await
-    }
-
-    async fn await_told(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        *why = None;
-        let timeout = options.timeout.unwrap_or(self.unit.constraints().request_timeout);
-        let mut call = self.begin(function, parameters, options, now() + timeout).await?;
-        poll_fn(|cx| {
-            let mut told = Parameters::<FAILURE_VALUES_BYTES>::sized();
-            // What it does may use the unit.
-            let is_told = self.unit.shared.machine.borrow_mut().take_told(&call.call, &mut told);
-            if is_told && on_progress(&told).is_break() {
-                return Poll::Ready(Err(Error::Cancelled));
-            }
-            let mut machine = self.unit.shared.machine.borrow_mut();
-            let Some(outcome) = machine.outcome(&call.call, parameters, cx.waker()) else { return Poll::Pending };
-            *why = machine.reply.take_failure(&call.call);
-            Poll::Ready(outcome)
-        })
-        .await?;
-        call.is_wanted = true;
-        Ok(())
+    pub(crate) fn hear(&self, call: &InFlight, outgoing: &mut Outgoing<'_, Infallible>) -> ControlFlow<()> {
+        let Some(hear) = &mut outgoing.progress else { return ControlFlow::Continue(()) };
+        let mut told = Parameters::<FAILURE_VALUES_BYTES>::sized();
+        // What it does may use the unit.
+        let is_told = self.shared.machine.borrow_mut().take_told(call, &mut told);
+        if is_told { hear(&told) } else { ControlFlow::Continue(()) }
     }
 }
 
 impl<T> Machine<T> {
+    /// With what the service has said. The unit has room for one of them: where another call fails before the task has looked,
+    /// nothing is known.
+    pub(crate) fn failed(&mut self, call: &InFlight, error: Error) -> CallError {
+        CallError::new(error, self.reply.take_failure(call).map(Detail::Service))
+    }
+
     /// Lends the session that a call came on, while it lasts.
     fn on_link_of<R>(
         &mut self,

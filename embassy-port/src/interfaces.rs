@@ -1,8 +1,6 @@
-//! Typed services on boards: how a unit's list takes the functions of an interface, and how its clients call a peer.
+//! Typed services on boards: how a unit's list takes the functions of an interface.
 
 use core::fmt;
-#[cfg(feature = "details")]
-use core::ops::ControlFlow;
 
 use cara_core::config::Priority;
 #[cfg(feature = "details")]
@@ -10,18 +8,14 @@ use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::Identity;
-use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::lease::{Ended, Lease};
-use cara_core::services::requests::CallId;
-use cara_core::services::session::RequestOptions;
 use cara_core::time::Instant;
-use cara_core::typed::{AnyCall, AwaitedCaller, Caller, Free, Functions, Interface, Method};
+use cara_core::typed::{AnyCall, Free, Functions, Interface, Method};
 
 use crate::functions::MyFunctionList;
 use crate::handler::{Handler, Hook, Safe, Served, ServiceOptions};
 use crate::lease::LeaseWatch;
-use crate::peer::Peer;
 
 /// What functions of an interface move, stop or reset: see [`ServiceOptions::lease`].
 pub struct Actuator<T: 'static> {
@@ -137,42 +131,5 @@ impl<T: 'static> Functions<T> for MyFunctionList<T> {
         run: &'static Free<Served<T>>,
     ) -> Result<(), Error> {
         self.add(signature, attributes, actuator, Handler::free(run))
-    }
-}
-
-impl<T> Caller for Peer<T> {
-    fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
-        let seen = self
-            .session(|session| look(session.their_function_list().named(function).map(|function| function.signature)));
-        seen.unwrap_or_else(|| look(None))
-    }
-
-    fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {
-        self.request_with(function, parameters, options)
-    }
-}
-
-impl<T> AwaitedCaller for Peer<T> {
-    async fn call(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<(), Error> {
-        self.block_request_with(function, parameters, options).await
-    }
-}
-
-#[cfg(feature = "details")]
-impl<T> cara_core::typed::AwaitedWatcher for Peer<T> {
-    async fn call_watched(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        self.block_request_with_progress(function, parameters, options, on_progress, why).await
     }
 }

@@ -83,7 +83,7 @@ macro_rules! warning {
 
 mod calls;
 mod config;
-#[cfg(feature = "details")]
+#[cfg_attr(not(feature = "details"), path = "no_details.rs")]
 mod details;
 mod driving;
 mod event;
@@ -111,12 +111,13 @@ mod taken;
 mod taking;
 mod time;
 
-pub use calls::Hold;
+pub use calls::{CallError, Hold};
 #[cfg(feature = "details")]
 pub use cara_core::distribution::failure::Failure;
-pub use cara_core::typed::{self, AnyCall, AsyncState, CallError, Variables};
+pub use cara_core::services::call::{Call, Held, Reply};
 #[cfg(feature = "details")]
-pub use cara_core::typed::{Failed, TypedCall};
+pub use cara_core::typed::TypedCall;
+pub use cara_core::typed::{self, AnyCall, AsyncState, Variables};
 #[cfg(feature = "derive")]
 pub use cara_derive::{VariablesEmbassy as Variables, interface_embassy as interface};
 pub use config::Config;

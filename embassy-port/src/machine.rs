@@ -1,5 +1,6 @@
 //! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
 
+use cara_core::config::LEASES;
 use cara_core::counters::Counters;
 use cara_core::distribution::claim::{Claim, StoredClaim, TaggedClaim};
 use cara_core::distribution::connection_handler::Command;
@@ -12,7 +13,7 @@ use cara_core::services::session::{Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
-use core::cell::RefCell;
+use core::cell::{Cell, RefCell};
 use core::net::SocketAddrV4;
 use core::task::Context as TaskContext;
 use embassy_net::Ipv4Cidr;
@@ -25,7 +26,7 @@ use crate::handler::{Hook, Listed};
 use crate::limits::Limits;
 use crate::line::Line;
 use crate::mail::EmbassyMailman;
-use crate::replies::{ReplyBox, Waiter};
+use crate::replies::{InFlight, ReplyBox, Waiter};
 use crate::security::{LinkCipher, Proof};
 use crate::taken::TaskSlot;
 use crate::time::now;
@@ -54,6 +55,37 @@ pub(crate) struct Shared<T: 'static> {
     pub(crate) machine: RefCell<Machine<T>>,
     /// The application's state, which has a cell of its own: a service that runs with it may use the unit.
     pub(crate) state: RefCell<T>,
+    /// Calls that were given up while the machine was in use.
+    pub(crate) unwanted: Unwanted<T>,
+}
+
+type GiveUp<T> = fn(&mut Machine<T>, &InFlight);
+
+/// Calls that the machine gives up when it is free: outside of its cell, for a guard that is dropped by a hook that makes safe.
+pub(crate) struct Unwanted<T: 'static> {
+    calls: Cell<heapless::Vec<InFlight, LEASES>>,
+    /// A pointer, so that an image that calls nothing has nothing of it.
+    give_up: Cell<Option<GiveUp<T>>>,
+}
+
+impl<T> Unwanted<T> {
+    pub(crate) const fn new() -> Self {
+        Self { calls: Cell::new(heapless::Vec::new()), give_up: Cell::new(None) }
+    }
+
+    /// One more than [`LEASES`] at a time is not kept: what it holds ends with its heart.
+    pub(crate) fn add(&self, call: InFlight) {
+        let mut calls = self.calls.take();
+        let _ = calls.push(call);
+        self.calls.set(calls);
+        self.give_up.set(Some(Machine::give_up));
+    }
+
+    pub(crate) fn release(&self, machine: &mut Machine<T>) {
+        if let Some(give_up) = self.give_up.take() {
+            self.calls.take().iter().for_each(|call| give_up(machine, call));
+        }
+    }
 }
 
 /// One link: the session while it is open, its memory while it is not.

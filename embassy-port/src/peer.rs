@@ -4,11 +4,8 @@ use core::fmt;
 use core::net::SocketAddrV4;
 
 use cara_core::distribution::identity::{Epoch, Identity};
-use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
-use cara_core::services::requests::CallId;
-use cara_core::services::session::RequestOptions;
 
 use crate::handle::Handle;
 use crate::machine::LinkSession;
@@ -71,27 +68,6 @@ impl<T> Peer<T> {
     /// Waits until the node has published `function`. Cancelling loses nothing.
     pub async fn wait_for_function(&self, function: &str) {
         self.unit.wait_until(|_| self.their_function_list().contains(function)).await;
-    }
-
-    /// Calls a function without waiting (paper, listing line 19): accepted, not sent, not executed. A failure comes as
-    /// [`UnitEvent::RequestFailed`](crate::UnitEvent::RequestFailed) under the returned id.
-    #[doc(alias = "request_their_function")]
-    pub fn request(&self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
-        self.request_with(function, parameters, &RequestOptions::default())
-    }
-
-    /// As [`request`](Self::request), with a class, delivery, life or lease of its own.
-    pub fn request_with(
-        &self,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Result<CallId, Error> {
-        let link = self.link()?;
-        let requested = self
-            .unit
-            .act(|machine| machine.with(link, |session, cx| session.request(cx, function, parameters, options, false)));
-        requested.unwrap_or(Err(Error::NotConnected))
     }
 
     /// Gives up the leases that calls of `function` have begun or will begin: what they started stops, and what has not

@@ -30,7 +30,7 @@ pub(crate) struct Waiter {
 
 /// Names a call of this unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct InFlight {
+pub struct InFlight {
     pub(crate) link: u16,
     pub(crate) serial: u32,
     pub(crate) id: CallId,

@@ -30,7 +30,7 @@ use crate::handle::Handle;
 use crate::handler::Listed;
 use crate::limits::Limits;
 use crate::line::Line;
-use crate::machine::{Board, Link, Machine, Shared, Wakers};
+use crate::machine::{Board, Link, Machine, Shared, Unwanted, Wakers};
 use crate::mail::EmbassyMailman;
 use crate::replies::{ReplyBox, Waiter};
 use crate::runner::Runner;
@@ -306,7 +306,11 @@ impl<
                 limits: const { &Self::LIMITS },
                 wakers: Wakers::new(),
             };
-        let shared = self.shared.write(Shared { machine: RefCell::new(machine), state: RefCell::new(state) });
+        let shared = self.shared.write(Shared {
+            machine: RefCell::new(machine),
+            state: RefCell::new(state),
+            unwanted: Unwanted::new(),
+        });
         // In its place: changed before it is moved there, it would lie on the stack more than once.
         let machine = shared.machine.get_mut();
         let claim = if config.claim == Claim::NONE { Claim::NONE.raised(seed) } else { config.claim };

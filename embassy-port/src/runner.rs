@@ -86,6 +86,7 @@ impl<T> Runner<T> {
     fn step(&mut self, context: &mut Context<'_>) -> Step {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
+        shared.unwanted.release(machine);
         // Anything may be due behind whatever is done, but nothing before the time to which the last rest has looked.
         let awaits_hook = machine.awaits_hook();
         let is_due = awaits_hook | (now() >= core::mem::replace(&mut self.rested_until, Instant::START));

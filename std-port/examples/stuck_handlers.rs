@@ -38,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     peer.request("stuck_emergency", &Parameters::new())?;
     let patient = RequestOptions { timeout: Some(Duration::from_secs(3_600).into()), ..RequestOptions::default() };
     for _ in 0..STUCK - 2 {
-        peer.request_with("stuck", &Parameters::new(), &patient)?;
+        peer.call("stuck", &mut Parameters::new()).with(patient).send()?;
     }
     peer.flush()?;
     sleep(Duration::from_millis(500));
@@ -54,7 +54,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for _ in 0..rounds {
         canary.reset();
         let asked = Instant::now();
-        peer.block_request_with("go", &mut Parameters::new(), &once)?;
+        peer.call("go", &mut Parameters::new()).with(once).wait()?;
         let ran: Instant = hooks.recv_timeout(Duration::from_secs(10))?;
         safe.note(ran.saturating_duration_since(asked + LEASE), canary.late());
         // The unit reports the end a moment after the hook: before that it takes no new order.

@@ -1,17 +1,19 @@
 //! The paper's `Communication_System`: an m_unit, which connects to many nodes.
 
 use std::collections::HashSet;
+use std::fmt;
 #[cfg(feature = "control")]
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Poll, Wake, Waker};
+use std::task::{Context, Poll, Wake, Waker};
 
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::identity::{Identity, Role};
-use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 #[cfg(feature = "control")]
 use cara_core::services::access::Verb;
+use cara_core::services::call::Caller;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
@@ -19,6 +21,7 @@ use core::net::IpAddr;
 
 use crate::builder::{BuildError, Builder};
 use crate::engine::CallsToAll;
+use crate::error::CallError;
 use crate::growing::CallParameters;
 use crate::handle::{Handle, MUnit, WeakHandle};
 #[cfg(feature = "control")]
@@ -275,63 +278,111 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         Ok(missing.iter().filter_map(|link| link.peer.get()).map(|peer| peer.identity.clone()).collect())
     }
 
-    /// Requests without waiting from every node, with an outcome for each: for each s_unit of the [roster](Self::roster),
-    /// [`Error::NotConnected`] of one that is absent and [`Error::UnknownFunction`] of one that does not offer `function`;
-    /// and for each m_unit that offers it.
-    pub fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Peer<T>, Result<CallId, Error>)> {
-        let peers = self.asked_with_all(function).into_iter();
-        peers.map(|peer| (peer.clone(), peer.request(function, parameters))).collect()
-    }
-
-    /// Calls `function` of every node, all at the same time, and waits for all of them. There is an outcome for each, as of
-    /// [`request_all`](Self::request_all).
+    /// A call of `function` of every node, all at the same time: `.wait()`, `.await` or `.send()`. There is an outcome for each
+    /// s_unit of the [roster](Self::roster), [`Error::NotConnected`] of one that is absent and [`Error::UnknownFunction`] of one that
+    /// does not offer `function`; and for each m_unit that offers it.
     ///
     /// ```no_run
-    /// use cara_std::{Parameters, RequestOptions};
     /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
-    ///
-    /// for (agv, outcome) in depot.block_request_all("stop", &Parameters::new(), &RequestOptions::default()) {
+    /// for (agv, outcome) in depot.call_all("stop", &cara_std::Parameters::new()).wait() {
     ///     if let Err(error) = outcome {
     ///         eprintln!("{agv:?} did not stop: {error}");
     ///     }
     /// }
     /// # Ok::<(), cara_std::BuildError>(())
     /// ```
-    pub fn block_request_all<P: CallParameters + Clone>(
-        &self,
-        function: &str,
-        parameters: &P,
-        options: &RequestOptions,
-    ) -> Vec<(Peer<T>, Result<P, Error>)> {
-        let peers = self.asked_with_all(function);
-        let mut results = rooms(&peers, function, parameters);
-        let mut calls = CallsToAll::new(self.engine(), peers.iter().map(Peer::link), function, options);
-        wait(|cx| calls.poll(cx, &mut results));
-        outcomes(peers, calls, results)
+    pub const fn call_all<'c, P: CallParameters + ?Sized>(
+        &'c self,
+        function: &'c str,
+        parameters: &'c P,
+    ) -> CallToAll<'c, T, P> {
+        CallToAll { system: self, function, parameters, options: RequestOptions::new() }
     }
 }
 
-/// Parameters for a call of each peer.
-pub(crate) fn rooms<T: Send + 'static, P: CallParameters + Clone>(
-    peers: &[Peer<T>],
-    function: &str,
-    parameters: &P,
-) -> Vec<P> {
-    let mut results = vec![parameters.clone(); peers.len()];
-    for (peer, results) in peers.iter().zip(&mut results) {
-        peer.with_room(function, results);
-    }
-    results
+/// A call of every node, which has not been sent: [`CommunicationSystem::call_all`].
+#[must_use = "nothing is sent before `.wait()`, `.await` or `.send()`"]
+pub struct CallToAll<'c, T: Send + 'static, P: ?Sized> {
+    system: &'c CommunicationSystem<T>,
+    function: &'c str,
+    parameters: &'c P,
+    options: RequestOptions,
 }
 
-/// With each peer its results, or why there are none.
-pub(crate) fn outcomes<T: Send + 'static, P>(
+impl<T: Send + 'static, P: ?Sized> fmt::Debug for CallToAll<'_, T, P> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("CallToAll").field("function", &self.function).finish_non_exhaustive()
+    }
+}
+
+impl<T: Send + 'static, P: CallParameters + ?Sized> CallToAll<'_, T, P> {
+    /// With these options.
+    pub const fn with(self, options: RequestOptions) -> Self {
+        Self { options, ..self }
+    }
+
+    /// Requests without waiting.
+    pub fn send(self) -> Vec<(Peer<T>, Result<CallId, CallError>)> {
+        let (callee, parameters) = (self.function.into(), self.parameters.view());
+        let peers = self.system.asked_with_all(self.function).into_iter();
+        peers.map(|peer| (peer.clone(), peer.send(callee, parameters, &self.options))).collect()
+    }
+
+    /// Calls and waits for all of them.
+    pub fn wait(self) -> Vec<(Peer<T>, Result<P, CallError>)>
+    where
+        P: Clone,
+    {
+        let mut replies = self.into_future();
+        wait(|cx| Pin::new(&mut replies).poll(cx))
+    }
+}
+
+impl<'c, T: Send + 'static, P: CallParameters + Clone> IntoFuture for CallToAll<'c, T, P> {
+    type Output = Vec<(Peer<T>, Result<P, CallError>)>;
+    type IntoFuture = RepliesOfAll<'c, T, P>;
+
+    fn into_future(self) -> Self::IntoFuture {
+        let Self { system, function, parameters, options } = self;
+        let peers = system.asked_with_all(function);
+        let mut results = vec![parameters.clone(); peers.len()];
+        for (peer, results) in peers.iter().zip(&mut results) {
+            peer.with_room(function, results);
+        }
+        let calls = CallsToAll::new(system.engine(), peers.iter().map(Peer::link), function, options);
+        RepliesOfAll { function, peers, calls: Some(calls), results }
+    }
+}
+
+/// What a [`CallToAll`] is while it is awaited. Dropped before it has ended, those calls that have not are given up.
+pub struct RepliesOfAll<'c, T: Send + 'static, P> {
+    function: &'c str,
     peers: Vec<Peer<T>>,
-    calls: CallsToAll<T>,
+    calls: Option<CallsToAll<T>>,
     results: Vec<P>,
-) -> Vec<(Peer<T>, Result<P, Error>)> {
-    let outcomes = peers.into_iter().zip(calls.into_outcomes()).zip(results);
-    outcomes.map(|((peer, outcome), results)| (peer, outcome.map(|()| results))).collect()
+}
+
+impl<T: Send + 'static, P> fmt::Debug for RepliesOfAll<'_, T, P> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RepliesOfAll").field("function", &self.function).finish_non_exhaustive()
+    }
+}
+
+/// Nothing in it is ever pinned.
+impl<T: Send + 'static, P> Unpin for RepliesOfAll<'_, T, P> {}
+
+impl<T: Send + 'static, P: CallParameters> Future for RepliesOfAll<'_, T, P> {
+    type Output = Vec<(Peer<T>, Result<P, CallError>)>;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
+        let Self { function, peers, calls, results } = &mut *self;
+        if calls.as_mut().is_some_and(|calls| calls.poll(cx, function, results).is_pending()) {
+            return Poll::Pending;
+        }
+        let ended = calls.take().into_iter().flat_map(CallsToAll::into_outcomes);
+        let outcomes = std::mem::take(peers).into_iter().zip(ended).zip(std::mem::take(results));
+        Poll::Ready(outcomes.map(|((peer, ended), results)| (peer, ended.map(|()| results))).collect())
+    }
 }
 
 /// Unparks the thread that makes it.

@@ -1,4 +1,4 @@
-//! Why a unit does not start.
+//! Why a unit does not start, and why a call has no results.
 
 use std::fmt;
 use std::net::SocketAddr;
@@ -6,6 +6,37 @@ use std::path::PathBuf;
 
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
+use cara_core::services::call::{self, CallDetails, Detail};
+
+/// Why a call has no results. It turns into an [`Error`] by `?`.
+///
+/// ```no_run
+/// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+/// if let Err(failed) = depot.s_unit("agv")?.call("go_to", &mut cara_std::Parameters::new()).wait() {
+///     println!("{failed}; it may have run: {}", failed.may_have_run());
+///     if let Some(failure) = failed.failure() {
+///         println!("{:?}", failure.values().variable::<[i64; 2]>("at"));
+///     }
+/// }
+/// # Ok::<(), cara_std::BuildError>(())
+/// ```
+pub type CallError<F = ()> = call::CallError<F, BoxedDetail>;
+
+/// What is known of a failed call beside its [`Error`].
+#[derive(Clone, Debug, Default)]
+pub struct BoxedDetail(Option<Box<Detail>>);
+
+const _: () = assert!(size_of::<CallError>() <= 24, "a result is returned in registers, or nearly");
+
+impl CallDetails for BoxedDetail {
+    fn of(detail: Detail) -> Self {
+        Self(Some(Box::new(detail)))
+    }
+
+    fn get(&self) -> Option<&Detail> {
+        self.0.as_deref()
+    }
+}
 
 /// Why a unit does not start.
 #[derive(Clone, PartialEq, Eq, thiserror::Error)]

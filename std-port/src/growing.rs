@@ -187,6 +187,9 @@ impl fmt::Debug for GrowingParameters {
 /// one, or [`GrowingParameters`].
 pub trait CallParameters: sealed::Sealed {
     #[doc(hidden)]
+    fn view(&self) -> &ParametersView;
+
+    #[doc(hidden)]
     fn view_mut(&mut self) -> &mut ParametersView;
 
     /// Makes room for so many bytes of results, if it can. They are asked for only then.
@@ -231,18 +234,30 @@ impl<P: CallParameters + ?Sized> sealed::Sealed for Box<P> {}
 impl sealed::Sealed for GrowingParameters {}
 
 impl CallParameters for ParametersView {
+    fn view(&self) -> &ParametersView {
+        self
+    }
+
     fn view_mut(&mut self) -> &mut ParametersView {
         self
     }
 }
 
 impl<const BYTES: usize> CallParameters for Parameters<BYTES> {
+    fn view(&self) -> &ParametersView {
+        self
+    }
+
     fn view_mut(&mut self) -> &mut ParametersView {
         self
     }
 }
 
 impl<P: CallParameters + ?Sized> CallParameters for Box<P> {
+    fn view(&self) -> &ParametersView {
+        (**self).view()
+    }
+
     fn view_mut(&mut self) -> &mut ParametersView {
         (**self).view_mut()
     }
@@ -253,6 +268,10 @@ impl<P: CallParameters + ?Sized> CallParameters for Box<P> {
 }
 
 impl CallParameters for GrowingParameters {
+    fn view(&self) -> &ParametersView {
+        self
+    }
+
     fn view_mut(&mut self) -> &mut ParametersView {
         self
     }

@@ -7,7 +7,7 @@ use cara_core::services::heart::{self, Beats, Renew};
 use cara_core::time::Duration;
 
 use crate::clock::Clock;
-use crate::engine::{CallFuture, Engine};
+use crate::engine::{Answered, Engine};
 use crate::locks::lock;
 
 /// Words of hearts that are not in use. A session may look at one at any time, so they are never freed.
@@ -19,15 +19,14 @@ static FREE: Mutex<Vec<&'static heart::Heart>> = Mutex::new(Vec::new());
 /// It belongs to one loop and can't be cloned: a beat of another one would hide that this one hangs.
 ///
 /// ```no_run
-/// use cara_std::{Duration, Parameters, RequestOptions};
+/// use cara_std::{Duration, Parameters};
 /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
 /// # fn is_still_wanted() -> bool { true }
 ///
 /// let mut heart = depot.heart(Duration::from_millis(100));
-/// let wanted = RequestOptions::renewing(heart.renew());
 /// let mut position = Parameters::new();
 /// position.add_int("position", 2)?;
-/// depot.s_unit("agv")?.block_request_with("go_to", &mut position, &wanted)?;
+/// depot.s_unit("agv")?.call("go_to", &mut position).renewing(heart.renew()).wait()?;
 /// while is_still_wanted() {
 ///     heart.beat();
 ///     std::thread::sleep(std::time::Duration::from_millis(50));
@@ -80,21 +79,24 @@ impl Drop for Heart {
     }
 }
 
-/// What a call has started goes on as long as this is kept, if its caller is alive: [`Peer::hold`](crate::Peer::hold).
+/// What a call has started goes on as long as this is kept, if its caller is alive: [`Call::hold`](crate::Call::hold).
 #[must_use = "dropped, it is released at once"]
 pub struct Hold<T: Send + 'static = ()> {
-    pub(crate) call: CallFuture<T>,
+    pub(crate) engine: Arc<Engine<T>>,
+    pub(crate) call: Answered,
 }
 
 impl<T: Send + 'static> Hold<T> {
-    pub(crate) const fn new(call: CallFuture<T>) -> Self {
-        Self { call }
-    }
-
     /// Whether it is renewed: no longer when it has ended there, which [`UnitEvent::LeaseEnded`](crate::UnitEvent::LeaseEnded)
     /// tells as well.
     pub fn is_held(&self) -> bool {
-        self.call.is_held()
+        self.call.link.lock().session.holds(self.call.id)
+    }
+}
+
+impl<T: Send + 'static> Drop for Hold<T> {
+    fn drop(&mut self) {
+        self.engine.give_up_call(&self.call.link, self.call.id);
     }
 }
 

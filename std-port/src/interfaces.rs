@@ -1,22 +1,25 @@
 //! Typed services on Linux: how a unit's list takes the functions of an interface, and how its clients call a peer.
 
-use std::ops::{ControlFlow, DerefMut};
+use std::task::{Context, Poll};
 
 use cara_core::config::Priority;
-use cara_core::distribution::failure::{CallFailure, Failure};
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
+use cara_core::services::call::{BlockingCaller, Callee, Caller, Outgoing};
 use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Instant;
-use cara_core::typed::{AnyCall, BlockingCaller, Caller, Free, Functions, Interface, Method, WatchingCaller};
+use cara_core::typed::{AnyCall, Free, Functions, Interface, Method};
 
 use crate::actuator::Actuator;
-use crate::engine::room;
+use crate::engine::details::Canceller;
+use crate::engine::{Answered, Pending, room};
+use crate::error::{BoxedDetail, CallError};
 use crate::handler::{IntoHandler, Served, ServiceOptions};
 use crate::heart::Hold;
 use crate::lease::LeaseWatch;
@@ -101,7 +104,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     ///
     /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
     /// let fork = depot.s_unit("fork")?;
-    /// LiftClient::at(&fork).lift_to(1.5)?;
+    /// LiftClient::at(&fork).lift_to(1.5).wait()?;
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     ///
@@ -153,91 +156,48 @@ impl<T: Send + 'static> Functions<T> for MyFunctionList<'_, T> {
 }
 
 impl<T: Send + 'static> Caller for Peer<T> {
-    fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
-        let Ok(link) = self.link() else { return look(None) };
-        let state = link.lock();
-        look(state.session.their_function_list().named(function).map(|function| function.signature))
-    }
+    type Pending = Pending<T>;
+    type Answered = Answered;
+    type Hold = Hold<T>;
+    type Details = BoxedDetail;
+    type Room = Box<ParametersView>;
+    type Canceller = Canceller;
 
-    fn room(bytes: usize) -> Option<impl DerefMut<Target = ParametersView> + Send> {
+    fn room(bytes: usize) -> Option<Box<ParametersView>> {
         Some(room(bytes))
     }
 
-    fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {
-        self.request_with(function, parameters, options)
+    fn send(
+        &self,
+        callee: Callee<'_>,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+    ) -> Result<CallId, CallError> {
+        self.engine.request(&self.link()?, callee, parameters, options)
+    }
+
+    fn poll(
+        &self,
+        pending: &mut Option<Pending<T>>,
+        mut outgoing: Outgoing<'_, Canceller>,
+        cx: &mut Context<'_>,
+    ) -> Poll<Result<Answered, CallError>> {
+        let pending = match pending {
+            Some(pending) => pending,
+            None => pending.insert(Pending::new(&self.engine, self.link()?, outgoing.callee, outgoing.options)),
+        };
+        pending.poll(&mut outgoing, cx)
+    }
+
+    fn hold(&self, call: Answered) -> Hold<T> {
+        Hold { engine: self.engine.clone(), call }
     }
 }
 
 impl<T: Send + 'static> BlockingCaller for Peer<T> {
-    type Hold = Hold<T>;
-
-    fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error> {
-        self.block_request_with(function, parameters, options)
-    }
-
-    fn block_and_hold(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<Hold<T>, Error> {
-        self.hold(function, parameters, options)
-    }
-}
-
-/// The error of a call, and in `why` what its service has said of it.
-pub(crate) fn parted(failed: Box<CallFailure>, why: &mut Option<Failure>) -> Error {
-    let CallFailure { error, failure } = *failed;
-    *why = failure;
-    error
-}
-
-impl<T: Send + 'static> WatchingCaller for Peer<T> {
-    fn block_watched(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        let outcome = self.block_request_with_progress(function, parameters, options, on_progress);
-        outcome.map_err(|failed| parted(failed, why))
-    }
-}
-
-#[cfg(feature = "async")]
-impl<T: Send + 'static> cara_core::typed::AwaitedCaller for Peer<T> {
-    async fn call(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<(), Error> {
-        self.request_async(function, parameters, options)?.await
-    }
-}
-
-#[cfg(feature = "async")]
-impl<T: Send + 'static> cara_core::typed::AwaitedWatcher for Peer<T> {
-    async fn call_watched(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        let options = RequestOptions { progress: true, ..*options };
-        let mut call = self.request_async(function, parameters, &options)?;
-        while let Some(told) = call.progress().await {
-            if on_progress(&told).is_break() {
-                // Dropped here, the call is given up.
-                return Err(Error::Cancelled);
-            }
-        }
-        let outcome = (&mut call).await;
-        *why = call.failure().map(|failure| *failure);
-        outcome
+    fn wait(&self, outgoing: Outgoing<'_, Canceller>) -> Result<Answered, CallError> {
+        let link = self.link()?;
+        let id = self.engine.block_request(&link, outgoing)?;
+        Ok(Answered { link, id })
     }
 }

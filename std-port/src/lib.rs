@@ -35,7 +35,7 @@
 //! depot.start()?;
 //! let agv = depot.wait_for_s_unit("agv-17", Duration::from_secs(10))?;
 //! agv.wait_for_function("battery", Duration::from_secs(10));
-//! println!("{} %", AgvClient::at(&agv).battery()?);
+//! println!("{} %", AgvClient::at(&agv).battery().wait()?);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
@@ -62,7 +62,6 @@ mod actuator;
 #[cfg(feature = "async")]
 pub mod asynchronous;
 mod builder;
-mod cancellable;
 mod claims;
 mod clock;
 mod communication_system;
@@ -73,7 +72,6 @@ mod engine;
 mod error;
 mod event;
 mod executor;
-mod explained;
 mod file_name;
 mod growing;
 mod handle;
@@ -108,13 +106,12 @@ mod unit;
 
 pub use actuator::Actuator;
 #[cfg(feature = "async")]
-pub use asynchronous::{CallGivenUp, EventStream, EventsLost, PendingReply, SampleStream};
+pub use asynchronous::{CallGivenUp, EventStream, EventsLost, SampleStream};
 pub use builder::{BuildError, Builder};
-pub use cancellable::Cancellable;
 pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT};
 pub use cara_core::distribution::claim::Claim;
 pub use cara_core::distribution::connection_handler::NodeCounter;
-pub use cara_core::distribution::failure::{CallFailure, Failure};
+pub use cara_core::distribution::failure::Failure;
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec, VariableSpecs};
 pub use cara_core::distribution::hello::{Limits, Manager};
 pub use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -124,20 +121,20 @@ pub use cara_core::distribution::parameters::{
 };
 pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceError};
 pub use cara_core::host::connections::LinkCounter;
+pub use cara_core::services::call::{Call, Held, Reply};
 pub use cara_core::services::heart::Renew;
 pub use cara_core::services::lease::{ActuatorState, Ended, LastOrder, Latch, LeaseEnd, OrderOutcome, Stage};
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
 pub use cara_core::time::Duration;
-pub use cara_core::typed::{self, AnyCall, AsyncState, CallError, Failed, Mismatch, TypedCall, Variables};
+pub use cara_core::typed::{self, AnyCall, AsyncState, Mismatch, TypedCall, Variables};
 #[cfg(feature = "derive")]
 pub use cara_derive::{VariablesStd as Variables, interface_std as interface};
-pub use communication_system::{CommunicationSystem, WeakSystem};
+pub use communication_system::{CallToAll, CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use engine::details::Canceller;
-pub use error::StartError;
+pub use error::{CallError, StartError};
 pub use event::{Finding, UnitEvent};
-pub use explained::Explained;
 pub use growing::{CallParameters, GrowingParameters};
 pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{IntoHandler, Served, ServiceOptions};

@@ -1,38 +1,30 @@
 //! A node as this unit sees it.
 
 use std::fmt;
-use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use cara_core::config::Constraints;
 use cara_core::distribution::claim::Claim;
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::Function;
 use cara_core::distribution::hello::Limits;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
+use cara_core::services::call::{Call, Caller, Dynamic};
 use cara_core::services::lease::{ActuatorState, OrderOutcome, trace_id};
 use cara_core::services::requests::CallId;
-#[cfg(feature = "control")]
-use cara_core::services::requests::Made;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use core::net::SocketAddr;
 
 use crate::builder;
-use crate::cancellable::Cancellable;
 #[cfg(feature = "control")]
 use crate::control::protocol::{DatagramsInfo, LinkInfo};
-#[cfg(feature = "control")]
-use crate::engine::CallFuture;
-use crate::engine::details::{Canceller, OnProgress, Watch};
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
 use crate::engine::{Engine, pairs};
 use crate::growing::{CallParameters, bytes_of_results};
-use crate::heart::Hold;
 
 /// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
 pub struct Peer<T: Send + 'static = ()> {
@@ -285,8 +277,43 @@ impl<T: Send + 'static> Peer<T> {
         true
     }
 
-    /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
-    /// are unchanged, and what the call started, or would start, stops if its service has a lease.
+    /// A call of a function by name, whose results update `parameters`: `.wait()` for threads, `.await` for tasks, or `.send()`
+    /// without waiting for results. Nothing happens before.
+    ///
+    /// On an error the parameters are unchanged, and what the call started, or would start, stops if its service has a lease.
+    ///
+    /// ```no_run
+    /// use cara_std::{Duration, Parameters};
+    /// use std::ops::ControlFlow;
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// let agv = depot.s_unit("agv")?;
+    /// let heart = depot.heart(Duration::from_millis(100));
+    ///
+    /// let mut position = Parameters::new();
+    /// position.add_int("position", 2)?;
+    /// agv.call("pos_info", &mut position).timeout(Duration::from_millis(200)).wait()?;
+    ///
+    /// let going = agv.call("go_to", &mut position).renewing(heart.renew()).watch(|progress| {
+    ///     match progress.variable::<f64>("left") {
+    ///         Ok(left) if left > 100.0 => ControlFlow::Break(()),
+    ///         _ => ControlFlow::Continue(()),
+    ///     }
+    /// });
+    /// let order = going.hold().wait()?;
+    /// // …
+    /// drop(order); // The vehicle stops.
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn call<'c>(
+        &'c self,
+        function: &'c str,
+        parameters: &'c mut (impl CallParameters + ?Sized),
+    ) -> Call<'c, Self, Dynamic<'c>> {
+        Call::new(self, Dynamic::new(function, self.with_room(function, parameters)))
+    }
+
+    /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13): [`call`](Self::call) with
+    /// the default options.
     ///
     /// ```no_run
     /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
@@ -298,85 +325,7 @@ impl<T: Send + 'static> Peer<T> {
     /// ```
     #[doc(alias = "block_request_their_function")]
     pub fn block_request(&self, function: &str, parameters: &mut (impl CallParameters + ?Sized)) -> Result<(), Error> {
-        self.block_request_with(function, parameters, &RequestOptions::default())
-    }
-
-    /// As [`block_request`](Self::block_request), with a time-out, class or lease of its own.
-    ///
-    /// ```no_run
-    /// use cara_std::{Duration, Parameters, RequestOptions};
-    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
-    ///
-    /// let patient = RequestOptions { timeout: Some(Duration::from_secs(30)), ..RequestOptions::default() };
-    /// depot.s_unit("agv")?.block_request_with("calibrate", &mut Parameters::new(), &patient)?;
-    /// # Ok::<(), cara_std::BuildError>(())
-    /// ```
-    pub fn block_request_with(
-        &self,
-        function: &str,
-        parameters: &mut (impl CallParameters + ?Sized),
-        options: &RequestOptions,
-    ) -> Result<(), Error> {
-        let parameters = self.with_room(function, parameters);
-        self.engine.block_request(&self.link()?, function, parameters, options).map(drop)
-    }
-
-    /// As [`block_request_with`](Self::block_request_with), with all that is known of a failure, and with what the call tells
-    /// while it runs: the newest progress that has not been looked at, in this thread, and none after the reply. Where
-    /// `on_progress` returns `Break`, the call is given up and ends with [`Error::Cancelled`]: what it moves stops, and its
-    /// handler is told.
-    ///
-    /// ```no_run
-    /// use cara_std::{Parameters, RequestOptions};
-    /// use std::ops::ControlFlow;
-    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
-    ///
-    /// let options = RequestOptions::default();
-    /// let outcome = depot.s_unit("agv")?.block_request_with_progress("go_to", &mut Parameters::new(), &options, |told| {
-    ///     match told.variable::<f64>("left") {
-    ///         Ok(left) if left > 100.0 => ControlFlow::Break(()),
-    ///         _ => ControlFlow::Continue(()),
-    ///     }
-    /// });
-    /// if let Err(failed) = outcome {
-    ///     println!("{failed}");
-    ///     if let Some(failure) = &failed.failure {
-    ///         println!("{:?}", failure.values().variable::<[i64; 2]>("at"));
-    ///     }
-    /// }
-    /// # Ok::<(), cara_std::BuildError>(())
-    /// ```
-    pub fn block_request_with_progress(
-        &self,
-        function: &str,
-        parameters: &mut (impl CallParameters + ?Sized),
-        options: &RequestOptions,
-        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-    ) -> Result<(), Box<CallFailure>> {
-        let parameters = self.with_room(function, parameters);
-        self.block_request_watched(function, parameters, options, &Canceller::new(), Some(&mut on_progress))
-    }
-
-    /// The same for a call that another thread may give up. Typed clients have [`cancelled_by`](Self::cancelled_by).
-    pub fn block_request_cancellable(
-        &self,
-        function: &str,
-        parameters: &mut (impl CallParameters + ?Sized),
-        options: &RequestOptions,
-        canceller: &Canceller,
-        mut on_progress: impl FnMut(&ParametersView),
-    ) -> Result<(), Box<CallFailure>> {
-        let mut told = |progress: &ParametersView| {
-            on_progress(progress);
-            ControlFlow::Continue(())
-        };
-        let parameters = self.with_room(function, parameters);
-        self.block_request_watched(function, parameters, options, canceller, Some(&mut told))
-    }
-
-    /// This peer for typed clients, whose calls another thread may give up.
-    pub fn cancelled_by(&self, canceller: &Canceller) -> Cancellable<T> {
-        Cancellable { peer: self.clone(), canceller: canceller.clone() }
+        Ok(self.call(function, parameters).wait()?)
     }
 
     /// The parameters of a call, with room for its results where they grow.
@@ -392,47 +341,6 @@ impl<T: Send + 'static> Peer<T> {
             Some(bytes_of_results(signature.results(), state.session.constraints().message_size))
         });
         parameters.view_mut()
-    }
-
-    pub(crate) fn block_request_watched<'w>(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        canceller: &'w Canceller,
-        on_progress: Option<OnProgress<'w>>,
-    ) -> Result<(), Box<CallFailure>> {
-        let mut watch = Watch { on_progress, canceller, failure: None };
-        let link = self.link().map_err(|error| Box::new(error.into()))?;
-        let result = self.engine.block_request_watched(&link, function, parameters, options, &mut watch);
-        match result {
-            Ok(_) => Ok(()),
-            Err(error) => Err(Box::new(CallFailure { error, failure: watch.failure.map(|failure| *failure) })),
-        }
-    }
-
-    /// As [`block_request_with`](Self::block_request_with); what the call has started goes on until the returned guard is
-    /// dropped, and at most for as long as the options' `renew` says.
-    ///
-    /// ```no_run
-    /// use cara_std::{Duration, Parameters, RequestOptions};
-    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
-    ///
-    /// let heart = depot.heart(Duration::from_millis(100));
-    /// let wanted = RequestOptions::renewing(heart.renew());
-    /// let lifting = depot.s_unit("fork")?.hold("lift", &mut Parameters::new(), &wanted)?;
-    /// // …
-    /// drop(lifting);
-    /// # Ok::<(), cara_std::BuildError>(())
-    /// ```
-    pub fn hold(
-        &self,
-        function: &str,
-        parameters: &mut (impl CallParameters + ?Sized),
-        options: &RequestOptions,
-    ) -> Result<Hold<T>, Error> {
-        let parameters = self.with_room(function, parameters);
-        self.engine.hold(self.link()?, function, parameters, options, None).map(Hold::new)
     }
 
     /// What has become of the newest call of a leased function by this unit, as the node tells after it has joined again: for
@@ -502,34 +410,7 @@ impl<T: Send + 'static> Peer<T> {
     /// ```
     #[doc(alias = "request_their_function")]
     pub fn request(&self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
-        self.request_with(function, parameters, &RequestOptions::default())
-    }
-
-    /// As [`request`](Self::request), with a class, delivery, life or lease of its own.
-    pub fn request_with(
-        &self,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Result<CallId, Error> {
-        self.engine.request(&self.link()?, function, parameters, options)
-    }
-
-    /// The place of a call that is made now among those of its link, if there is one.
-    #[cfg(feature = "control")]
-    pub(crate) fn make(&self) -> Option<Made> {
-        self.link().ok().map(|link| link.lock().session.make())
-    }
-
-    /// The end of a call, to be polled for.
-    #[cfg(feature = "control")]
-    pub(crate) fn call_future(
-        &self,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Result<CallFuture<T>, Error> {
-        self.engine.call_future(&self.link()?, function, parameters, options, None)
+        Ok(self.send(function.into(), parameters, &RequestOptions::new())?)
     }
 
     /// Gives up the leases that calls of `function` have begun or will begin: what they started stops, and what has not

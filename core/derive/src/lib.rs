@@ -59,7 +59,7 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
     variables::derive(input.into(), &quote!(::cara_embassy)).into()
 }
 
-/// As `cara_core::interface`: makes `DriveServer`, `DriveClient` and `DriveAsyncClient` of a trait `Drive`.
+/// As `cara_core::interface`: makes `DriveServer` and `DriveClient` of a trait `Drive`.
 ///
 /// ```
 /// use cara_core::error::ServiceError;
@@ -95,12 +95,11 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// about the call; where its bounds need types that differ from port to port, the trait declares them (`type Order;`).
 ///
 /// `call: &impl TypedCall<Left, Blocked>` declares also what calls tell while they run, and the values of their failures: structs that
-/// derive `Variables`, or `()` for nothing. Clients have `watch_go_to` beside `go_to` then: it hands each `Left` to a closure, and
-/// fails with a `Failed<Blocked>`. It needs the feature `details` of the core, which Linux has always. On a board a function with
+/// derive `Variables`, or `()` for nothing. A client's `.watch(…)` hands each `Left` to a closure, and its error has `values()`, a
+/// `Blocked`. It needs the feature `details` of the core, which Linux has always. On a board a function with
 /// `call: &impl LongCall<Left, Blocked, State = Agv>` declares the same, and takes the call for a task.
 ///
-/// The client for threads has `hold_go_to` of a function with a lease, which returns a `Held`: its results, and what goes on until that is
-/// dropped.
+/// A method of the client sends nothing: it returns a `Call`, which is sent by `.wait()` (Linux), `.await` or `.send()`.
 ///
 /// | a function | has the state |
 /// |---|---|

@@ -11,15 +11,13 @@ use cara_core::distribution::block::{self, SliceWriter};
 use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Definition, Signature};
 use cara_core::distribution::identity::Identity;
+use cara_core::services::call::{BlockingCaller, CallError, Callee, Caller, Detail, Held, Outgoing};
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_core::typed::{
-    AwaitedCaller, BAD_ARGUMENT, BlockingCaller, CallError, Caller, Free, Functions, Held, Interface, Method,
-    WatchingCaller,
-};
+use cara_core::typed::{BAD_ARGUMENT, Free, Functions, Interface, Method, Mismatch};
 use cara_core::{AnyCall, Error, Parameters, ParametersView, ServiceError, TypedCall, Variables, interface};
 
 #[derive(Variables, Clone, Copy, Debug, PartialEq)]
@@ -270,24 +268,24 @@ impl Functions<Vehicle> for Unit {
     }
 }
 
-impl Caller for Unit {
-    fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
-        if let Some(other) = &self.other {
-            return look(Some(other.signature()));
-        }
+impl Unit {
+    /// Looks at what is published, as a port does, and calls.
+    #[expect(clippy::result_large_err, reason = "it is the port's error")]
+    fn ask(
+        &self,
+        callee: Callee<'_>,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<(), CallError<(), Option<Detail>>> {
         let listed = self.listed.borrow();
-        look(listed.iter().find(|listed| listed.signature.name() == function).map(|listed| listed.signature))
+        let own = listed.iter().find(|listed| listed.signature.name() == callee.name()).map(|listed| listed.signature);
+        if let Some(published) = self.other.as_ref().map(|other| other.signature()).or(own) {
+            let wrong = |found: Mismatch| CallError::new(Error::Mismatch(found.part), Some(Detail::Version(found)));
+            callee.check(published).map_err(wrong)?;
+        }
+        let outcome = self.block(callee.name(), parameters, options);
+        outcome.map_err(|error| CallError::new(error, self.failure.take().map(Detail::Service)))
     }
-
-    fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {
-        let mut copy = Parameters::<1024>::sized();
-        copy.copy_from(parameters)?;
-        self.block(function, &mut copy, options).map(|()| CallId(1))
-    }
-}
-
-impl BlockingCaller for Unit {
-    type Hold = &'static str;
 
     /// Through blocks, as between two units.
     fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error> {
@@ -313,43 +311,52 @@ impl BlockingCaller for Unit {
         block::write(results, &served, &mut SliceWriter::new(&mut bytes));
         block::read(results, &bytes, parameters)
     }
+}
 
-    fn block_and_hold(
+impl Caller for Unit {
+    type Pending = ();
+    type Answered = ();
+    type Hold = &'static str;
+    type Details = Option<Detail>;
+    type Room = &'static mut ParametersView;
+    type Canceller = ();
+
+    fn room(_: usize) -> Option<Self::Room> {
+        None
+    }
+
+    fn send(
         &self,
-        function: &str,
-        parameters: &mut ParametersView,
+        callee: Callee<'_>,
+        parameters: &ParametersView,
         options: &RequestOptions,
-    ) -> Result<&'static str, Error> {
-        self.block(function, parameters, options).map(|()| "held")
+    ) -> Result<CallId, CallError<(), Option<Detail>>> {
+        let mut copy = Parameters::<1024>::sized();
+        copy.copy_from(parameters)?;
+        self.ask(callee, &mut copy, options).map(|()| CallId(1))
+    }
+
+    fn poll(
+        &self,
+        _: &mut Option<()>,
+        outgoing: Outgoing<'_, ()>,
+        _: &mut Context<'_>,
+    ) -> Poll<Result<(), CallError<(), Option<Detail>>>> {
+        Poll::Ready(self.wait(outgoing))
+    }
+
+    fn hold(&self, (): ()) -> &'static str {
+        "held"
     }
 }
 
-impl WatchingCaller for Unit {
-    fn block_watched(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        mut on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error> {
-        let outcome = self.block(function, parameters, options);
-        *why = self.failure.take();
-        match on_progress(&self.told.borrow()) {
-            ControlFlow::Continue(()) => outcome,
-            ControlFlow::Break(()) => Err(Error::Cancelled),
+impl BlockingCaller for Unit {
+    fn wait(&self, outgoing: Outgoing<'_, ()>) -> Result<(), CallError<(), Option<Detail>>> {
+        let outcome = self.ask(outgoing.callee, outgoing.parameters, outgoing.options);
+        match outgoing.progress.map(|hear| hear(&self.told.borrow())) {
+            Some(ControlFlow::Break(())) => Err(Error::Cancelled.into()),
+            _ => outcome,
         }
-    }
-}
-
-impl AwaitedCaller for Unit {
-    async fn call(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<(), Error> {
-        self.block(function, parameters, options)
     }
 }
 
@@ -410,16 +417,16 @@ fn attributes_and_actuators_are_passed_on() {
 fn a_client_gets_what_the_service_gives() {
     let unit = unit();
     let agv = AgvClient::at(&unit);
-    assert_eq!(agv.add(40, 2), Ok(42));
-    assert_eq!(agv.go_to([3, 4]), Ok(()));
+    assert_eq!(agv.add(40, 2).wait(), Ok(42));
+    assert_eq!(agv.go_to([3, 4]).wait(), Ok(()));
     assert_eq!(unit.vehicle.borrow().target, Some([3, 4]));
-    assert_eq!(agv.stop(), Ok(()));
-    assert_eq!(agv.say("stand by", &[1, 2], 5, Gear::Reverse), Ok(("STAND BY".to_owned(), 7, Gear::Neutral)));
-    assert_eq!(agv.pose(), Err(CallError::Call(Error::Service(ServiceError::NotReady))));
-    assert_eq!(agv.place(Pose::new("hall 7")), Ok(()));
-    assert_eq!(agv.pose(), Ok(Pose::new("hall 7")));
+    assert_eq!(agv.stop().wait(), Ok(()));
+    assert_eq!(agv.say("stand by", &[1, 2], 5, Gear::Reverse).wait(), Ok(("STAND BY".to_owned(), 7, Gear::Neutral)));
+    assert_eq!(agv.pose().wait(), Err(Error::Service(ServiceError::NotReady).into()));
+    assert_eq!(agv.place(Pose::new("hall 7")).wait(), Ok(()));
+    assert_eq!(agv.pose().wait(), Ok(Pose::new("hall 7")));
     unit.vehicle.borrow_mut().stands_by = true;
-    assert_eq!(agv.reset(), Err(CallError::Call(Error::Service(ServiceError::Failed(2)))));
+    assert_eq!(agv.reset().wait(), Err(Error::Service(ServiceError::Failed(2)).into()));
     assert_eq!(unit.vehicle.borrow().resets, 1);
 }
 
@@ -433,28 +440,30 @@ fn progress_and_failures_are_typed() {
             told.push(left);
             ControlFlow::Continue(())
         };
-        agv.watch_dock(gate, on_progress).unwrap_err()
+        agv.dock(gate).watch(on_progress).wait().unwrap_err()
     };
-    let error = CallError::Call(Error::Service(ServiceError::Failed(7)));
+    let error = Error::Service(ServiceError::Failed(7));
     let failed = dock(1);
-    assert_eq!((&failed.error, failed.text.as_str()), (&error, "the way is blocked"));
-    assert_eq!(failed.values, Some(Blocked { at: [3, 4], by: "a pallet".to_owned() }));
+    assert_eq!((&failed.error, failed.text()), (&error, "the way is blocked"));
+    assert_eq!(failed.values(), Some(Blocked { at: [3, 4], by: "a pallet".to_owned() }));
     assert_eq!(failed.to_string(), "the way is blocked (code 7)");
     // Longer than it is declared: the rest is told.
     let failed = dock(9);
-    assert_eq!((failed.values, failed.text.as_str()), (None, "the way is blocked"));
+    assert_eq!((failed.values(), failed.text()), (None, "the way is blocked"));
     assert_eq!(told, [Left { left: 2.5 }; 2]);
-    assert_eq!(agv.dock(1), Err(error), "without what it tells");
-    let cancelled =
-        agv.watch_undock(|left| if left.left == 0.0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) });
-    assert_eq!(cancelled.map_err(|failed| failed.error), Err(CallError::Call(Error::Cancelled)));
+    assert_eq!(agv.dock(1).wait(), Err(error.into()), "without what it tells");
+    let cancelled = agv
+        .undock()
+        .watch(|left| if left.left == 0.0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
+        .wait();
+    assert_eq!(cancelled.map_err(|failed| failed.error), Err(Error::Cancelled));
 }
 
 #[test]
 fn a_service_of_any_port_gets_its_order() {
     let unit = Unit::default();
     WinchServer.add_to(&unit).unwrap();
-    assert_eq!(WinchClient::at(&unit).wind(), Ok(true));
+    assert_eq!(WinchClient::at(&unit).wind().wait(), Ok(true));
 }
 
 #[test]
@@ -462,24 +471,24 @@ fn options_holds_and_requests_go_through() {
     let mut unit = unit();
     let wanted = RequestOptions { timeout: Some(Duration::from_secs(9)), ..RequestOptions::new() };
     let agv = AgvClient::at(&unit).with(wanted).renewing(Renew::Process);
-    assert_eq!(agv.hold_go_to([1, 2]), Ok(Held { results: (), hold: "held" }));
-    assert_eq!(agv.request_add(1, 2), Ok(CallId(1)));
+    assert_eq!(agv.go_to([1, 2]).hold().wait(), Ok(Held { results: (), hold: "held" }));
+    assert_eq!(agv.add(1, 2).send(), Ok(CallId(1)));
     assert_eq!(*unit.sent.borrow(), [RequestOptions { renew: Renew::Process, ..wanted }; 2]);
     unit.ended = Some(Ended);
-    assert!(AgvClient::at(&unit).go_to([9, 9]).is_err(), "its order has ended");
+    assert!(AgvClient::at(&unit).go_to([9, 9]).wait().is_err(), "its order has ended");
     assert_eq!(unit.vehicle.borrow().target, Some([1, 2]));
 }
 
 #[test]
 fn a_task_awaits_the_same() {
     let unit = unit();
-    let agv = AgvAsyncClient::at(&unit);
-    let both = async { (agv.add(1, 2).await, agv.request_go_to([5, 6]), agv.pose().await) };
+    let agv = AgvClient::at(&unit);
+    let both = async { (agv.add(1, 2).await, agv.go_to([5, 6]).send(), agv.pose().await) };
     let Poll::Ready((sum, sent, pose)) = pin!(both).poll(&mut Context::from_waker(Waker::noop())) else {
         panic!("it is ready at once");
     };
     assert_eq!((sum, sent), (Ok(3), Ok(CallId(1))));
-    assert_eq!(pose, Err(CallError::Call(Error::Service(ServiceError::NotReady))));
+    assert_eq!(pose, Err(Error::Service(ServiceError::NotReady).into()));
 }
 
 #[test]
@@ -494,8 +503,9 @@ fn another_version_at_the_peer_is_told_before_anything_is_sent() {
     ] {
         unit.other = Some(Definition::parse(theirs).unwrap());
         unit.sent.borrow_mut().clear();
-        match (AgvClient::at(&unit).add(1, 2), told) {
-            (Err(CallError::Mismatch(mismatch)), Some(told)) => {
+        match (AgvClient::at(&unit).add(1, 2).wait(), told) {
+            (Err(failed), Some(told)) => {
+                let mismatch = failed.mismatch().expect("it is of another version");
                 assert!(mismatch.to_string().contains(told), "{mismatch}");
                 assert_eq!(mismatch.function, "add");
                 assert_eq!(unit.sent.borrow().len(), 0);
@@ -526,8 +536,8 @@ fn what_does_not_fit_the_rust_type_is_refused() {
     assert_eq!(unit.block("say", &mut call, &usual), Ok(()));
     assert_eq!(call.variable("gear"), Ok(0));
     // Too long for what is declared: nothing is sent.
-    let long = AgvClient::at(&unit).say(&"x".repeat(65), &[], 0, Gear::Reverse);
-    assert_eq!(long, Err(CallError::Call(Error::WrongSize { index: 0, expected: 64, found: 65 })));
+    let long = AgvClient::at(&unit).say(&"x".repeat(65), &[], 0, Gear::Reverse).wait();
+    assert_eq!(long, Err(Error::WrongSize { index: 0, expected: 64, found: 65 }.into()));
 }
 
 #[test]

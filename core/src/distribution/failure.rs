@@ -4,7 +4,7 @@ use core::fmt;
 
 use super::parameters::{Parameters, ParametersView};
 use crate::config::{FAILURE_TEXT_BYTES, FAILURE_VALUES_BYTES};
-use crate::error::{Error, ServiceError};
+use crate::error::ServiceError;
 
 /// Why a service failed, as its handler says it and its caller reads it.
 ///
@@ -57,7 +57,7 @@ impl Failure {
     }
 
     /// Whether the text was too long.
-    pub(crate) const fn is_cut(&self) -> bool {
+    pub const fn is_cut(&self) -> bool {
         self.is_cut
     }
 
@@ -81,35 +81,3 @@ impl fmt::Debug for Failure {
         f.debug_struct("Failure").field("code", &self.code).field("text", &self.text).finish_non_exhaustive()
     }
 }
-
-/// How a call has ended without results, with all that is known of it.
-#[derive(Clone, Debug)]
-pub struct CallFailure {
-    /// What every caller learns.
-    pub error: Error,
-    /// Why the service failed, where it has said so.
-    pub failure: Option<Failure>,
-}
-
-impl From<Error> for CallFailure {
-    fn from(error: Error) -> Self {
-        Self { error, failure: None }
-    }
-}
-
-impl From<CallFailure> for Error {
-    fn from(failure: CallFailure) -> Self {
-        failure.error
-    }
-}
-
-impl fmt::Display for CallFailure {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.failure {
-            Some(failure) => write!(f, "the service failed: {failure}"),
-            None => fmt::Display::fmt(&self.error, f),
-        }
-    }
-}
-
-impl core::error::Error for CallFailure {}

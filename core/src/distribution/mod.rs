@@ -10,7 +10,6 @@ mod control;
 pub mod datagram;
 mod display;
 mod element;
-#[cfg(feature = "details")]
 pub mod failure;
 pub mod function;
 pub mod function_list;

@@ -14,6 +14,7 @@ use super::parameters::{Elements, Fields, FromValue, Parameters, ParametersView,
 use super::value::{Element, Value};
 use crate::bytes::are_same;
 use crate::config::{NAME_BYTES, VARIABLES};
+pub use crate::error::Part;
 use crate::error::{Error, ServiceError};
 
 mod signatures;
@@ -316,29 +317,10 @@ pub struct Mismatch {
     pub theirs: Option<(Type, u32)>,
 }
 
-/// What a variable is in a signature.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
-    /// What a caller passes.
-    Argument,
-    /// What it gets back.
-    Result,
-    /// What it is told meanwhile.
-    Progress,
-    /// What it is told of a failure.
-    Failure,
-}
-
 impl fmt::Display for Mismatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { function, variable, part, ours, theirs } = self;
-        let what = match part {
-            Part::Argument => "argument",
-            Part::Result => "result",
-            Part::Progress => "progress",
-            Part::Failure => "failure's",
-        };
-        write!(f, "the peer's {function} is of another version: its {what} {variable} is ")?;
+        write!(f, "the peer's {function} is of another version: its {part} {variable} is ")?;
         show(f, *theirs)?;
         f.write_str(" there and ")?;
         show(f, *ours)?;

@@ -184,6 +184,7 @@
 //! ```
 
 pub mod access;
+pub mod call;
 mod calls;
 pub mod event;
 pub mod heart;

@@ -5,14 +5,9 @@
 //! interface is told apart before anything is sent.
 
 #[cfg(feature = "details")]
-use core::fmt;
 use core::future::Future;
-#[cfg(feature = "details")]
-use core::ops::ControlFlow;
-use core::ops::{Deref, DerefMut};
+use core::ops::DerefMut;
 
-#[cfg(feature = "details")]
-use crate::config::FAILURE_TEXT_BYTES;
 use crate::config::Priority;
 #[cfg(feature = "details")]
 use crate::distribution::failure::Failure;
@@ -21,9 +16,10 @@ use crate::distribution::identity::Identity;
 use crate::distribution::parameters::ParametersView;
 pub use crate::distribution::typed::*;
 use crate::error::{Error, ServiceError};
+use crate::services::call::{Call, Caller};
+pub use crate::services::call::{Frame, Request};
 use crate::services::heart::Renew;
 use crate::services::lease::Ended;
-use crate::services::requests::CallId;
 use crate::services::session::RequestOptions;
 use crate::time::Instant;
 
@@ -39,8 +35,8 @@ pub mod parts {
     pub use crate::distribution::parameters::{FromValue, IntoValue, Parameters, ParametersView, Slot, Type};
     pub use crate::distribution::value::Value;
     pub use crate::error::{Error, ServiceError};
+    pub use crate::services::call::{Call, Callee, Caller};
     pub use crate::services::heart::Renew;
-    pub use crate::services::requests::CallId;
     pub use crate::services::session::RequestOptions;
     pub use crate::time::Duration;
 }
@@ -203,175 +199,6 @@ pub trait Interface<T: 'static, F: Functions<T> + ?Sized> {
     fn add_to(self, functions: &F) -> Result<(), Error>;
 }
 
-/// Why a typed call has no results.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum CallError {
-    /// The peer has another version of the function; nothing was sent.
-    #[error("{0}")]
-    Mismatch(#[from] Mismatch),
-    /// What the dynamic form of the call says as well.
-    #[error("{0}")]
-    Call(#[from] Error),
-}
-
-/// Why a typed call has no results, with what its service has said of it.
-#[cfg(feature = "details")]
-#[derive(Clone, Debug, PartialEq)]
-pub struct Failed<F> {
-    /// What every caller learns.
-    pub error: CallError,
-    /// The reason in words; empty where there is none.
-    pub text: heapless::String<FAILURE_TEXT_BYTES>,
-    /// The values; `None` where the service sent none.
-    pub values: Option<F>,
-}
-
-#[cfg(feature = "details")]
-impl<F: Variables> Failed<F> {
-    /// Of an error, and what the service has said of it.
-    #[doc(hidden)]
-    pub fn new(error: Error, why: Option<&Failure>) -> Self {
-        let text = why.and_then(|why| heapless::String::try_from(why.text()).ok());
-        let values = why.filter(|why| !why.values().is_empty()).and_then(|why| F::from_parameters(why.values()).ok());
-        Self { error: error.into(), text: text.unwrap_or_default(), values }
-    }
-}
-
-#[cfg(feature = "details")]
-impl<F> From<CallError> for Failed<F> {
-    fn from(error: CallError) -> Self {
-        Self { error, text: heapless::String::new(), values: None }
-    }
-}
-
-#[cfg(feature = "details")]
-impl<F> From<Error> for Failed<F> {
-    fn from(error: Error) -> Self {
-        CallError::Call(error).into()
-    }
-}
-
-#[cfg(feature = "details")]
-impl<F> fmt::Display for Failed<F> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match (self.text.as_str(), &self.error) {
-            ("", error) => fmt::Display::fmt(error, f),
-            (text, CallError::Call(Error::Service(ServiceError::Failed(code)))) => write!(f, "{text} (code {code})"),
-            (text, error) => write!(f, "{error}: {text}"),
-        }
-    }
-}
-
-#[cfg(feature = "details")]
-impl<F: fmt::Debug> core::error::Error for Failed<F> {}
-
-/// Hands over what a call tells, as the struct that the interface declares for it.
-#[cfg(feature = "details")]
-#[doc(hidden)]
-pub fn hand<V: Variables>(told: &ParametersView, mut on_progress: impl FnMut(V) -> ControlFlow<()>) -> ControlFlow<()> {
-    // What cannot be read is of another version, which is no reason to end a motion.
-    V::from_parameters(told).map_or(ControlFlow::Continue(()), &mut on_progress)
-}
-
-impl From<CallError> for ServiceError {
-    fn from(error: CallError) -> Self {
-        match error {
-            CallError::Mismatch(_) => Self::NotReady,
-            CallError::Call(error) => error.into(),
-        }
-    }
-}
-
-/// What a call that is held has given, and what gives it up when this is dropped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[must_use = "dropped, it is released at once"]
-pub struct Held<H, R> {
-    /// The results; `()` of a function without any.
-    pub results: R,
-    /// What the call has started goes on until this is dropped.
-    pub hold: H,
-}
-
-impl<H, R> Deref for Held<H, R> {
-    type Target = H;
-
-    fn deref(&self) -> &H {
-        &self.hold
-    }
-}
-
-/// A peer whose functions are called.
-pub trait Caller {
-    /// Shows what the peer has published under a name.
-    fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R;
-
-    /// Room for variables of so many bytes, which are too many for the stack; `None` where there is no other memory.
-    #[doc(hidden)]
-    fn room(_bytes: usize) -> Option<impl DerefMut<Target = ParametersView> + Send> {
-        None::<&'static mut ParametersView>
-    }
-
-    /// Calls without waiting.
-    fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error>;
-}
-
-/// A peer that a thread can wait for.
-pub trait BlockingCaller: Caller {
-    /// A call that is given up when this is dropped.
-    type Hold;
-
-    /// Calls and waits for the results.
-    fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error>;
-
-    /// The same; what the call has started goes on until what is returned is dropped.
-    fn block_and_hold(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<Self::Hold, Error>;
-}
-
-/// A peer that a task can await.
-pub trait AwaitedCaller: Caller {
-    /// Calls and waits for the results.
-    fn call(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> impl Future<Output = Result<(), Error>>;
-}
-
-/// A peer that a thread can wait for while it hears how far its call is.
-#[cfg(feature = "details")]
-pub trait WatchingCaller: BlockingCaller {
-    /// As [`block`](BlockingCaller::block), with what the call tells while it runs, and what the service has said of a failure in
-    /// `why`. `Break` gives the call up, which ends with [`Error::Cancelled`].
-    fn block_watched(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> Result<(), Error>;
-}
-
-/// A peer that a task can await while it hears how far its call is.
-#[cfg(feature = "details")]
-pub trait AwaitedWatcher: AwaitedCaller {
-    /// As [`block_watched`](WatchingCaller::block_watched).
-    fn call_watched(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-        why: &mut Option<Failure>,
-    ) -> impl Future<Output = Result<(), Error>>;
-}
-
 /// What all clients are made of: a peer, and how its functions are called.
 #[derive(Debug)]
 pub struct Client<'p, P> {
@@ -404,21 +231,8 @@ impl<'p, P: Caller> Client<'p, P> {
         Self { options, ..self }
     }
 
-    /// The peer.
-    pub const fn peer(&self) -> &'p P {
-        self.peer
-    }
-
-    /// How its functions are called.
-    pub const fn options(&self) -> &RequestOptions {
-        &self.options
-    }
-
-    /// Makes the variables of a function, and looks whether the peer has the same one.
-    pub fn prepare(&self, function: Signature<'static>, parameters: &mut ParametersView) -> Result<(), CallError> {
-        parameters.lay_out(function)?;
-        let differs =
-            |published: Option<Signature<'_>>| published.map_or(Ok(()), |theirs| Mismatch::check(function, theirs));
-        Ok(self.peer.published(function.name(), differs)?)
+    /// A call at the peer, with these options.
+    pub const fn call<Q>(&self, request: Q) -> Call<'p, P, Q> {
+        Call::new(self.peer, request).with(self.options)
     }
 }

@@ -147,7 +147,7 @@ impl SUnit {
         wants_reply: bool,
     ) -> Result<CallId, Error> {
         let session = self.session.as_mut().ok_or(Error::NotConnected)?;
-        session.request(context!(self, now), function, parameters, options, wants_reply)
+        session.request(context!(self, now), function.into(), parameters, options, wants_reply)
     }
 
     /// Answers a call that the program serves [later](crate::Outcome::Later). [`Error::Full`]: try again after a poll.

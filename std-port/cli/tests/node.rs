@@ -314,7 +314,11 @@ fn call(peer: &Peer, function: &str, n: i64) -> Result<i64, Error> {
     let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::renewing(Renew::Process) };
     let mut parameters = number(n);
     parameters.add_int("m", 1).unwrap();
-    peer.block_request_with(function, &mut parameters, &options).map(|()| parameters.variable("m").unwrap())
+    peer.call(function, &mut parameters)
+        .with(options)
+        .wait()
+        .map(|()| parameters.variable("m").unwrap())
+        .map_err(Error::from)
 }
 
 /// A function `NAME(n: int) -> (m: int)` that a shell serves.
@@ -467,7 +471,7 @@ fn the_end_of_a_lease_ends_the_program_first() {
     let (unit, manager) = node.vehicle("agv", 7);
     let mut parameters = number(1);
     parameters.add_int("m", 1).unwrap();
-    manager.request_with("go", &parameters, &RequestOptions::renewing(Renew::Process)).unwrap();
+    manager.call("go", &mut parameters).renewing(Renew::Process).send().unwrap();
     until("it drives", || motion(&node) == "going\n");
     unit.stop();
     until("it is stopped", || motion(&node) == "going\nstopped\n");

@@ -1,15 +1,15 @@
-//! The asynchronous face, for tokio or any other executor: what waits is a future or a stream, and holds no thread.
+//! The asynchronous face, for tokio or any other executor: what waits is a future or a stream, and holds no thread. A call is
+//! awaited without it.
 //!
 //! The unit's own threads read its links, and its clock ends what takes too long; both wake the task that waits. No method
-//! whose name ends in `_async` blocks the thread that polls it: a poll takes locks that other threads hold for as long as a
+//! whose name ends in `_async`, and no awaited call, blocks the thread that polls it: a poll takes locks that other threads hold for as long as a
 //! frame takes to be encoded, and never while they wait for the network.
 //!
 //! | waits for | method | dropped before it has ended |
 //! |---|---|---|
-//! | a reply | [`Peer::request_async`] | the call is given up, and what it started, or would start, stops if its service has a lease |
-//! | a reply, and keeps what was started | [`Peer::hold_async`] | likewise |
+//! | a reply | [`Peer::call`] | the call is given up, and what it started, or would start, stops if its service has a lease |
 //! | the end of what was kept | [`Hold::release_async`] | it is released all the same |
-//! | replies of all nodes | [`CommunicationSystem::request_all_async`] | those calls that have not ended are given up |
+//! | replies of all nodes | [`CommunicationSystem::call_all`] | those calls that have not ended are given up |
 //! | a round trip | [`Peer::ping_async`] | the answer is not measured; another caller has its turn |
 //! | a node | [`CommunicationSystem::wait_for_s_unit_async`], [`Unit::wait_for_manager_async`] | nothing |
 //! | a function | [`Peer::wait_for_function_async`] | nothing |
@@ -85,7 +85,7 @@
 //!
 //! [`Served::lease_ended`]: crate::Served::lease_ended
 //! [`CommunicationSystem::publish_and_wait_async`]: crate::CommunicationSystem::publish_and_wait_async
-//! [`CommunicationSystem::request_all_async`]: crate::CommunicationSystem::request_all_async
+//! [`CommunicationSystem::call_all`]: crate::CommunicationSystem::call_all
 //! [`CommunicationSystem::wait_for_s_unit_async`]: crate::CommunicationSystem::wait_for_s_unit_async
 //! [`Error::WouldDeadlock`]: crate::Error::WouldDeadlock
 //! [`Handle::events_async`]: crate::Handle::events_async
@@ -97,13 +97,12 @@
 //! [`Hold`]: crate::Hold
 //! [`Hold::release_async`]: crate::Hold::release_async
 //! [`LeaseWatch::ended`]: crate::LeaseWatch::ended
+//! [`Peer::call`]: crate::Peer::call
 //! [`Peer::flush`]: crate::Peer::flush
-//! [`Peer::hold_async`]: crate::Peer::hold_async
 //! [`Peer::ping_async`]: crate::Peer::ping_async
 //! [`Peer::publish_and_wait_async`]: crate::Peer::publish_and_wait_async
 //! [`Peer::release`]: crate::Peer::release
 //! [`Peer::request`]: crate::Peer::request
-//! [`Peer::request_async`]: crate::Peer::request_async
 //! [`Peer::wait_for_function_async`]: crate::Peer::wait_for_function_async
 //! [`TheirStream::subscribe_async`]: crate::TheirStream::subscribe_async
 //! [`Unit::wait_for_manager_async`]: crate::Unit::wait_for_manager_async
@@ -112,13 +111,11 @@
 mod calls;
 mod elsewhere;
 mod events;
-mod reply;
 mod samples;
 mod services;
 mod waiting;
 
 pub(crate) use events::EventQueue;
 pub use events::{EventStream, EventsLost};
-pub use reply::PendingReply;
 pub use samples::SampleStream;
 pub use services::{CallGivenUp, StateOfTasks};

@@ -1,9 +1,12 @@
 //! Calls that an operator makes: to one node or to all, once or again and again.
 
-use std::task::Poll;
+use std::ops::ControlFlow;
+use std::task::{Context, Poll};
 use std::time::Instant;
 
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Cause, Error};
+use cara_core::services::call::{Caller, OnProgress, Outgoing};
 use cara_core::services::heart::Renew;
 use cara_core::time::Duration;
 
@@ -11,7 +14,8 @@ use super::answering::{End, LOOK, Sink, pause, send};
 use super::protocol::{Answer, Argument, CallQuestion, Failure, Said};
 use super::{describe, select, values};
 use crate::communication_system::thread_waker;
-use crate::engine::{CallFuture, worth_waiting};
+use crate::engine::{Answered, Pending};
+use crate::error::CallError;
 use crate::growing::GrowingParameters;
 use crate::{CommunicationSystem, Delivery, Peer, RequestOptions, TheirFunction};
 
@@ -20,8 +24,6 @@ const BYTES_AT_A_TIME: usize = 64 * 1024 * 1024;
 
 /// A call of all that has no answer for so long is [`News::Late`].
 const LATE: std::time::Duration = std::time::Duration::from_millis(500);
-/// How long a call waits for room at a time.
-const PAUSE: Duration = Duration::from_millis(20);
 
 /// Calls one node, or all that offer the function. Once `wanted` returns `false`, calls that have not ended are given
 /// up.
@@ -51,8 +53,8 @@ fn tell<T: Send + 'static>(
 ) -> Result<(), End> {
     let started = Instant::now();
     let outcome = prepare(peer, question).and_then(|prepared| {
-        let id = peer.request_with(&question.function, &prepared.parameters, options);
-        id.map(|id| Outcome { call: Some(id.0), ..Outcome::default() }).map_err(|error| prepared.explain(error))
+        let id = peer.send(question.function.as_str().into(), &prepared.parameters, options);
+        id.map(|id| Outcome { call: Some(id.0), ..Outcome::default() }).map_err(|failed| prepared.explain(&failed))
     });
     send(sink, called(peer, outcome, started))
 }
@@ -90,8 +92,7 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         take_over: question.take_over,
         operator: true,
         made: None,
-        // Also for why it fails.
-        progress: true,
+        progress: question.progress,
     })
 }
 
@@ -103,59 +104,39 @@ pub(super) fn await_one<T: Send + 'static>(
     options: &RequestOptions,
     sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
-) -> Result<Result<(Outcome, CallFuture<T>), Failure>, End> {
+) -> Result<Result<(Outcome, Answered), Failure>, End> {
     let mut prepared = match prepare(peer, question) {
         Ok(prepared) => prepared,
         Err(failure) => return Ok(Err(failure)),
     };
-    let mut call = match begin(peer, &question.function, &prepared, options, wanted)? {
-        Ok(call) => call,
-        Err(error) => return Ok(Err(prepared.explain(error))),
+    let signature = prepared.function.definition.clone();
+    let mut unheard = None;
+    let mut hear = |progress: &ParametersView| {
+        let values = values::arguments(signature.signature().progress(), progress);
+        match send(sink, Answer::Progress { node: peer.name().to_owned(), id: peer.id(), values }) {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(end) => {
+                unheard = Some(end);
+                ControlFlow::Break(())
+            }
+        }
     };
     let waker = thread_waker();
-    let mut cx = std::task::Context::from_waker(&waker);
-    loop {
-        if question.progress
-            && let Poll::Ready(Some(told)) = call.poll_progress(&cx)
-        {
-            let values = values::arguments(prepared.function.definition.signature().progress(), &told);
-            send(sink, Answer::Progress { node: peer.name().to_owned(), id: peer.id(), values })?;
-        }
-        if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
-            let failure = call.take_failure();
-            return Ok(prepared.outcome(outcome, failure.as_deref()).map(|outcome| (outcome, call)));
+    let mut cx = Context::from_waker(&waker);
+    let mut pending = None;
+    let outcome = loop {
+        let progress: Option<OnProgress<'_>> = if question.progress { Some(&mut hear) } else { None };
+        if let Poll::Ready(outcome) = prepared.poll(peer, &mut pending, options, progress, &mut cx) {
+            break outcome;
         }
         if !wanted() {
             return Err(End::Gone);
         }
         std::thread::park_timeout(LOOK);
-    }
-}
-
-/// Sends the request as soon as interval and queue allow, within the deadline.
-fn begin<T: Send + 'static>(
-    peer: &Peer<T>,
-    function: &str,
-    prepared: &Prepared,
-    options: &RequestOptions,
-    wanted: &dyn Fn() -> bool,
-) -> Result<Result<CallFuture<T>, Error>, End> {
-    let timeout = options.timeout.unwrap_or_else(|| peer.constraints().request_timeout);
-    let started = Instant::now();
-    // It keeps its place among the calls that move the same thing, however long it waits for room.
-    let made = peer.make();
-    loop {
-        let left = timeout - started.elapsed().into();
-        let options = RequestOptions { timeout: Some(left), made, ..*options };
-        let error = match peer.call_future(function, &prepared.parameters, &options) {
-            Ok(call) => return Ok(Ok(call)),
-            Err(error) => error,
-        };
-        let Some(wait) = worth_waiting(&error, PAUSE).filter(|wait| *wait < left) else { return Ok(Err(error)) };
-        if !wanted() {
-            return Err(End::Gone);
-        }
-        std::thread::sleep(LOOK.min(wait.into()));
+    };
+    match unheard {
+        Some(end) => Err(end),
+        None => Ok(prepared.outcome(outcome)),
     }
 }
 
@@ -187,28 +168,37 @@ fn signed(failure: Failure, function: &TheirFunction) -> Failure {
 }
 
 impl Prepared {
-    fn outcome(
-        &self,
-        outcome: Result<(), Error>,
-        failure: Option<&cara_core::distribution::failure::Failure>,
-    ) -> Result<Outcome, Failure> {
-        outcome.map_err(|error| match failure {
-            Some(failure) => {
-                let values = values::arguments(self.function.definition.signature().failure(), failure.values());
-                let text = format!("the service failed: {failure}");
-                let said = Some(Box::new(Said { reason: failure.text().to_owned(), values }));
-                Failure { said, text, ..Failure::from(error) }
-            }
-            None => self.explain(error),
-        })?;
-        let results = values::arguments(self.function.definition.signature().results(), &self.parameters);
-        Ok(Outcome { results, call: None })
+    fn poll<'c, T: Send + 'static>(
+        &'c mut self,
+        peer: &Peer<T>,
+        pending: &mut Option<Pending<T>>,
+        options: &'c RequestOptions,
+        progress: Option<OnProgress<'c>>,
+        cx: &mut Context<'_>,
+    ) -> Poll<Result<Answered, CallError>> {
+        let (callee, parameters) = (self.function.definition.name().into(), &mut *self.parameters);
+        peer.poll(pending, Outgoing { callee, parameters, options, progress, canceller: None }, cx)
     }
 
-    /// The text of an error in the arguments shows the function's signature.
-    fn explain(&self, error: Error) -> Failure {
-        let failure = Failure::from(error);
-        if error.cause() == Cause::Configuration { signed(failure, &self.function) } else { failure }
+    fn outcome(&self, outcome: Result<Answered, CallError>) -> Result<(Outcome, Answered), Failure> {
+        let answered = outcome.map_err(|failed| self.explain(&failed))?;
+        let results = values::arguments(self.function.definition.signature().results(), &self.parameters);
+        Ok((Outcome { results, call: None }, answered))
+    }
+
+    /// What the service has said of its failure; the text of an error in the arguments shows the function's signature.
+    fn explain(&self, failed: &CallError) -> Failure {
+        let signature = self.function.definition.signature();
+        let failure = Failure::from(failed.error);
+        match failed.failure() {
+            Some(said) => {
+                let values = values::arguments(signature.failure(), said.values());
+                let said = Some(Box::new(Said { reason: said.text().to_owned(), values }));
+                Failure { said, text: format!("the service failed: {failed}"), ..failure }
+            }
+            None if failed.error.cause() == Cause::Configuration => signed(failure, &self.function),
+            None => failure,
+        }
     }
 }
 
@@ -263,20 +253,16 @@ pub(super) fn block_all<T: Send + 'static>(
     let mut under_way = Vec::new();
     let mut bytes = 0;
     let waker = thread_waker();
-    let mut cx = std::task::Context::from_waker(&waker);
+    let mut cx = Context::from_waker(&waker);
     loop {
         while bytes < BYTES_AT_A_TIME
             && let Some((number, &(peer, question))) = calls.next()
         {
             let started = Instant::now();
-            let begun = prepare(peer, question).and_then(|prepared| {
-                let call = peer.call_future(&question.function, &prepared.parameters, options);
-                call.map_err(|error| prepared.explain(error)).map(|call| (prepared, call))
-            });
-            match begun {
-                Ok((prepared, call)) => {
+            match prepare(peer, question) {
+                Ok(prepared) => {
                     bytes += size_of_val(&*prepared.parameters);
-                    under_way.push((number, peer, started, prepared, call, false));
+                    under_way.push((number, peer, started, prepared, None, false));
                 }
                 Err(failure) => {
                     tell(number, News::Late)?;
@@ -289,15 +275,21 @@ pub(super) fn block_all<T: Send + 'static>(
         }
         let before = under_way.len();
         let mut index = 0;
-        while let Some((number, peer, started, prepared, call, is_late)) = under_way.get_mut(index) {
-            if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
+        while let Some((number, peer, started, prepared, pending, is_late)) = under_way.get_mut(index) {
+            if let Poll::Ready(outcome) = prepared.poll(peer, pending, options, None, &mut cx) {
                 bytes -= size_of_val(&*prepared.parameters);
-                let outcome = prepared.outcome(outcome, call.take_failure().as_deref());
+                // It never left: what is urgent goes another way.
+                let is_unsent = outcome.is_err() && !pending.as_ref().is_some_and(Pending::was_sent);
+                let outcome = prepared.outcome(outcome).map(|(outcome, _)| outcome);
                 let (number, answer) = (*number, called(peer, outcome, *started));
                 drop(under_way.swap_remove(index));
+                if is_unsent {
+                    tell(number, News::Late)?;
+                }
                 tell(number, News::Answer(Box::new(answer)))?;
             } else {
-                if !*is_late && started.elapsed() >= LATE {
+                let is_sent = pending.as_ref().is_some_and(Pending::was_sent);
+                if !*is_late && (!is_sent || started.elapsed() >= LATE) {
                     *is_late = true;
                     tell(*number, News::Late)?;
                 }

@@ -8,13 +8,14 @@ use std::time::{Duration, Instant};
 
 use cara_core::error::CloseReason;
 use cara_core::services::access::Verb;
+use cara_core::services::call::Caller;
 use cara_core::services::lease::LeaseEnd;
 
 use super::answering::{End, LOOK, Lives, Sink, send};
 use super::call::{await_one, called, options};
 use super::protocol::{Answer, BEAT, CallQuestion, Failure};
 use super::select;
-use crate::engine::CallFuture;
+use crate::heart::Hold;
 use crate::{CommunicationSystem, Peer, RequestOptions, UnitEvent};
 
 /// Events that wait while the call is made.
@@ -58,7 +59,7 @@ pub(super) fn hold<T: Send + 'static>(
         Err(End::Gone) => return Err(gone()),
         Err(end) => return Err(end),
         Ok(Ok((outcome, call))) => {
-            let held = Held { peer: &peer, call, lost: None };
+            let held = Held { peer: &peer, order: peer.hold(call), lost: None };
             send(sink, called(&peer, Ok(outcome), started))?;
             held
         }
@@ -121,10 +122,10 @@ pub(super) fn unattended(function: &str) -> Failure {
     Failure::resource("Unattended", text)
 }
 
-/// A renewed lease, given up on drop.
+/// A renewed lease, given up on drop. Nothing is sent for one that has ended there, or that a newer call has taken over.
 struct Held<'h, T: Send + 'static> {
     peer: &'h Peer<T>,
-    call: CallFuture<T>,
+    order: Hold<T>,
     /// Since when it is no longer renewed, without an event that says why.
     lost: Option<Instant>,
 }
@@ -134,7 +135,7 @@ impl<T: Send + 'static> Held<'_, T> {
     fn end(&self, event: &UnitEvent) -> Option<LeaseEnd> {
         match event {
             UnitEvent::LeaseEnded { peer, call, why, .. }
-                if peer == self.peer.identity() && *call == self.call.id() =>
+                if peer == self.peer.identity() && *call == self.order.call.id =>
             {
                 Some(*why)
             }
@@ -147,16 +148,9 @@ impl<T: Send + 'static> Held<'_, T> {
 
     /// Whether newer calls have taken its place in the table of leases that this unit renews.
     fn has_given_way(&mut self) -> bool {
-        if self.call.is_held() {
+        if self.order.is_held() {
             return false;
         }
         self.lost.get_or_insert_with(Instant::now).elapsed() > PATIENCE
-    }
-}
-
-impl<T: Send + 'static> Drop for Held<'_, T> {
-    fn drop(&mut self) {
-        // Nothing is sent for a lease that has ended there, or that a newer call has taken over.
-        self.call.release();
     }
 }

@@ -8,6 +8,7 @@ use std::time::Instant;
 use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::services::access::Verb;
+use cara_core::services::call::Caller;
 
 use super::answering::{End, Sink, permit, send};
 use super::call::{News, block_all, called, prepare};
@@ -120,7 +121,7 @@ fn send_one_way<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion, opti
     let Ok(prepared) = prepare(peer, question) else { return false };
     let ways = [Delivery::BestEffort, Delivery::Reliable].map(|delivery| {
         let options = RequestOptions { delivery, ..*options };
-        peer.request_with(&question.function, &prepared.parameters, &options).is_ok()
+        peer.send(question.function.as_str().into(), &prepared.parameters, &options).is_ok()
     });
     ways.contains(&true)
 }

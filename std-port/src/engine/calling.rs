@@ -1,26 +1,25 @@
 //! Requests of this unit: blocking ones, whose caller reads its own reply, and those that do not wait.
 
-use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::thread;
 
-use cara_core::distribution::block;
-use cara_core::distribution::function::Signature;
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Limit};
+use cara_core::services::call::{Callee, Detail, Outgoing};
 use cara_core::services::heart::Beats;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
-use super::awaiting::CallFuture;
-use super::details::{Canceller, Watch};
+use super::details::Canceller;
 use super::inbound::OwnCall;
-use super::link::{LinkCell, LinkState, Outcome, Wake};
+use super::link::{LinkCell, LinkState, Wake};
 use super::reader::{Cause, Token};
 use super::settling::RETRY;
 use super::worker::READ_BYTES;
+use crate::error::CallError;
 use crate::locks::Locked;
 use crate::sys::stream::{Received, Wait};
 
@@ -46,95 +45,47 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn request(
         &self,
         link: &Arc<LinkCell>,
-        function: &str,
+        callee: Callee<'_>,
         parameters: &ParametersView,
         options: &RequestOptions,
-    ) -> Result<CallId, Error> {
-        let noted = self.noted(link, function, options);
+    ) -> Result<CallId, CallError> {
+        let noted = self.noted(link, callee.name(), options);
         let now = self.now();
         let mut state = link.lock();
-        let result = self.request_on(now, link, &mut state, function, parameters, options, false);
+        let result = self.request_on(now, link, &mut state, callee, parameters, options, false);
         self.settle_at(now, link, state);
         if let Some(noted) = noted {
-            noted.ended(result.map(drop));
+            noted.ended(outline(&result));
         }
         result
     }
 
-    /// Requests and waits for the reply, which updates `parameters`. On an error they are unchanged.
+    /// Requests and waits for the reply, which updates the parameters. On an error they are unchanged.
     pub(crate) fn block_request(
         &self,
         link: &Arc<LinkCell>,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<CallId, Error> {
-        let noted = self.noted(link, function, options);
-        // Nothing here would look at it.
-        let options = RequestOptions { progress: false, ..*options };
+        mut outgoing: Outgoing<'_, Canceller>,
+    ) -> Result<CallId, CallError> {
+        let noted = self.noted(link, outgoing.callee.name(), outgoing.options);
         let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
-            let begun = self.begin_call(link, function, parameters, &options, None)?;
+            let begun = self.begin_call(link, &outgoing)?;
             let id = begun.id;
-            self.await_reply(link, begun, parameters, None).map(|()| id)
+            self.await_reply(link, begun, &mut outgoing).map(|()| id)
         });
         if let Some(noted) = noted {
-            noted.ended(result.map(drop));
+            noted.ended(outline(&result));
         }
         result
-    }
-
-    /// The same for a call that is watched.
-    pub(crate) fn block_request_watched(
-        &self,
-        link: &Arc<LinkCell>,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        watch: &mut Watch<'_>,
-    ) -> Result<CallId, Error> {
-        let noted = self.noted(link, function, options);
-        let options = RequestOptions { progress: watch.on_progress.is_some(), ..*options };
-        let result = self.services.state.waiting_for(link.id, || {
-            self.go_on_with_parked();
-            let mut begun = self.begin_call(link, function, parameters, &options, Some(watch.canceller))?;
-            let id = begun.id;
-            begun.state.details.watch(id);
-            let result = self.await_reply(link, begun, parameters, Some(&mut *watch));
-            watch.failure = link.lock().details.unwatch(id).filter(|_| result.is_err());
-            result.map(|()| id)
-        });
-        if let Some(noted) = noted {
-            noted.ended(result.map(drop));
-        }
-        result
-    }
-
-    /// The same; what the call has started is given up with what is returned.
-    pub(crate) fn hold(
-        self: &Arc<Self>,
-        link: Arc<LinkCell>,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-        watch: Option<&mut Watch<'_>>,
-    ) -> Result<CallFuture<T>, Error> {
-        let id = match watch {
-            Some(watch) => self.block_request_watched(&link, function, parameters, options, watch),
-            None => self.block_request(&link, function, parameters, options),
-        }?;
-        Ok(CallFuture::held(self.clone(), link, id))
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline, unless it is given up before.
     fn begin_call<'l>(
         &self,
         link: &'l Arc<LinkCell>,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-        canceller: Option<&Canceller>,
-    ) -> Result<Begun<'l>, Error> {
+        outgoing: &Outgoing<'_, Canceller>,
+    ) -> Result<Begun<'l>, CallError> {
+        let Outgoing { callee, parameters, options, canceller, .. } = outgoing;
         let mut now = self.now();
         let mut state = link.lock();
         let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
@@ -143,18 +94,21 @@ impl<T: Send + 'static> Engine<T> {
         let made = Some(state.session.make());
         loop {
             if canceller.is_some_and(Canceller::is_cancelled) {
-                return Err(Error::Cancelled);
+                return Err(Error::Cancelled.into());
             }
             // Before the request goes out: a thread of the pool must not wake for the reply.
             let token = self.take_token(now, link, &mut state);
-            let options = RequestOptions { timeout: Some(deadline.since(now)), made, ..*options };
-            let sent = self.request_on(now, link, &mut state, function, parameters, &options, true);
+            let options = RequestOptions { timeout: Some(deadline.since(now)), made, ..**options };
+            let sent = self.request_on(now, link, &mut state, *callee, parameters, &options, true);
             let (error, wait) = match sent {
                 Ok(id) => {
                     state.await_reply(id, Wake::Thread(thread::current()));
                     return Ok(Begun { state, token, id, now, deadline });
                 }
-                Err(error) => (error, worth_waiting(&error, PAUSE).unwrap_or(Duration::MAX)),
+                Err(error) => {
+                    let wait = worth_waiting(&error.error, PAUSE).unwrap_or(Duration::MAX);
+                    (error, wait)
+                }
             };
             self.leave(link, state, token);
             if self.now() + wait >= deadline {
@@ -177,45 +131,41 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &Arc<LinkCell>,
         begun: Begun<'_>,
-        parameters: &mut ParametersView,
-        mut watch: Option<&mut Watch<'_>>,
-    ) -> Result<(), Error> {
+        outgoing: &mut Outgoing<'_, Canceller>,
+    ) -> Result<(), CallError> {
         let Begun { mut state, mut token, id, now: asked, deadline } = begun;
+        let Outgoing { parameters, progress, canceller, .. } = outgoing;
         let mut now = asked;
         loop {
             // The reply may have come through another thread before this one got the token. Without this look it would block in
             // reading for a reply that is here.
-            if let Some(outcome) = state.take_outcome(id) {
+            if let Some(ended) = self.take_ended(link, &mut state, id, parameters) {
                 self.leave(link, state, token);
-                return self.read_outcome(link, id, outcome, parameters);
+                return ended;
             }
-            if now >= deadline {
+            let is_cancelled = canceller.is_some_and(Canceller::is_cancelled);
+            if is_cancelled || now >= deadline {
                 self.cancel(now, link, &mut state, id);
                 self.leave(link, state, token);
-                return Err(Error::TimedOut);
+                return Err(if is_cancelled { Error::Cancelled } else { Error::TimedOut }.into());
             }
-            if let Some(watch) = watch.as_deref_mut() {
-                let told = state.details.take_progress(id).filter(|_| !watch.canceller.is_cancelled());
-                let is_told = told.is_some();
-                let mut flow = ControlFlow::Continue(());
-                if let Some((told, on_progress)) = told.zip(watch.on_progress.as_mut()) {
-                    // What it does may take its time: others read the link meanwhile.
-                    self.leave(link, state, token.take());
-                    flow = on_progress(&told);
-                    state = link.lock();
-                    now = self.now();
-                }
-                if flow.is_break() || watch.canceller.is_cancelled() {
+            if let Some(hear) = progress
+                && let Some(news) = state.take_progress(id)
+            {
+                // What it does may take its time: others read the link meanwhile.
+                self.leave(link, state, token.take());
+                let flow = hear(&news);
+                state = link.lock();
+                now = self.now();
+                if flow.is_break() {
                     self.cancel(now, link, &mut state, id);
                     self.leave(link, state, token);
-                    return Err(Error::Cancelled);
+                    return Err(Error::Cancelled.into());
                 }
-                if is_told {
-                    continue;
-                }
+                continue;
             }
             // A thread that reads is woken by what comes alone, so one that may be told to give up looks now and then.
-            let until = if watch.is_some() { deadline.min(now + PAUSE) } else { deadline };
+            let until = if canceller.is_some() { deadline.min(now + PAUSE) } else { deadline };
             token = token.or_else(|| self.read_by(now, link, &mut state, Cause::Wants));
             if let Some(token) = token {
                 let mut own = OwnCall { id, parameters, result: None };
@@ -223,11 +173,11 @@ impl<T: Send + 'static> Engine<T> {
                 if let Some(result) = own.result {
                     if result.is_err() {
                         // The results may not fit: what the call started is not wanted then.
-                        self.cancel(now, link, &mut state, id);
+                        self.with_at(now, link, &mut state, |session, cx| session.cancel(cx, id));
                     }
-                    state.forget(id);
+                    let failure = state.forget(id);
                     self.leave_with_reply(asked, now, link, state, token);
-                    return result;
+                    return result.map_err(|error| failed(error, failure));
                 }
             } else {
                 self.settle_at(now, link, state);
@@ -236,6 +186,26 @@ impl<T: Send + 'static> Engine<T> {
                 now = self.now();
             }
         }
+    }
+
+    /// How a call has ended, if it has, with the results that another thread has read. What it started whose results do not fit
+    /// is not wanted.
+    pub(super) fn take_ended(
+        &self,
+        link: &LinkCell,
+        state: &mut LinkState,
+        id: CallId,
+        parameters: &mut ParametersView,
+    ) -> Option<Result<(), CallError>> {
+        let ended = state.take_ended(id)?;
+        let session = &state.session;
+        let result = ended.outcome?.and_then(|(slot, generation, bytes)| {
+            session.kept_results(slot, generation, &bytes)?.read_into(parameters)
+        });
+        if result.is_err() {
+            self.with(link, state, |session, cx| session.cancel(cx, id));
+        }
+        Some(result.map_err(|error| failed(error, ended.failure)))
     }
 
     /// Reads the link until the own reply has come, the deadline has passed, or another thread has noted the end. Returns
@@ -345,22 +315,16 @@ impl<T: Send + 'static> Engine<T> {
         self.with_at(now, link, state, |session, cx| session.cancel(cx, id));
         state.forget(id);
     }
+}
 
-    /// Decodes what another thread read. What a call started whose results do not fit is not wanted.
-    pub(super) fn read_outcome(
-        &self,
-        link: &Arc<LinkCell>,
-        id: CallId,
-        outcome: Outcome,
-        parameters: &mut ParametersView,
-    ) -> Result<(), Error> {
-        let result = outcome
-            .and_then(|(signature, bytes)| block::read(Signature::decode(&signature)?.results(), &bytes, parameters));
-        if result.is_err() {
-            self.give_up_call(link, id);
-        }
-        result
-    }
+/// Why a call has no results, with what its service has said.
+fn failed(error: Error, failure: Option<Box<Failure>>) -> CallError {
+    CallError::new(error, failure.map(|failure| Detail::Service(*failure)))
+}
+
+/// For the audit log.
+fn outline(result: &Result<CallId, CallError>) -> Result<(), Error> {
+    result.as_ref().map(drop).map_err(|error| error.error)
 }
 
 /// After what time a request that failed so may succeed; after `pause` where only the end of another call makes room.
@@ -376,6 +340,5 @@ pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> 
 fn is_over(state: &LinkState, id: CallId) -> bool {
     let ended = state.session.deadline() == Instant::START || state.session.is_ended();
     ended
-        || state.details.has_news(id)
-        || state.waiters.iter().any(|waiter| waiter.id == id && waiter.outcome.is_some())
+        || state.waiters.iter().any(|waiter| waiter.id == id && (waiter.outcome.is_some() || waiter.progress.is_some()))
 }

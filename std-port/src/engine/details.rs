@@ -2,7 +2,6 @@
 //! whatever watches them.
 
 use std::fmt;
-use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 
@@ -10,8 +9,7 @@ use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::Ticket;
-use cara_core::services::requests::CallId;
-use cara_core::services::session::{ReplyBlock, Session};
+use cara_core::services::session::Session;
 use cara_core::time::Instant;
 
 use super::Engine;
@@ -25,15 +23,6 @@ pub(crate) struct Details {
     failures: Vec<(Ticket, Box<Failure>)>,
     /// The newest progress of each call of the peer that could not be sent.
     progress: Vec<(Ticket, Box<ParametersView>)>,
-    watched: Vec<Watched>,
-}
-
-/// A call of this unit that is watched.
-struct Watched {
-    id: CallId,
-    /// The newest that it has told, until it is looked at.
-    progress: Option<Box<ParametersView>>,
-    failure: Option<Box<Failure>>,
 }
 
 impl Details {
@@ -45,46 +34,6 @@ impl Details {
 
     pub(super) const fn has_progress_to_send(&self) -> bool {
         !self.progress.is_empty()
-    }
-
-    pub(crate) fn watch(&mut self, id: CallId) {
-        self.watched.push(Watched { id, progress: None, failure: None });
-    }
-
-    /// Nothing watches a call any more; why it failed, where its service has said so.
-    pub(crate) fn unwatch(&mut self, id: CallId) -> Option<Box<Failure>> {
-        let index = self.watched.iter().position(|watched| watched.id == id)?;
-        self.watched.swap_remove(index).failure
-    }
-
-    pub(crate) fn has_news(&self, id: CallId) -> bool {
-        self.watched.iter().any(|watched| watched.id == id && watched.progress.is_some())
-    }
-
-    pub(crate) fn take_progress(&mut self, id: CallId) -> Option<Box<ParametersView>> {
-        self.watched.iter_mut().find(|watched| watched.id == id)?.progress.take()
-    }
-
-    fn of(&mut self, id: CallId) -> Option<&mut Watched> {
-        self.watched.iter_mut().find(|watched| watched.id == id)
-    }
-
-    /// A call of this unit has told how far it is; whether anything watches it.
-    pub(super) fn told(&mut self, id: CallId, block: &ReplyBlock<'_>) -> bool {
-        let Some(watched) = self.of(id) else { return false };
-        let mut values = arena(block.parameters_bytes() as usize);
-        if block.read_into(&mut values).is_ok() {
-            watched.progress = Some(values);
-        }
-        true
-    }
-
-    /// A call of this unit has failed, and its service has said why.
-    pub(super) fn failed(&mut self, id: CallId, failure: Failure) {
-        tracing::debug!(call = id.0, code = failure.code(), text = ?failure.text(), "a call has failed");
-        if let Some(watched) = self.of(id) {
-            watched.failure = Some(Box::new(failure));
-        }
     }
 }
 
@@ -200,17 +149,15 @@ impl Serving {
 /// Gives up a call that another thread waits for. Copies are of the same call.
 ///
 /// ```no_run
-/// use cara_std::{Canceller, Parameters, RequestOptions};
+/// use cara_std::{Canceller, Parameters};
 /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
-/// let (canceller, options) = (Canceller::new(), RequestOptions::default());
+/// let canceller = Canceller::new();
 /// let button = canceller.clone();
 /// std::thread::spawn(move || button.cancel());
 /// let agv = depot.s_unit("agv")?;
-/// let outcome = agv.block_request_cancellable("go_to", &mut Parameters::new(), &options, &canceller, |_| {});
+/// let outcome = agv.call("go_to", &mut Parameters::new()).cancelled_by(&canceller).wait();
 /// # Ok::<(), cara_std::BuildError>(())
 /// ```
-///
-/// Typed clients take it with their peer: [`Peer::cancelled_by`](crate::Peer::cancelled_by).
 #[derive(Clone, Debug, Default)]
 pub struct Canceller(Arc<AtomicBool>);
 
@@ -229,15 +176,4 @@ impl Canceller {
     pub fn is_cancelled(&self) -> bool {
         self.0.load(Ordering::SeqCst)
     }
-}
-
-/// Hears what a call tells; `Break` gives it up.
-pub(crate) type OnProgress<'w> = &'w mut dyn FnMut(&ParametersView) -> ControlFlow<()>;
-
-/// What watches a call whose caller blocks.
-pub(crate) struct Watch<'w> {
-    /// `None` for a call whose progress nobody asks for.
-    pub(crate) on_progress: Option<OnProgress<'w>>,
-    pub(crate) canceller: &'w Canceller,
-    pub(crate) failure: Option<Box<Failure>>,
 }

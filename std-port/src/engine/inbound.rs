@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
-use cara_core::services::session::Event;
+use cara_core::services::session::{Event, ReplyBlock};
 use cara_core::time::Instant;
 
 use super::Engine;
@@ -101,7 +102,7 @@ impl<T: Send + 'static> Engine<T> {
     ) -> Step {
         self.make_call_room(state);
         let functions = self.functions();
-        let LinkState { session, waiters, notices, woken, details, .. } = state;
+        let LinkState { session, waiters, notices, woken, .. } = state;
         let receipt = self.with_functions(now, &functions, link, session, |session, cx| {
             session.receive(cx, bytes, arguments.as_deref_mut())
         });
@@ -124,22 +125,24 @@ impl<T: Send + 'static> Engine<T> {
             }
             Some(Event::Progress(id, values)) => {
                 let block = session.progress_values(&values, bytes);
-                if block.is_ok_and(|block| details.told(id, &block)) {
-                    state.wake(id);
+                if let Ok(block) = block
+                    && let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id)
+                {
+                    waiter.progress = read(&block).or(waiter.progress.take());
+                    waiter.wake.wake(woken);
                 }
             }
             Some(Event::Reply(id, outcome)) => {
-                if outcome.is_err()
-                    && let Some(failure) = session.failure(bytes)
-                {
-                    details.failed(id, failure);
-                }
-                let outcome = outcome.and_then(|results| session.results(&results, bytes));
-                if let Some(own) = own.filter(|own| own.id == id) {
-                    own.result = Some(outcome.and_then(|block| block.read_into(own.parameters)));
-                } else if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
-                    let outcome = outcome.map(|block| (block.signature().as_bytes().into(), block.bytes().into()));
-                    waiter.finish(outcome, woken);
+                let failure = outcome.err().and_then(|_| session.failure(bytes));
+                let outcome = outcome.and_then(|results| Ok((results.function(), session.results(&results, bytes)?)));
+                if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
+                    waiter.failure = failure.inspect(|failure| show(id, failure)).map(Box::new);
+                    match own.filter(|own| own.id == id) {
+                        Some(own) => own.result = Some(outcome.and_then(|(_, block)| block.read_into(own.parameters))),
+                        None => {
+                            waiter.finish(outcome.map(|((slot, of), block)| (slot, of, block.bytes().into())), woken)
+                        }
+                    }
                 }
                 state.wake_tasks();
             }
@@ -153,7 +156,7 @@ impl<T: Send + 'static> Engine<T> {
                 if let Event::Failed(id, _) = event
                     && let Some(failure) = session.failure(bytes)
                 {
-                    details.failed(id, failure);
+                    show(id, &failure);
                 }
                 if matches!(event, Event::ListChanged) && !link.is_introduced() {
                     // A node that counts has its place.
@@ -182,4 +185,14 @@ impl<T: Send + 'static> Engine<T> {
             self.run_emergency(functions, link, begun, copy);
         }
     }
+}
+
+/// What a call tells, with room for it.
+fn read(block: &ReplyBlock<'_>) -> Option<Box<ParametersView>> {
+    let mut values = arena(block.parameters_bytes() as usize);
+    block.read_into(&mut values).is_ok().then_some(values)
+}
+
+fn show(id: CallId, failure: &Failure) {
+    tracing::debug!(call = id.0, code = failure.code(), text = ?failure.text(), "a call has failed");
 }

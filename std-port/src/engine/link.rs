@@ -6,7 +6,9 @@ use std::sync::{Arc, Condvar, Mutex, OnceLock};
 use std::task::Waker;
 use std::thread::Thread;
 
-use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::failure::Failure;
+use cara_core::distribution::function_list::{Generation, Slot};
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::Port;
@@ -104,6 +106,10 @@ pub(crate) struct Waiter {
     pub(crate) id: CallId,
     pub(crate) wake: Wake,
     pub(crate) outcome: Option<Outcome>,
+    /// The newest progress that its caller has not heard.
+    pub(crate) progress: Option<Box<ParametersView>>,
+    /// What the service has said of its failure.
+    pub(crate) failure: Option<Box<Failure>>,
 }
 
 impl Waiter {
@@ -119,8 +125,8 @@ pub(crate) enum Wake {
     Task(Option<Waker>),
 }
 
-/// How a call ended: the signature and the block of its results, or why there are none.
-pub(crate) type Outcome = Result<(Box<[u8]>, Box<[u8]>), Error>;
+/// How a call ended: the function and the block of its results, or why there are none.
+pub(crate) type Outcome = Result<(Slot, Generation, Box<[u8]>), Error>;
 
 impl LinkCell {
     pub(crate) fn new(
@@ -247,13 +253,22 @@ impl LinkState {
     pub(crate) fn await_reply(&mut self, id: CallId, wake: Wake) {
         // One at a time is usual, and a list begins with room for four.
         self.waiters.reserve_exact(usize::from(self.waiters.is_empty()));
-        self.waiters.push(Waiter { id, wake, outcome: None });
+        self.waiters.push(Waiter { id, wake, outcome: None, progress: None, failure: None });
     }
 
-    /// Notes how a call ended and wakes what waits for it.
-    pub(crate) fn finish(&mut self, id: CallId, outcome: Outcome) {
+    /// What waits for a call from here on, and what did before, to be dropped without the lock. `None` when nothing waits for it.
+    pub(crate) fn await_reply_by(&mut self, id: CallId, wake: Wake) -> Option<Wake> {
+        self.waiter(id).map(|waiter| std::mem::replace(&mut waiter.wake, wake))
+    }
+
+    pub(crate) fn waiter(&mut self, id: CallId) -> Option<&mut Waiter> {
+        self.waiters.iter_mut().find(|waiter| waiter.id == id)
+    }
+
+    /// Notes why a call has no results and wakes what waits for it.
+    pub(crate) fn fail(&mut self, id: CallId, error: Error) {
         if let Some(waiter) = self.waiters.iter_mut().find(|waiter| waiter.id == id) {
-            waiter.finish(outcome, &mut self.woken);
+            waiter.finish(Err(error), &mut self.woken);
         }
         self.wake_tasks();
     }
@@ -264,21 +279,27 @@ impl LinkState {
         self.waiters.iter_mut().filter(|waiter| waiter.id == id).for_each(|waiter| waiter.wake.wake(woken));
     }
 
-    /// Takes out how a call ended, if it has.
-    pub(crate) fn take_outcome(&mut self, id: CallId) -> Option<Outcome> {
-        let index = self.waiters.iter().position(|waiter| waiter.id == id)?;
-        self.waiters.get(index)?.outcome.as_ref()?;
-        self.waiters.swap_remove(index).outcome
+    /// Takes a call out that has ended.
+    pub(crate) fn take_ended(&mut self, id: CallId) -> Option<Waiter> {
+        let index = self.waiters.iter().position(|waiter| waiter.id == id && waiter.outcome.is_some())?;
+        Some(self.waiters.swap_remove(index))
     }
 
-    /// Nothing waits for a call any more, and there may be room for another.
-    pub(crate) fn forget(&mut self, id: CallId) {
-        let Some(index) = self.waiters.iter().position(|waiter| waiter.id == id) else { return };
-        if let Wake::Task(Some(waker)) = self.waiters.swap_remove(index).wake {
+    /// The newest progress of a call, once.
+    pub(crate) fn take_progress(&mut self, id: CallId) -> Option<Box<ParametersView>> {
+        self.waiter(id)?.progress.take()
+    }
+
+    /// Nothing waits for a call any more, and there may be room for another. What the service has said of its failure.
+    pub(crate) fn forget(&mut self, id: CallId) -> Option<Box<Failure>> {
+        let index = self.waiters.iter().position(|waiter| waiter.id == id)?;
+        let Waiter { wake, failure, .. } = self.waiters.swap_remove(index);
+        if let Wake::Task(Some(waker)) = wake {
             // Dropped under the lock, the last one of a task would run the end of that task's calls.
             self.woken.push(waker);
         }
         self.wake_tasks();
+        failure
     }
 
     /// The task of `waker` looks again when the link has changed: room, a reply, an answer, its end.
@@ -356,7 +377,7 @@ impl Backlog {
 
 impl Wake {
     /// Unparks the thread; the task's waker is left to the thread that gives the link's lock up.
-    fn wake(&mut self, woken: &mut Vec<Waker>) {
+    pub(super) fn wake(&mut self, woken: &mut Vec<Waker>) {
         match self {
             Self::Thread(thread) => thread.unpark(),
             Self::Task(waker) => woken.extend(waker.take()),

@@ -66,12 +66,9 @@ pub(crate) use accounts::pairs;
 #[cfg(feature = "metrics")]
 pub(crate) use accounts::{Group, Reading};
 #[cfg(feature = "async")]
-pub(crate) use alarms::Alarm;
-pub(crate) use awaiting::{CallFuture, CallsToAll};
 #[cfg(feature = "async")]
-pub(crate) use awaiting::{PendingCall, Step, Told as CallTold};
-#[cfg(feature = "control")]
-pub(crate) use calling::worth_waiting;
+pub(crate) use alarms::Alarm;
+pub(crate) use awaiting::{Answered, CallsToAll, Pending};
 #[cfg(feature = "async")]
 pub(crate) use events::Told;
 pub(crate) use keys::Keys;

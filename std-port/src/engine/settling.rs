@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::task::Waker;
 
+use cara_core::error::Error;
 use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 
@@ -54,7 +55,8 @@ impl<T: Send + 'static> Engine<T> {
                 #[cfg(feature = "async")]
                 Some(Event::Cancelled(ticket)) => state.wake_serving(ticket),
                 Some(Event::Reply(id, outcome)) => {
-                    state.finish(id, outcome.map(|_| Default::default()));
+                    // Results come with what was read alone.
+                    state.fail(id, outcome.err().unwrap_or(Error::ResultLost));
                 }
                 Some(event) => {
                     if let Event::Closed(_) = event {

@@ -6,6 +6,7 @@ use cara_core::distribution::connection_handler::NodeStorage;
 use cara_core::distribution::function_list::Entry;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
+use cara_core::services::call::{Callee, Detail};
 use cara_core::services::requests::CallId;
 use cara_core::services::session::{RequestOptions, SessionStorage};
 use cara_core::services::slots_for;
@@ -14,6 +15,7 @@ use cara_core::time::Instant;
 use super::Engine;
 use super::link::{LinkCell, LinkState, Linux};
 use crate::config::Capacities;
+use crate::error::CallError;
 use crate::storage::{Boxed, filled, filled_with};
 use crate::sys::limits;
 
@@ -92,18 +94,18 @@ impl<T: Send + 'static> Engine<T> {
         now: Instant,
         link: &LinkCell,
         state: &mut LinkState,
-        function: &str,
+        callee: Callee<'_>,
         parameters: &ParametersView,
         options: &RequestOptions,
         wait: bool,
-    ) -> Result<CallId, Error> {
+    ) -> Result<CallId, CallError> {
         let mut attempt =
-            || self.with_at(now, link, state, |session, cx| session.request(cx, function, parameters, options, wait));
+            || self.with_at(now, link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
         let mut outcome = attempt();
         let most = self.links.capacities.calls_in_flight;
         if outcome == Err(Error::Full(Limit::Calls)) && state.session.call_slots() < most {
             drop(state.session.lend_calls(filled(most, None)));
-            outcome = self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait));
+            outcome = self.with(link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
         }
         // An operator's is not the program's to ask after.
         if let Ok(id) = outcome
@@ -111,9 +113,12 @@ impl<T: Send + 'static> Engine<T> {
             && state.session.last_order().is_some_and(|(_, order)| order == id)
             && let Some(peer) = link.peer.get()
         {
-            peer.ordered(function, state.session.nonce() as u32, id);
+            peer.ordered(callee.name(), state.session.nonce() as u32, id);
         }
-        outcome
+        outcome.map_err(|error| match error {
+            Error::Mismatch(_) => mismatch(state, callee, error),
+            error => error.into(),
+        })
     }
 
     /// Makes room for as many calls of the peer as it may have here once more than one runs or waits, before the next one comes.
@@ -134,6 +139,14 @@ impl<T: Send + 'static> Engine<T> {
         }
         grows
     }
+}
+
+/// Where the peer's version of a function differs.
+#[cold]
+fn mismatch(state: &LinkState, callee: Callee<'_>, error: Error) -> CallError {
+    let published = state.session.their_function_list().named(callee.name());
+    let found = published.and_then(|published| callee.check(published.signature).err());
+    CallError::new(error, found.map(Detail::Version))
 }
 
 #[cfg(test)]

@@ -157,12 +157,12 @@ fn an_answer_that_cannot_be_kept_is_dropped_with_its_deadline() {
     let (pool, far) = (&pair.agv.engine().pool, pair.far());
     let buffers = drain(pool);
     // Long enough for the call to be run on a busy machine: one that comes too late has no results.
-    let outcome = pair.peer.block_request_with("fill", &mut text(LONG), &options(Duration::from_secs(2)));
-    assert_eq!(outcome, Err(Error::TimedOut));
+    let outcome = pair.peer.call("fill", &mut text(LONG)).with(options(Duration::from_secs(2))).wait();
+    assert_eq!(outcome, Err(Error::TimedOut.into()));
     until(|| far.lock().session.counters().value(LinkCounter::RepliesDropped) == 1);
     assert_eq!(far.lock().session.calls_held(), 0);
     buffers.into_iter().for_each(|buffer| pool.give(buffer));
-    pair.peer.block_request_with("fill", &mut text(LONG), &options(PATIENT)).unwrap();
+    pair.peer.call("fill", &mut text(LONG)).with(options(PATIENT)).wait().unwrap();
 }
 
 /// The thread that is to run a call may come when the call's order has ended.
@@ -178,7 +178,7 @@ fn no_handler_runs_for_an_order_that_has_ended() {
         let options = ServiceOptions::new().lease(Duration::from_secs(3_600), || {});
         agv.my_function_list().add_service(&"go()".parse().unwrap(), options, go).unwrap();
     });
-    pair.peer.block_request_with("go", &mut Parameters::new(), &options(PATIENT)).unwrap();
+    pair.peer.call("go", &mut Parameters::new()).with(options(PATIENT)).wait().unwrap();
     let told = told.recv().unwrap();
     let runs = AtomicUsize::new(0);
     let run = || {
@@ -226,9 +226,9 @@ fn the_deadline_of_a_call_is_that_of_its_first_try() {
     });
     let (pool, near) = (&pair.manager.engine().pool, pair.near());
     let tries = || near.lock().session.counters().value(LinkCounter::RequestsWithheld);
-    let one = || pair.peer.block_request_with("take", &mut text(LONG), &options(TIMEOUT)).unwrap();
+    let one = || pair.peer.call("take", &mut text(LONG)).with(options(TIMEOUT)).wait().unwrap();
     let all = || {
-        let outcomes = pair.manager.block_request_all("take", &*text(LONG), &options(TIMEOUT));
+        let outcomes = pair.manager.call_all("take", &*text(LONG)).with(options(TIMEOUT)).wait();
         assert!(outcomes.len() == 1 && outcomes.iter().all(|(_, outcome)| outcome.is_ok()));
     };
     for call in [&one as &(dyn Fn() + Sync), &all] {
@@ -266,8 +266,8 @@ fn nothing_is_left_of_a_call_that_has_timed_out() {
         let held_up = clock_is_held_up.then(|| engine.freeze_hub());
         engine.wake_clock();
         // Long enough for the call to be run on a busy machine: one that comes too late is answered.
-        let outcome = pair.peer.block_request_with("wait", &mut text(1), &options(Duration::from_millis(500)));
-        assert_eq!(outcome, Err(Error::TimedOut));
+        let outcome = pair.peer.call("wait", &mut text(1)).with(options(Duration::from_millis(500))).wait();
+        assert_eq!(outcome, Err(Error::TimedOut.into()));
         drop(held_up);
         let state = near.lock();
         assert_eq!((state.waiters.len(), state.session.calls_in_flight()), (0, 0));

@@ -76,7 +76,7 @@ impl Audited {
     }
 
     fn call(&self, function: &str, options: &RequestOptions) -> Result<(), Error> {
-        self.peer.block_request_with(function, &mut Parameters::new(), options)
+        self.peer.call(function, &mut Parameters::new()).with(*options).wait().map_err(Error::from)
     }
 }
 
@@ -141,9 +141,14 @@ fn what_the_program_moves_stops_and_resets_is_noted() {
     assert_eq!(audited.call("halt", &RequestOptions::default()), Ok(()));
     assert!(matches!(audited.call("drive", &wanted), Err(Error::Inhibited { .. })));
     until("it is reset", || audited.call("free", &RequestOptions::default()) == Ok(()));
-    audited.peer.request_with("drive", &Parameters::new(), &RequestOptions { take_over: true, ..wanted }).unwrap();
+    audited
+        .peer
+        .call("drive", &mut Parameters::new())
+        .with(RequestOptions { take_over: true, ..wanted })
+        .send()
+        .unwrap();
     let none: Parameters = Parameters::new();
-    let all = audited.depot.system.block_request_all("halt", &none, &RequestOptions::default());
+    let all = audited.depot.system.call_all("halt", &none).wait();
     assert!(all.iter().all(|(_, outcome)| outcome.is_ok()), "{all:?}");
     let expected = [
         line("call", "drive", "ok"),

@@ -4,9 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use cara_std::control::protocol::{Answer, CallQuestion, Failure, Question};
-use cara_std::{
-    Error, Parameters, ParametersView, Peer, Renew, RequestOptions, Served, ServiceError, ServiceOptions, UnitEvent,
-};
+use cara_std::{Error, Parameters, ParametersView, Peer, Renew, Served, ServiceError, ServiceOptions, UnitEvent};
 
 use crate::support::{Depot, ask, call, until};
 
@@ -25,7 +23,7 @@ fn outcome(answers: &[Answer]) -> Result<(), Failure> {
 
 /// What a call of the unit's program comes to.
 fn wanted_by_program(peer: &Peer<()>) -> Result<(), Error> {
-    peer.block_request_with("drive", &mut Parameters::new(), &RequestOptions::renewing(Renew::Process))
+    peer.call("drive", &mut Parameters::new()).renewing(Renew::Process).wait().map_err(Error::from)
 }
 
 #[test]

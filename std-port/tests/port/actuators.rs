@@ -78,11 +78,7 @@ impl Crane {
     }
 
     fn ask(&self, caller: usize, function: &str) -> Result<(), Error> {
-        self.peer(caller).block_request_with(
-            function,
-            &mut Parameters::new(),
-            &RequestOptions::renewing(Renew::Process),
-        )
+        self.peer(caller).call(function, &mut Parameters::new()).renewing(Renew::Process).wait().map_err(Error::from)
     }
 
     fn moves(&self) -> bool {
@@ -130,7 +126,7 @@ fn another_callers_order_is_held_unless_it_is_taken_over() {
     assert_eq!(crane.ask(1, "dock"), Err(Error::Held { by: 1, operator: false }));
     assert!(crane.moves() && crane.hooks() == 0);
     let options = RequestOptions { take_over: true, ..RequestOptions::new() };
-    assert_eq!(crane.peer(1).block_request_with("dock", &mut Parameters::new(), &options), Ok(()));
+    assert_eq!(crane.peer(1).call("dock", &mut Parameters::new()).with(options).wait(), Ok(()));
     assert_eq!(crane.ask(0, "go"), Err(Error::Held { by: 2, operator: false }));
     // The earlier holder gives up what it no longer has: nothing stops.
     crane.peer(0).release("go").unwrap();

@@ -7,8 +7,8 @@ use std::sync::{Arc, Mutex};
 
 use cara_std::control::Control;
 use cara_std::{
-    Actuator, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, Renew,
-    RequestOptions, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
+    Actuator, Claim, CommunicationSystem, Definition, Error, LeaseEnd, Parameters, ParametersView, Renew, Served,
+    ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, system, unit, until};
@@ -226,11 +226,7 @@ fn a_handler_that_hangs_is_cut_off_before_the_next_manager_moves_anything() {
     let first = manager(fleet, &here, false);
     first.start().unwrap();
     until("it is told of the function", || first.peer("agv").is_ok_and(|agv| agv.their_function_list().contains("go")));
-    first
-        .peer("agv")
-        .unwrap()
-        .request_with("go", &Parameters::new(), &RequestOptions::renewing(Renew::Process))
-        .unwrap();
+    first.peer("agv").unwrap().call("go", &mut Parameters::new()).renewing(Renew::Process).send().unwrap();
     until("its handler runs", || log.lock().unwrap().len() == 1);
 
     let second = manager(fleet, &there, true);

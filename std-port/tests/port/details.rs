@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use cara_std::{
-    CallFailure, Canceller, CommunicationSystem, Constraints, Error, Failure, LeaseWatch, LinkCounter, Parameters,
+    CallError, Canceller, CommunicationSystem, Constraints, Error, Failure, LeaseWatch, LinkCounter, Parameters,
     ParametersView, Peer, RequestOptions, Served, ServiceError, ServiceOptions, Stage, Unit,
 };
 
@@ -53,9 +53,9 @@ fn watched(
     peer: &Peer,
     function: &str,
     on_progress: impl FnMut(&ParametersView) -> ControlFlow<()>,
-) -> Result<i64, Box<CallFailure>> {
+) -> Result<i64, CallError> {
     let mut parameters = number(1);
-    let outcome = peer.block_request_with_progress(function, &mut parameters, &patient(), on_progress);
+    let outcome = peer.call(function, &mut parameters).with(patient()).watch(on_progress).wait();
     outcome.map(|()| value(&parameters))
 }
 
@@ -79,16 +79,13 @@ fn a_failure_tells_its_code_its_text_and_its_values() {
     });
     let (peer, _) = meet(&manager, &agv);
     let failed = watched(&peer, "says", passed_over).unwrap_err();
-    assert_eq!(
-        (failed.error, failed.to_string().as_str()),
-        (FAILED, "the service failed: the way is blocked (code 7)")
-    );
-    assert_blocked(failed.failure.as_ref());
+    assert_eq!((failed.error, failed.to_string().as_str()), (FAILED, "the way is blocked (code 7)"));
+    assert_blocked(failed.failure());
     assert_eq!(peer.block_request("says", &mut number(1)), Err(FAILED), "the short form has the code");
     let failed = watched(&peer, "says_not", passed_over).unwrap_err();
-    assert!(failed.error == FAILED && failed.failure.is_none(), "{failed:?}");
+    assert!(failed.error == FAILED && failed.failure().is_none(), "{failed:?}");
     let failed = watched(&peer, "says_another", passed_over).unwrap_err();
-    assert!(failed.error == Error::Service(ServiceError::Failed(8)) && failed.failure.is_none(), "{failed:?}");
+    assert!(failed.error == Error::Service(ServiceError::Failed(8)) && failed.failure().is_none(), "{failed:?}");
     assert_eq!(watched(&peer, "recovers", passed_over).unwrap(), 1);
 }
 
@@ -123,7 +120,7 @@ fn the_newest_progress_comes_and_others_need_not() {
     // To a caller that does not want to know nothing is sent.
     let sent = || counter(&agv.manager().unwrap().counters(), "ProgressSent");
     let before = sent();
-    assert_eq!(peer.block_request_with("go", &mut number(2), &patient()), Ok(()));
+    assert_eq!(peer.call("go", &mut number(2)).with(patient()).wait(), Ok(()));
     assert!(before > 0 && sent() == before);
 }
 
@@ -199,8 +196,9 @@ fn another_thread_gives_a_call_up_and_its_order_ends() {
     let vehicle = Vehicle::new();
     let canceller = Canceller::new();
     let failed = std::thread::scope(|scope| {
-        let call = scope
-            .spawn(|| vehicle.peer.block_request_cancellable("go", &mut number(1), &patient(), &canceller, |_| {}));
+        let call = scope.spawn(|| {
+            vehicle.peer.call("go", &mut number(1)).with(patient()).cancelled_by(&canceller).watch(passed_over).wait()
+        });
         vehicle.begun(1);
         assert!(vehicle.hooks() == 0 && vehicle.orders.lock().unwrap()[0].is_live());
         canceller.clone().cancel();
@@ -210,7 +208,8 @@ fn another_thread_gives_a_call_up_and_its_order_ends() {
     until("what it moved is safe", || vehicle.hooks() == 1);
     assert_eq!(vehicle.orders.lock().unwrap()[0].stage(), Stage::Dead);
     // It is for one call and all that come after it.
-    let late = vehicle.peer.block_request_cancellable("waits", &mut number(1), &patient(), &canceller, |_| {});
+    let late =
+        vehicle.peer.call("waits", &mut number(1)).with(patient()).cancelled_by(&canceller).watch(passed_over).wait();
     assert_eq!(late.unwrap_err().error, Error::Cancelled);
     vehicle.gate.open();
     vehicle.agv.stop();
@@ -230,7 +229,8 @@ fn a_call_that_is_given_up_before_it_is_sent_is_not_sent() {
     let (canceller, sent) = (Canceller::new(), manager.counted(LinkCounter::MessagesSent));
     let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(120)), ..Default::default() };
     let failed = std::thread::scope(|scope| {
-        let call = scope.spawn(|| peer.block_request_cancellable("go", &mut number(1), &options, &canceller, |_| {}));
+        let call = scope
+            .spawn(|| peer.call("go", &mut number(1)).with(options).cancelled_by(&canceller).watch(passed_over).wait());
         std::thread::sleep(std::time::Duration::from_millis(100));
         canceller.cancel();
         until("it ends", || call.is_finished());
@@ -245,12 +245,13 @@ fn a_call_that_is_given_up_leaves_a_newer_order_alone() {
     let vehicle = Vehicle::new();
     let canceller = Canceller::new();
     std::thread::scope(|scope| {
-        let call = scope
-            .spawn(|| vehicle.peer.block_request_cancellable("go", &mut number(1), &patient(), &canceller, |_| {}));
+        let call = scope.spawn(|| {
+            vehicle.peer.call("go", &mut number(1)).with(patient()).cancelled_by(&canceller).watch(passed_over).wait()
+        });
         vehicle.begun(1);
         // The answer comes at once, and what it has started goes on.
         let newer = RequestOptions { renew: cara_std::Renew::Process, ..patient() };
-        vehicle.peer.block_request_with("go", &mut number(2), &newer).unwrap();
+        vehicle.peer.call("go", &mut number(2)).with(newer).wait().unwrap();
         let orders = vehicle.orders.lock().unwrap().clone();
         assert!(!orders[0].is_live() && orders[1].is_live());
         canceller.cancel();

@@ -77,15 +77,20 @@ fn growing_parameters_have_room_for_the_results_of_every_form_of_call() {
     has_text(&parameters);
     peer.block_request("tell", &mut parameters).unwrap();
     let mut parameters = asked();
-    peer.block_request_with_progress("tell", &mut parameters, &options, |_| ControlFlow::Continue(())).unwrap();
+    peer.call("tell", &mut parameters).with(options).watch(|_| ControlFlow::Continue(())).wait().unwrap();
     has_text(&parameters);
     let mut parameters = asked();
-    peer.block_request_cancellable("tell", &mut parameters, &options, &Canceller::new(), |_| {}).unwrap();
+    peer.call("tell", &mut parameters)
+        .with(options)
+        .cancelled_by(&Canceller::new())
+        .watch(|_| ControlFlow::Continue(()))
+        .wait()
+        .unwrap();
     has_text(&parameters);
     let mut parameters = asked();
-    drop(peer.hold("tell", &mut parameters, &options).unwrap());
+    drop(peer.call("tell", &mut parameters).with(options).hold().wait().unwrap());
     has_text(&parameters);
-    for (_, outcome) in manager.block_request_all("tell", &asked(), &options) {
+    for (_, outcome) in manager.call_all("tell", &asked()).with(options).wait() {
         has_text(&outcome.unwrap());
     }
     peer.request("tell", &asked()).unwrap();
@@ -143,12 +148,12 @@ fn tasks_call_and_serve_with_growing_parameters() {
     runtime.block_on(async {
         let options = RequestOptions::default();
         let mut parameters = GrowingParameters::new();
-        peer.request_async("list", &mut parameters, &options).unwrap().await.unwrap();
+        peer.call("list", &mut parameters).with(options).await.unwrap();
         assert_eq!(parameters.list("list").unwrap().len(), ELEMENTS);
         let mut held = GrowingParameters::new();
-        drop(peer.hold_async("list", &mut held, &options).await.unwrap());
+        drop(peer.call("list", &mut held).with(options).hold().await.unwrap());
         assert_eq!(held, parameters);
-        let all = manager.request_all_async("list", &GrowingParameters::new(), &options).await;
+        let all = manager.call_all("list", &GrowingParameters::new()).with(options).await;
         assert_eq!(all.len(), 1);
         assert!(all.into_iter().all(|(_, outcome)| outcome == Ok(parameters.clone())));
     });

@@ -104,7 +104,7 @@ fn a_slow_handler_delays_nobody_else() {
     std::thread::scope(|scope| {
         let slow = scope.spawn(|| {
             let mut parameters = number(1);
-            first.1.block_request_with("slow", &mut parameters, &options)
+            first.1.call("slow", &mut parameters).with(options).wait()
         });
         until("the slow handler runs", || gate.came() == 1);
         // Longer than the three keep-alives after which a silent link is lost.
@@ -113,7 +113,7 @@ fn a_slow_handler_delays_nobody_else() {
             assert_eq!(ask(&second.1, "quick", 1), Ok(2), "another link");
             let high = RequestOptions { priority: Some(Priority::High), ..Default::default() };
             let mut parameters = number(4);
-            assert_eq!(first.1.block_request_with("quick", &mut parameters, &high), Ok(()), "the same link");
+            assert_eq!(first.1.call("quick", &mut parameters).with(high).wait(), Ok(()), "the same link");
             assert_eq!(value(&parameters), 5);
         }
         assert!(first.0.is_connected() && second.0.is_connected());
@@ -132,7 +132,7 @@ fn as_many_calls_of_one_peer_run_as_it_may_have() {
     let (_, peer) = meet(&manager, &agv);
     let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(20)), ..Default::default() };
     std::thread::scope(|scope| {
-        let call = || peer.block_request_with("slow", &mut number(1), &options);
+        let call = || peer.call("slow", &mut number(1)).with(options).wait();
         let calls: Vec<_> = (0..CALLS).map(|_| scope.spawn(call)).collect();
         until("all of them run", || gate.came() == CALLS);
         gate.open();
@@ -161,7 +161,7 @@ fn quick_handlers_that_all_get_slow_leave_a_thread_that_reads() {
     let met: Vec<_> = units.iter().map(|unit| meet(&manager, unit)).collect();
     let (last, callers) = met.split_last().unwrap();
     let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(20)), ..Default::default() };
-    let call = |peer: &cara_std::Peer, argument| peer.block_request_with("work", &mut number(argument), &options);
+    let call = |peer: &cara_std::Peer, argument| peer.call("work", &mut number(argument)).with(options).wait();
     std::thread::scope(|scope| {
         let calls: Vec<_> = callers
             .iter()
@@ -199,8 +199,8 @@ fn an_emergency_does_not_wait_for_other_handlers() {
     for priority in classes {
         let timeout = Some(cara_std::Duration::from_secs(20));
         let options = RequestOptions { priority: Some(priority), timeout, ..Default::default() };
-        peer.request_with("work", &number(1), &options).unwrap();
-        peer.request_with("work", &number(1), &options).unwrap();
+        peer.call("work", &mut number(1)).with(options).send().unwrap();
+        peer.call("work", &mut number(1)).with(options).send().unwrap();
     }
     until("all are busy, side by side", || gate.came() == 2 * classes.len());
     assert_eq!(ask(&peer, "stop", 3), Ok(3), "while the others are busy");
@@ -233,7 +233,7 @@ fn a_burst_that_ends_slowly_leaves_the_stream_to_others() {
     until("the slow one runs", || gate.came() == 1);
     let options = RequestOptions { priority: Some(Priority::High), ..Default::default() };
     let mut parameters = number(5);
-    assert_eq!(peer.block_request_with("quick", &mut parameters, &options), Ok(()), "while the slow one runs");
+    assert_eq!(peer.call("quick", &mut parameters).with(options).wait(), Ok(()), "while the slow one runs");
     gate.open();
 }
 

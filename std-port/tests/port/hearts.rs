@@ -48,7 +48,7 @@ fn of_two_loops_the_one_that_hangs_ends_its_motion_and_the_other_goes_on() {
                 let mut heart = manager.heart(PERIOD);
                 heart.beat();
                 let wanted = RequestOptions::renewing(heart.renew());
-                peer.block_request_with(function, &mut number(1), &wanted).unwrap();
+                peer.call(function, &mut number(1)).with(wanted).wait().unwrap();
                 while !ends.load(Ordering::SeqCst) {
                     if !(may_hang && hangs.load(Ordering::SeqCst)) {
                         heart.beat();
@@ -79,7 +79,7 @@ fn a_guard_that_is_dropped_releases() {
     let Vehicle { manager, _agv, peer, leases: [drive, _] } = vehicle();
     let mut heart = manager.heart(PERIOD);
     heart.beat();
-    let held = peer.hold("drive", &mut number(1), &RequestOptions::renewing(heart.renew())).unwrap();
+    let held = peer.call("drive", &mut number(1)).renewing(heart.renew()).hold().wait().unwrap();
     assert!(drive.is_live() && held.is_held());
     drop(held);
     until("it is released", || !drive.is_live());
@@ -91,20 +91,20 @@ fn a_heart_that_is_dropped_releases_and_a_slow_one_is_refused() {
     let mut heart = manager.heart(PERIOD);
     heart.beat();
     let renew = heart.renew();
-    peer.block_request_with("drive", &mut number(1), &RequestOptions::renewing(renew)).unwrap();
+    peer.call("drive", &mut number(1)).renewing(renew).wait().unwrap();
     assert!(drive.is_live());
     drop(heart);
     until("what named it is released", || !drive.is_live());
     // Its word is used by the next one, whose beats mean nothing to what names the first.
     let mut next = manager.heart(PERIOD);
     let began = Instant::now();
-    peer.block_request_with("lift", &mut number(1), &RequestOptions::renewing(renew)).unwrap();
+    peer.call("lift", &mut number(1)).renewing(renew).wait().unwrap();
     while began.elapsed() < 2 * LEASE {
         next.beat();
         std::thread::sleep(Duration::from_millis(20));
     }
     assert!(!lift.is_live());
     let slow = manager.heart(LEASE);
-    let refused = peer.block_request_with("drive", &mut number(1), &RequestOptions::renewing(slow.renew()));
-    assert_eq!(refused, Err(Error::SlowHeart { need: 800, have: 1_600 }));
+    let refused = peer.call("drive", &mut number(1)).renewing(slow.renew()).wait();
+    assert_eq!(refused, Err(Error::SlowHeart { need: 800, have: 1_600 }.into()));
 }

@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Barrier};
 
 use cara_std::{
-    CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions, Served,
-    ServiceError, ServiceOptions, Unit,
+    CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, Served, ServiceError,
+    ServiceOptions, Unit,
 };
 
 use crate::support::{PATIENCE, fleet, meet, system, unit, until};
@@ -45,7 +45,7 @@ fn joined(manager: &CommunicationSystem, agv: &Unit) -> Peer<()> {
 fn ask(peer: &Peer<()>, function: &str) -> Result<(), Error> {
     // A stop and a reset of the same moment are told apart by 3 ms.
     std::thread::sleep(std::time::Duration::from_millis(5));
-    peer.block_request_with(function, &mut Parameters::new(), &RequestOptions::renewing(Renew::Process))
+    peer.call(function, &mut Parameters::new()).renewing(Renew::Process).wait().map_err(Error::from)
 }
 
 #[test]
@@ -143,7 +143,7 @@ fn a_stop_of_all_reaches_all_behind_a_handler_that_hangs_in_a_commit() {
     let lift = functions.add_service(&define("lift()"), moves(), nothing).unwrap();
     let peer = joined(&manager, &agv);
     assert_eq!(ask(&peer, "lift"), Ok(()));
-    peer.request_with("drive", &Parameters::new(), &RequestOptions::renewing(Renew::Process)).unwrap();
+    peer.call("drive", &mut Parameters::new()).renewing(Renew::Process).send().unwrap();
     until("it hangs", || is_inside.load(Ordering::SeqCst));
     assert!(drive.is_live() && lift.is_live());
     peer.request("halt", &Parameters::new()).unwrap();

@@ -53,7 +53,7 @@ impl Vehicle {
     fn go(&self, renew: Renew) {
         assert!(!self.lease.is_live());
         let options = RequestOptions { renew, ..Default::default() };
-        self.peer.block_request_with("go_to", &mut number(1), &options).unwrap();
+        self.peer.call("go_to", &mut number(1)).with(options).wait().unwrap();
         assert!(self.lease.is_live());
         assert_eq!(self.speed(), 5);
     }

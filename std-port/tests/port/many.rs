@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
-use cara_std::{Capacities, Constraints, Error, RequestOptions, Threads, Unit, UnitEvent};
+use cara_std::{CallError, Capacities, Constraints, Error, RequestOptions, Threads, Unit, UnitEvent};
 
 use crate::support::{
     Gate, PATIENCE, ask, counter, fleet, held, meet, number, pair, publish, retire_absent, service, system, unit,
@@ -86,7 +86,7 @@ fn all_are_called_although_the_interval_has_not_passed() {
     let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::default() };
     let began = std::time::Instant::now();
     for _ in 0..2 {
-        let outcomes = manager.block_request_all("add", &number(5), &options);
+        let outcomes = manager.call_all("add", &number(5)).with(options).wait();
         assert_eq!(outcomes.len(), NODES as usize);
         for (peer, outcome) in outcomes {
             assert_eq!(outcome.map(|results| value(&results)), Ok(5 + i64::from(peer.id() - 10)), "{peer:?}");
@@ -94,9 +94,9 @@ fn all_are_called_although_the_interval_has_not_passed() {
     }
     assert!(began.elapsed() >= interval, "the second call of each waited");
     let hasty = RequestOptions { timeout: Some(Duration::from_millis(1).into()), ..RequestOptions::default() };
-    let outcomes = manager.block_request_all("add", &number(5), &hasty);
+    let outcomes = manager.call_all("add", &number(5)).with(hasty).wait();
     assert!(
-        outcomes.iter().any(|(_, outcome)| matches!(outcome, Err(Error::TooSoon { .. }))),
+        outcomes.iter().any(|(_, outcome)| matches!(outcome, Err(CallError { error: Error::TooSoon { .. }, .. }))),
         "not beyond the deadline"
     );
 }
@@ -166,7 +166,7 @@ fn tables_grow_to_the_capacities_and_no_further() {
     assert_eq!(ask(&peer, "function_40", 3), Err(Error::UnknownFunction));
     let before = counter(&peer.counters(), "RequestsSent");
     let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::default() };
-    let call = |caller: i64| peer.block_request_with("slow", &mut number(caller), &options);
+    let call = |caller: i64| peer.call("slow", &mut number(caller)).with(options).wait();
     std::thread::scope(|scope| {
         let callers: Vec<_> = (0..20)
             .map(|caller| {

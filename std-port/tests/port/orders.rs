@@ -55,7 +55,7 @@ impl Vehicle {
     fn go(&self, call: i64, renew: Renew) {
         let timeout = Some(cara_std::Duration::from_secs(20));
         let options = RequestOptions { renew, timeout, ..Default::default() };
-        self.peer.block_request_with("go", &mut number(call), &options).unwrap();
+        self.peer.call("go", &mut number(call)).with(options).wait().unwrap();
     }
 
     /// The thread and the task have awaited the end of this call, and of no other.

@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    CommunicationSystem, Constraints, Delivery, Error, Parameters, Peer, RequestOptions, ServiceError, Unit, UnitEvent,
+    CallError, CommunicationSystem, Constraints, Delivery, Error, Parameters, Peer, RequestOptions, ServiceError, Unit,
+    UnitEvent,
 };
 
 use crate::support::{
@@ -39,11 +40,14 @@ fn fleet_with_one_that_fails(count: u32) -> (CommunicationSystem, Vec<Unit>) {
 #[test]
 fn a_request_to_all_has_an_outcome_for_each() {
     let (manager, _units) = fleet_with_one_that_fails(3);
-    let outcomes = manager.block_request_all("f", &number(100), &RequestOptions::default());
+    let outcomes = manager.call_all("f", &number(100)).wait();
     assert_eq!(outcomes.len(), 3);
     for (peer, outcome) in outcomes {
-        let expected =
-            if peer.id() == 2 { Err(Error::Service(ServiceError::Failed(4))) } else { Ok(100 + i64::from(peer.id())) };
+        let expected = if peer.id() == 2 {
+            Err(Error::Service(ServiceError::Failed(4)).into())
+        } else {
+            Ok(100 + i64::from(peer.id()))
+        };
         assert_eq!(outcome.map(|parameters| value(&parameters)), expected, "{peer:?}");
     }
 }
@@ -58,16 +62,18 @@ fn a_request_to_all_tells_who_is_missing() {
     until("one has left", || !by_id(0).is_connected());
     until("one has withdrawn it", || by_id(1).their_function_list().is_empty());
     let outcomes = || {
-        let told = manager.block_request_all("f", &number(100), &RequestOptions::default()).into_iter();
-        let mut told: Vec<_> =
-            told.map(|(peer, outcome)| (peer.id(), outcome.map(|results| value(&results)))).collect();
+        let told = manager.call_all("f", &number(100)).wait().into_iter();
+        let mut told: Vec<_> = told
+            .map(|(peer, outcome)| (peer.id(), outcome.map(|results| value(&results)).map_err(Error::from)))
+            .collect();
         told.sort_unstable_by_key(|(id, _)| *id);
         told
     };
     let fails = (3, Err(Error::Service(ServiceError::Failed(4))));
     assert_eq!(outcomes(), [(0, Err(Error::NotConnected)), (1, Err(Error::UnknownFunction)), (2, Ok(102)), fails]);
-    let asked = manager.request_all("f", &number(100));
-    let refused = |id: u32| asked.iter().find(|(peer, _)| peer.id() == id).unwrap().1.err();
+    let asked = manager.call_all("f", &number(100)).send();
+    let refused =
+        |id: u32| asked.iter().find(|(peer, _)| peer.id() == id).unwrap().1.as_ref().err().map(|failed| failed.error);
     assert_eq!([0, 1, 2, 3].map(refused), [Some(Error::NotConnected), Some(Error::UnknownFunction), None, None]);
     assert!(by_id(0).retire() && !by_id(1).retire(), "one that is connected stays");
     assert_eq!(outcomes(), [(1, Err(Error::UnknownFunction)), (2, Ok(102)), fails]);
@@ -98,10 +104,10 @@ fn a_name_that_several_have_is_refused() {
 fn a_request_to_all_without_waiting_reports_the_failure() {
     let (manager, _units) = fleet_with_one_that_fails(3);
     let events = manager.events();
-    let outcomes = manager.request_all("f", &number(100));
+    let outcomes = manager.call_all("f", &number(100)).send();
     assert_eq!(outcomes.len(), 3);
     let (_, failing) = outcomes.iter().find(|(peer, _)| peer.id() == 2).unwrap();
-    let failing = failing.unwrap();
+    let failing = *failing.as_ref().unwrap();
     loop {
         if let UnitEvent::RequestFailed { peer, call, error } = events.recv_timeout(PATIENCE).unwrap() {
             assert_eq!((peer.id(), call, error), (2, failing, Error::Service(ServiceError::Failed(4))));
@@ -166,8 +172,8 @@ fn a_blocking_request_waits_for_the_interval_and_another_is_told() {
     }
     // A time-out shorter than the interval leaves no room to wait.
     let options = RequestOptions { timeout: Some(cara_std::Duration::from_millis(1)), ..Default::default() };
-    let refused = peer.block_request_with("f", &mut number(1), &options);
-    assert!(matches!(refused, Err(Error::TooSoon { .. })), "{refused:?}");
+    let refused = peer.call("f", &mut number(1)).with(options).wait();
+    assert!(matches!(refused, Err(CallError { error: Error::TooSoon { .. }, .. })), "{refused:?}");
 }
 
 #[test]
@@ -186,8 +192,11 @@ fn a_time_out_frees_the_slot_and_leaves_the_parameters() {
     let began = Instant::now();
     // More than there are slots for calls in flight.
     for _ in 0..80 {
-        let refused = peer.block_request_with("slow", &mut parameters, &options);
-        assert!(matches!(refused, Err(Error::TimedOut | Error::Busy | Error::Expired)), "{refused:?}");
+        let refused = peer.call("slow", &mut parameters).with(options).wait();
+        assert!(
+            matches!(refused, Err(CallError { error: Error::TimedOut | Error::Busy | Error::Expired, .. })),
+            "{refused:?}"
+        );
         assert_eq!(value(&parameters), 5);
     }
     // Less than the default time-out for each.
@@ -220,7 +229,7 @@ fn best_effort_arrives_in_one_datagram_or_is_refused() {
     let mut value = 0;
     until("a call goes in a datagram", || {
         let before = sent();
-        peer.request_with("telemetry", &number(value), &options).unwrap();
+        peer.call("telemetry", &mut number(value)).with(options).send().unwrap();
         let now = sent();
         // A vehicle holds a few calls at a time and drops the rest; loopback loses none.
         value += 1;
@@ -229,14 +238,17 @@ fn best_effort_arrives_in_one_datagram_or_is_refused() {
     });
     let [_, before] = sent();
     for value in value..value + 20 {
-        peer.request_with("telemetry", &number(value), &options).unwrap();
+        peer.call("telemetry", &mut number(value)).with(options).send().unwrap();
         until("it has come", || came.lock().unwrap().len() == value as usize + 1);
     }
     let [_, now] = sent();
     assert!(now >= before + 20, "{now} from {before}");
     assert_eq!(*came.lock().unwrap(), (0..value + 20).collect::<Vec<_>>());
-    assert!(matches!(peer.request_with("long", &long, &options), Err(Error::TooLarge { .. })));
-    assert_eq!(peer.block_request_with("telemetry", &mut number(1), &options), Err(Error::BadConstraint));
+    assert!(matches!(
+        peer.call("long", &mut long).with(options).send(),
+        Err(CallError { error: Error::TooLarge { .. }, .. })
+    ));
+    assert_eq!(peer.call("telemetry", &mut number(1)).with(options).wait(), Err(Error::BadConstraint.into()));
 }
 
 #[test]

@@ -102,9 +102,7 @@ fn as_child() {
             let manager = system(fleet).control(Control::Off).build().unwrap();
             manager.start().unwrap();
             until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
-            manager.nodes_offering("go_to")[0]
-                .block_request_with("go_to", &mut number(1), &RequestOptions::renewing(Renew::Process))
-                .unwrap();
+            manager.nodes_offering("go_to")[0].call("go_to", &mut number(1)).renewing(Renew::Process).wait().unwrap();
             until_input_ends();
         }
     }
@@ -132,14 +130,14 @@ fn a_killed_peer_interrupts_its_callers_and_takes_its_place_again() {
                 .map(|_| {
                     scope.spawn(|| {
                         let options = cara_std::RequestOptions { timeout: Some(PATIENCE.into()), ..Default::default() };
-                        peer.block_request_with("hang", &mut number(0), &options)
+                        peer.call("hang", &mut number(0)).with(options).wait()
                     })
                 })
                 .collect();
             until("all have asked", || sent() >= before + 3);
             first.kill();
             for caller in callers {
-                assert_eq!(caller.join().unwrap(), Err(Error::Interrupted));
+                assert_eq!(caller.join().unwrap(), Err(Error::Interrupted.into()));
             }
         });
         until("it has left", || !peer.is_connected());
@@ -163,11 +161,11 @@ fn an_interrupted_order_is_resolved_when_the_vehicle_is_back() {
     std::thread::scope(|scope| {
         let drives = scope.spawn(|| {
             let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::renewing(Renew::Process) };
-            peer.block_request_with("drive", &mut Parameters::new(), &options)
+            peer.call("drive", &mut Parameters::new()).with(options).wait()
         });
         until("it drives", || peer.outcome_of("drive") == OrderOutcome::Runs);
         vehicle.freeze();
-        assert_eq!(drives.join().unwrap(), Err(Error::Interrupted));
+        assert_eq!(drives.join().unwrap(), Err(Error::Interrupted.into()));
     });
     until("it is lost", || !peer.is_connected());
     assert_eq!(peer.outcome_of("drive"), OrderOutcome::Unknown);

@@ -22,7 +22,7 @@ fn a_waiting_caller_returns_at_once_when_its_unit_stops() {
                     move || {
                         let options = cara_std::RequestOptions { timeout: Some(PATIENCE.into()), ..Default::default() };
                         let mut parameters = crate::support::number(number);
-                        peer.block_request_with("slow", &mut parameters, &options)
+                        peer.call("slow", &mut parameters).with(options).wait()
                     }
                 })
             })
@@ -31,7 +31,7 @@ fn a_waiting_caller_returns_at_once_when_its_unit_stops() {
         until("all have asked", || crate::support::counter(&peer.counters(), "RequestsSent") == 4);
         manager.stop();
         for caller in callers {
-            assert_eq!(caller.join().unwrap(), Err(Error::Interrupted));
+            assert_eq!(caller.join().unwrap(), Err(Error::Interrupted.into()));
         }
         gate.open();
     });
@@ -57,7 +57,7 @@ fn a_handler_may_stop_its_own_unit() {
     // Methods of another class wait for the state meanwhile.
     let high = cara_std::RequestOptions { priority: Some(cara_std::Priority::High), ..Default::default() };
     for _ in 0..4 {
-        peer.request_with("wait", &number(0), &high).unwrap();
+        peer.call("wait", &mut number(0)).with(high).send().unwrap();
     }
     assert_eq!(ask(&peer, "stop", 1), Err(Error::Interrupted));
     until("it has left", || !peer.is_connected());

@@ -60,13 +60,13 @@ impl Stuck {
     fn call(&self, function: &str) {
         let options =
             RequestOptions { timeout: Some(PATIENCE.into()), renew: Renew::Never, ..RequestOptions::default() };
-        self.peer.request_with(function, &number(1), &options).unwrap();
+        self.peer.call(function, &mut number(1)).with(options).send().unwrap();
         self.peer.flush().unwrap();
     }
 
     fn go(&self) {
         let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
-        self.peer.block_request_with("go", &mut number(1), &options).unwrap();
+        self.peer.call("go", &mut number(1)).with(options).wait().unwrap();
     }
 
     fn hooks(&self) -> usize {
@@ -86,8 +86,8 @@ fn with_every_handler_stuck_a_hook_runs_and_an_emergency_is_answered() {
     }
     until("handlers are stuck, one of them with the state", || stuck.gate.came() >= 10);
     let free = RequestOptions { timeout: Some(Duration::from_millis(300).into()), ..RequestOptions::default() };
-    let quick = stuck.peer.block_request_with("quick", &mut number(1), &free);
-    assert_eq!(quick, Err(Error::TimedOut), "as many run as may");
+    let quick = stuck.peer.call("quick", &mut number(1)).with(free).wait();
+    assert_eq!(quick, Err(Error::TimedOut.into()), "as many run as may");
     until("the hook runs all the same", || stuck.hooks() == 1);
     for round in 0..10 {
         assert_eq!(ask(&stuck.peer, "stop", round), Ok(round), "an emergency, whatever else is stuck");
@@ -142,15 +142,15 @@ fn hooks_do_not_wait_for_each_other() {
     list.add_service(&signature("sound"), sound, service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
-    let call = |function: &str| peer.block_request_with(function, &mut number(1), &options);
+    let call = |function: &str| peer.call(function, &mut number(1)).with(options).wait();
     assert_eq!(call("stuck"), Ok(()));
     until("its hook is stuck", || gate.came() == 1);
     // The hook may be ahead of the unit, which is busy until it has seen the end of the last order.
     let mut refused = call("stuck");
-    while refused == Err(Error::Busy) {
+    while refused == Err(Error::Busy.into()) {
         refused = call("stuck");
     }
-    assert_eq!(refused, Err(Error::Service(ServiceError::NotReady)), "the next order comes after the hook");
+    assert_eq!(refused, Err(Error::Service(ServiceError::NotReady).into()), "the next order comes after the hook");
     for round in 1..4 {
         // Its hook may be ahead of the unit, which takes no new order before it has seen the end of the last one.
         until("it takes an order", || call("sound") == Ok(()));

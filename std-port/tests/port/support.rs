@@ -147,7 +147,7 @@ pub(crate) fn service(
 pub(crate) fn ask<T: Send + 'static>(peer: &Peer<T>, function: &str, number_in: i64) -> Result<i64, Error> {
     let mut parameters = number(number_in);
     let patient = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::default() };
-    peer.block_request_with(function, &mut parameters, &patient).map(|()| value(&parameters))
+    peer.call(function, &mut parameters).with(patient).wait().map(|()| value(&parameters)).map_err(Error::from)
 }
 
 /// A counter of the peer's link, or of a unit's discovery.

@@ -94,7 +94,7 @@ fn calls_of_a_class_take_the_state_in_order() {
             while !done.load(Ordering::Relaxed) {
                 let high = cara_std::RequestOptions { priority: Some(cara_std::Priority::High), ..Default::default() };
                 let mut parameters = number(1);
-                peer.block_request_with("echo", &mut parameters, &high).unwrap();
+                peer.call("echo", &mut parameters).with(high).wait().unwrap();
             }
         });
         for call in 0..2_000 {

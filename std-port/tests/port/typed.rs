@@ -7,9 +7,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use cara_core::distribution::block::{self, SliceWriter};
 use cara_std::typed::{BAD_ARGUMENT, Part};
 use cara_std::{
-    AnyCall, CallError, Canceller, Constraints, Definition, Duration, Error, Explained, Failure, LeaseWatch,
-    LinkCounter, Parameters, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, TypedCall, Variables,
-    interface,
+    AnyCall, CallError, Canceller, Constraints, Definition, Duration, Error, Failure, LeaseWatch, LinkCounter,
+    Parameters, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, TypedCall, Variables, interface,
 };
 
 use crate::support::{PATIENCE, fleet, meet, system, unit, until};
@@ -95,26 +94,29 @@ fn progress_and_failures_come_typed() {
     assert_eq!(shown, "dock(from: int) progress (left: int) fails (at: int[2])");
     let client = DockClient::at(&peer);
     let mut told = Vec::new();
-    let outcome = client.watch_dock(3, |Left { left }| {
-        told.push(left);
-        ControlFlow::Continue(())
-    });
+    let outcome = client
+        .dock(3)
+        .watch(|Left { left }| {
+            told.push(left);
+            ControlFlow::Continue(())
+        })
+        .wait();
     assert_eq!(outcome, Ok(()));
     // Which of them are told, depends on time; the first one is sent at once, and none comes twice.
     assert!(told.first() == Some(&2) && told.is_sorted_by(|one, next| one > next), "{told:?}");
-    let failed = client.watch_dock(11, |_| ControlFlow::Continue(())).unwrap_err();
-    assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(7))));
-    assert_eq!((failed.text.as_str(), failed.values), ("the way is blocked", Some(Blocked { at: [3, -4] })));
+    let failed = client.dock(11).watch(|_| ControlFlow::Continue(())).wait().unwrap_err();
+    assert_eq!(failed.error, Error::Service(ServiceError::Failed(7)));
+    assert_eq!((failed.text(), failed.values()), ("the way is blocked", Some(Blocked { at: [3, -4] })));
     assert_eq!(failed.to_string(), "the way is blocked (code 7)");
-    let failed = client.watch_dock(500, |_| ControlFlow::Break(())).unwrap_err();
-    assert_eq!(failed, CallError::Call(Error::Cancelled).into());
+    let failed = client.dock(500).watch(|_| ControlFlow::Break(())).wait().unwrap_err();
+    assert_eq!(failed, Error::Cancelled);
     until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 1));
-    assert_eq!(client.dock(1), Ok(()));
-    let told = NewerDockClient::at(&peer).watch_dock(1, |_| unreachable!("nothing is sent")).unwrap_err();
-    assert!(matches!(&told.error, CallError::Mismatch(what) if what.part == Part::Progress), "{told}");
+    assert_eq!(client.dock(1).wait(), Ok(()));
+    let told = NewerDockClient::at(&peer).dock(1).watch(|_| unreachable!("nothing is sent")).wait().unwrap_err();
+    assert!(matches!(told.mismatch(), Some(what) if what.part == Part::Progress), "{told}");
     assert!(told.to_string().contains("its progress left is int there and float here"), "{told}");
-    let told = NewestDockClient::at(&peer).dock(1).unwrap_err();
-    assert!(matches!(&told, CallError::Mismatch(what) if what.part == Part::Failure), "{told}");
+    let told = NewestDockClient::at(&peer).dock(1).wait().unwrap_err();
+    assert!(matches!(told.mismatch(), Some(what) if what.part == Part::Failure), "{told}");
     assert!(told.to_string().contains("its failure's at is int[2] there and int[3] here"), "{told}");
     manager.stop();
     agv.stop();
@@ -129,17 +131,10 @@ fn another_thread_gives_typed_calls_up() {
     let agv = unit("agv", 7, fleet).state(gate).build().unwrap();
     agv.my_function_list().serve(DockServer).unwrap();
     let (peer, _) = meet(&manager, &agv);
-    let cancelled = CallError::Call(Error::Cancelled);
     // Runs until it is given up, far behind the end of the test.
     let ask = |watched: bool, canceller: &Canceller| {
-        let peer = peer.cancelled_by(canceller);
-        let client =
-            DockClient::at(&peer).with(RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() });
-        if watched {
-            client.watch_dock(5_000, |_| ControlFlow::Continue(())).map_err(|failed| failed.error)
-        } else {
-            client.dock(5_000)
-        }
+        let call = DockClient::at(&peer).dock(5_000).timeout(PATIENCE).cancelled_by(canceller);
+        if watched { call.watch(|_| ControlFlow::Continue(())).wait() } else { call.wait() }
     };
     for (count, watched) in [(1, false), (2, true)] {
         let canceller = Canceller::new();
@@ -150,12 +145,12 @@ fn another_thread_gives_typed_calls_up() {
             until("its service runs", || begun.load(Ordering::SeqCst) > before);
             until("it tells", || !watched || told() > told_before);
             canceller.cancel();
-            assert_eq!(call.join().unwrap(), Err(cancelled.clone()), "watched: {watched}");
+            assert_eq!(call.join().unwrap(), Err(Error::Cancelled.into()), "watched: {watched}");
         });
         until("its service is told", || agv.with_state(|gate| gate.given_up).unwrap() == count);
         assert!(watched || agv.counted(LinkCounter::ProgressSent) == 0, "nobody asked for it");
-        assert_eq!(ask(watched, &canceller), Err(cancelled.clone()), "all calls behind it are given up");
-        assert_eq!(DockClient::at(&peer).dock(1), Ok(()), "others are not");
+        assert_eq!(ask(watched, &canceller), Err(Error::Cancelled.into()), "all calls behind it are given up");
+        assert_eq!(DockClient::at(&peer).dock(1).wait(), Ok(()), "others are not");
     }
     manager.stop();
     agv.stop();
@@ -189,22 +184,21 @@ fn a_typed_call_that_is_held_gives_its_results_too() {
     agv.my_function_list().serve(CraneServer { motor }).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let canceller = Canceller::new();
-    let cancellable = peer.cancelled_by(&canceller);
-    let client = CraneClient::at(&cancellable).renewing(Renew::Process);
-    let held = client.hold_hoist(3).unwrap();
+    let client = CraneClient::at(&peer).renewing(Renew::Process);
+    let held = client.hoist(3).hold().cancelled_by(&canceller).wait().unwrap();
     assert!(held.results == 8 && held.is_held() && order.is_live());
     canceller.cancel();
-    assert_eq!(client.hold_hoist(4).unwrap_err(), CallError::Call(Error::Cancelled));
+    assert_eq!(client.hoist(4).hold().cancelled_by(&canceller).wait().unwrap_err(), Error::Cancelled);
     assert!(held.is_held() && order.is_live(), "what was held before stays so");
     drop(held);
     until("it is released", || !order.is_live());
     let canceller = Canceller::new();
     std::thread::scope(|scope| {
-        let peer = peer.cancelled_by(&canceller);
-        let call = scope.spawn(move || CraneClient::at(&peer).renewing(Renew::Process).hold_hoist(101).map(|_| ()));
+        let call = client.hoist(101).hold().cancelled_by(&canceller);
+        let call = scope.spawn(move || call.wait().map(|_| ()));
         until("it moves", || order.is_live());
         canceller.cancel();
-        assert_eq!(call.join().unwrap(), Err(CallError::Call(Error::Cancelled)));
+        assert_eq!(call.join().unwrap(), Err(Error::Cancelled.into()));
     });
     until("it stops", || !order.is_live());
     manager.stop();
@@ -284,20 +278,20 @@ fn a_typed_vehicle_is_driven_stopped_and_reset() {
     );
     let (peer, _) = meet(&manager, &agv);
     let client = DriveClient::at(&peer);
-    assert_eq!(client.state(), Ok(State::default()));
-    assert_eq!(client.say("on the way"), Ok(10));
-    let held = client.renewing(Renew::Process).hold_go_to([1, 2], 3).unwrap();
+    assert_eq!(client.state().wait(), Ok(State::default()));
+    assert_eq!(client.say("on the way").wait(), Ok(10));
+    let held = client.renewing(Renew::Process).go_to([1, 2], 3).hold().wait().unwrap();
     assert!(order.is_live());
-    assert_eq!(client.state(), Ok(State { position: [1, 2], mode: Mode::Driving, said: "on the way".into() }));
-    assert_eq!(client.halt(), Ok(()));
+    assert_eq!(client.state().wait(), Ok(State { position: [1, 2], mode: Mode::Driving, said: "on the way".into() }));
+    assert_eq!(client.halt().wait(), Ok(()));
     assert!(!order.is_live());
     until("the hook has run", || safe.load(Ordering::SeqCst) == 1);
-    assert!(matches!(client.go_to([5, 5], 3), Err(CallError::Call(Error::Inhibited { .. }))));
+    assert!(matches!(client.go_to([5, 5], 3).wait(), Err(CallError { error: Error::Inhibited { .. }, .. })));
     drop(held);
-    until("it may move again", || client.free().is_ok() && client.go_to([5, 5], 3).is_ok());
+    until("it may move again", || client.free().wait().is_ok() && client.go_to([5, 5], 3).wait().is_ok());
     let wanted = RequestOptions { timeout: Some(Duration::from_secs(5)), ..RequestOptions::new() };
-    client.with(wanted).request_say("!").unwrap();
-    until("the request has run", || client.state().is_ok_and(|state| state.said == "on the way!"));
+    client.with(wanted).say("!").send().unwrap();
+    until("the request has run", || client.state().wait().is_ok_and(|state| state.said == "on the way!"));
     manager.stop();
     agv.stop();
 }
@@ -348,23 +342,24 @@ fn another_version_of_the_vehicle_is_told_before_anything_is_sent() {
     agv.my_function_list().add_service(&say, ServiceOptions::new(), run).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let client = DriveClient::at(&peer);
-    let Err(CallError::Mismatch(mismatch)) = client.go_to([1, 2], 3) else { panic!("it is told") };
+    let told = client.go_to([1, 2], 3).wait().unwrap_err();
+    assert_eq!(told.error, Error::Mismatch(Part::Argument));
     assert_eq!(
-        mismatch.to_string(),
+        told.to_string(),
         "the peer's go_to is of another version: its argument position is float[2] there and int[2] here: update one of the two"
     );
-    assert!(matches!(client.request_go_to([1, 2], 3), Err(CallError::Mismatch(_))));
+    assert_eq!(client.go_to([1, 2], 3).send(), Err(Error::Mismatch(Part::Argument).into()));
     assert_eq!(calls.load(Ordering::SeqCst), 0);
-    assert_eq!(client.state(), Err(CallError::Call(Error::UnknownFunction)));
+    assert_eq!(client.state().wait(), Err(Error::UnknownFunction.into()));
     assert_eq!(
-        client.say("a newer version gives more"),
-        Err(CallError::Call(Error::WrongSize { index: 0, expected: 20, found: 26 }))
+        client.say("a newer version gives more").wait(),
+        Err(Error::WrongSize { index: 0, expected: 20, found: 26 }.into())
     );
-    assert_eq!(client.say("short enough"), Ok(0));
+    assert_eq!(client.say("short enough").wait(), Ok(0));
     assert_eq!(calls.load(Ordering::SeqCst), 1);
     manager.stop();
     agv.stop();
-    assert_eq!(client.say("gone"), Err(CallError::Call(Error::NotConnected)));
+    assert_eq!(client.say("gone").wait(), Err(Error::NotConnected.into()));
 }
 
 #[cfg(feature = "async")]
@@ -377,7 +372,7 @@ fn a_task_of_any_thread_awaits_a_typed_call() {
     agv.my_function_list().serve(DriveServer { motor }).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_time().build().unwrap();
-    let task = runtime.spawn(async move { DriveAsyncClient::at(&peer).say("hello").await });
+    let task = runtime.spawn(async move { DriveClient::at(&peer).say("hello").await });
     assert_eq!(runtime.block_on(task).unwrap(), Ok(5));
     manager.stop();
     agv.stop();
@@ -402,18 +397,12 @@ fn a_typed_service_says_why_it_fails() {
     let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).state(Stuck).build().unwrap());
     agv.my_function_list().serve(DoorServer).unwrap();
     let (peer, _) = meet(&manager, &agv);
-    let door = Explained::new(peer.clone());
-    let client = DoorClient::at(&door);
-    let failed = Err(CallError::Call(Error::Service(ServiceError::Failed(4))));
-    assert_eq!(client.open(2), failed);
-    let failure = door.take_failure().expect("it has said why");
-    assert_eq!((failure.code(), failure.text()), (4, "something is in the way"));
-    assert!(door.take_failure().is_none(), "it is told once");
-    // Of a call that succeeds there is none.
-    assert_eq!(client.open(2), failed);
-    assert_eq!(client.open(1), Ok(()));
-    assert!(door.take_failure().is_none());
-    assert_eq!(DoorClient::at(&peer).open(2), failed, "the plain client has the code");
+    let client = DoorClient::at(&peer);
+    let failed = client.open(2).wait().unwrap_err();
+    assert_eq!(failed, Error::Service(ServiceError::Failed(4)));
+    assert_eq!((failed.code(), failed.text()), (Some(4), "something is in the way"));
+    assert!(failed.may_have_run());
+    assert_eq!(client.open(1).wait(), Ok(()));
     manager.stop();
     agv.stop();
 }
@@ -447,8 +436,8 @@ fn a_typed_service_knows_its_order_and_ends_it() {
     agv.my_function_list().serve(MastServer { motor }).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let client = MastClient::at(&peer);
-    assert_eq!(client.count(), Ok(()));
-    let held = client.renewing(Renew::Process).hold_lift().unwrap();
+    assert_eq!(client.count().wait(), Ok(()));
+    let held = client.renewing(Renew::Process).lift().hold().wait().unwrap();
     assert!(held.is_held());
     let order = agv.with_state(Option::take).unwrap().expect("its lease is told");
     assert!(order.is_live() && agv.end_order(&order));
@@ -598,15 +587,14 @@ fn an_order_of_50_nodes_comes_as_it_was_sent() {
     let (peer, _) = meet(&manager, &agv);
     let client = PlannedClient::at(&peer);
     let order = Order::of_50_nodes();
-    assert_eq!(client.planned(), Ok(Order::default()));
-    assert_eq!(client.plan(order.clone()), Ok((50, order.nodes.last().cloned())));
+    assert_eq!(client.planned().wait(), Ok(Order::default()));
+    assert_eq!(client.plan(order.clone()).wait(), Ok((50, order.nodes.last().cloned())));
     // It takes more than a client puts on its stack.
-    assert_eq!(PlannedClient::at(&Explained::new(peer.clone())).planned(), Ok(order.clone()));
-    assert_eq!(PlannedClient::at(&peer.cancelled_by(&Canceller::new())).planned(), Ok(order.clone()));
-    assert_eq!(client.planned(), Ok(order.clone()));
+    assert_eq!(client.planned().cancelled_by(&Canceller::new()).wait(), Ok(order.clone()));
+    assert_eq!(client.planned().wait(), Ok(order.clone()));
     let none = Order { nodes: vec![], ..order };
-    assert_eq!(client.plan(none.clone()), Ok((0, None)));
-    assert_eq!(client.planned(), Ok(none));
+    assert_eq!(client.plan(none.clone()).wait(), Ok((0, None)));
+    assert_eq!(client.planned().wait(), Ok(none));
     manager.stop();
     agv.stop();
 }
@@ -623,11 +611,11 @@ fn an_order_that_a_peer_has_no_room_for_is_refused_before_it_is_sent() {
     let client = PlannedClient::at(&peer);
     let sent = manager.counted(LinkCounter::MessagesSent);
     let order = Order::of_50_nodes();
-    assert_eq!(client.plan(order.clone()), Err(CallError::Call(Error::TooLarge { limit: 1024 })));
+    assert_eq!(client.plan(order.clone()).wait(), Err(Error::TooLarge { limit: 1024 }.into()));
     assert_eq!(manager.counted(LinkCounter::MessagesSent), sent);
-    assert_eq!(client.planned(), Ok(Order::default()));
+    assert_eq!(client.planned().wait(), Ok(Order::default()));
     let short = Order { nodes: order.nodes[..2].to_vec(), edges: order.edges[..1].to_vec(), ..order };
-    assert_eq!(client.plan(short.clone()), Ok((2, short.nodes.last().cloned())));
+    assert_eq!(client.plan(short.clone()).wait(), Ok((2, short.nodes.last().cloned())));
     manager.stop();
     agv.stop();
 }
@@ -642,7 +630,7 @@ fn an_order_is_not_sent_to_a_function_without_lists() {
     agv.my_function_list().add_service(&plan, ServiceOptions::new(), run).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let sent = manager.counted(LinkCounter::MessagesSent);
-    let told = PlannedClient::at(&peer).plan(Order::of_50_nodes()).unwrap_err();
+    let told = PlannedClient::at(&peer).plan(Order::of_50_nodes()).wait().unwrap_err();
     assert_eq!(
         told.to_string(),
         "the peer's plan is of another version: its argument nodes is string[32] there and a list of at most 64 here: update one of the two"
@@ -700,7 +688,7 @@ fn an_order_of_50_nodes_is_timed() {
     agv.my_function_list().serve(PlannedServer).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let client = PlannedClient::at(&peer);
-    println!("a call with it: {:?}", median(|| assert!(client.plan(order.clone()).is_ok())));
+    println!("a call with it: {:?}", median(|| assert!(client.plan(order.clone()).wait().is_ok())));
     println!("a ping: {:?}", median(|| assert!(peer.ping(Duration::from_secs(5)).is_ok())));
     manager.stop();
     agv.stop();

@@ -74,9 +74,8 @@ impl Pair {
                 hear.borrow_mut().push(told.variable("left").unwrap());
                 go_on(*hear.borrow().last().unwrap())
             };
-            let (mut parameters, options, mut why) = (one("number", 1), RequestOptions::new(), None);
-            let call = agv.block_request_with_progress("go", &mut parameters, &options, on_progress, &mut why);
-            end.set(Some(call.await));
+            let mut parameters = one("number", 1);
+            end.set(Some(agv.call("go", &mut parameters).watch(on_progress).await.map_err(Error::from)));
         });
         assert!(self.bench.run_until(|| ended.get().is_some(), LONG));
         (ended.get().unwrap(), heard.take())
@@ -87,9 +86,9 @@ impl Pair {
         let ended = Rc::<RefCell<Option<_>>>::default();
         let (told, agv) = (ended.clone(), self.manager.peer("agv").unwrap());
         self.boards[0].spawn(async move {
-            let mut why = None;
-            let outcome = agv.block_request_explained(function, &mut one("number", 1), &options, &mut why).await;
-            *told.borrow_mut() = Some((outcome, why));
+            let outcome = agv.call(function, &mut one("number", 1)).with(options).await;
+            let why = outcome.as_ref().err().and_then(|failed| failed.failure().cloned());
+            *told.borrow_mut() = Some((outcome.map_err(Error::from), why));
         });
         assert!(self.bench.run_until(|| ended.borrow().is_some(), LONG));
         ended.take().unwrap()
@@ -185,9 +184,8 @@ fn what_a_call_tells_makes_way_for_the_reply_of_another_one() {
     });
     let agv = pair.manager.peer("agv").unwrap();
     let mut waits = pin!(async {
-        let (mut parameters, options, mut why) = (one("number", 1), RequestOptions::new(), None);
-        let heard = |_: &ParametersView| ControlFlow::Break(());
-        agv.block_request_with_progress("go", &mut parameters, &options, heard, &mut why).await
+        let mut parameters = one("number", 1);
+        agv.call("go", &mut parameters).watch(|_| ControlFlow::Break(())).await
     });
     let mut look = || waits.as_mut().poll(&mut Context::from_waker(Waker::noop()));
     assert!(look().is_pending());

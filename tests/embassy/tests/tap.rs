@@ -14,7 +14,7 @@ use cara_processes::network::{self, ip};
 use cara_secure::random::Random;
 use cara_std::keys::{FleetKeys, KeyRing};
 use cara_std::{
-    CommunicationSystem, Error, Fleet, Identity, Interfaces, Parameters, Renew, RequestOptions, ServiceError,
+    CallError, CommunicationSystem, Error, Fleet, Identity, Interfaces, Parameters, Renew, RequestOptions, ServiceError,
 };
 use embassy_net::{Ipv4Address, Ipv4Cidr, StackResources, StaticConfigV4};
 use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
@@ -179,9 +179,10 @@ fn talk(manager: &CommunicationSystem, to: [i64; 2]) {
     let options = RequestOptions { timeout: Some(LONG.into()), ..RequestOptions::renewing(Renew::Process) };
     let deadline = Instant::now() + LONG;
     loop {
-        match agv.block_request_with("go_to", &mut position(to), &options) {
+        match agv.call("go_to", &mut position(to)).with(options).wait() {
             // This machine was too busy to renew the lease, and the vehicle stands.
-            Err(Error::Expired | Error::Service(ServiceError::NotReady)) if Instant::now() < deadline => {}
+            Err(CallError { error: Error::Expired | Error::Service(ServiceError::NotReady), .. })
+                if Instant::now() < deadline => {}
             ended => break ended.unwrap(),
         }
     }

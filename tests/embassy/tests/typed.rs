@@ -212,17 +212,17 @@ fn a_typed_board_is_called_stopped_and_reset() {
     assert!(shown.contains("load() -> (kilograms: int, label: int[2])\n"), "{shown}");
     let peer = manager.peer("agv").unwrap();
     finish(&bench, &board, async move {
-        let client = LiftAsyncClient::at(&peer);
+        let client = LiftClient::at(&peer);
         assert_eq!(client.load().await, Ok(Load { kilograms: 900, label: [7, 8] }));
         assert_eq!(client.renewing(Renew::Process).lift_to(1.5).await, Ok(()));
         assert_eq!(client.height().await, Ok(1.5));
         assert!(MOTOR.is_live(cara_embassy::now()));
         assert_eq!(client.halt().await, Ok(()));
         assert!(!MOTOR.is_live(cara_embassy::now()));
-        assert!(matches!(client.lift_to(2.0).await, Err(CallError::Call(Error::Inhibited { .. }))));
+        assert!(matches!(client.lift_to(2.0).await, Err(CallError { error: Error::Inhibited { .. }, .. })));
         embassy_time::Timer::after_secs(1).await;
         assert_eq!(client.free().await, Ok(()));
-        client.request_lift_to(3.0).unwrap();
+        client.lift_to(3.0).send().unwrap();
         embassy_time::Timer::after_millis(100).await;
         assert_eq!(client.height().await, Ok(3.0));
     });
@@ -240,7 +240,7 @@ fn another_version_is_told_before_anything_is_sent() {
         unit.my_function_list().add_service("lift_to(height: int)", ServiceOptions::new(), lift_to).unwrap();
     });
     let peer = manager.peer("agv").unwrap();
-    let told = finish(&bench, &board, async move { LiftAsyncClient::at(&peer).lift_to(1.5).await });
+    let told = finish(&bench, &board, async move { LiftClient::at(&peer).lift_to(1.5).await });
     let told = told.unwrap_err().to_string();
     assert!(told.contains("lift_to") && told.contains("height is int there and float here"), "{told}");
 }
@@ -253,20 +253,20 @@ fn a_method_takes_its_call_and_a_task_tells_how_far_it_is() {
     at_fork.spawn(drive(fork));
     let peer = manager.peer("agv").unwrap();
     finish(&bench, &board, async move {
-        let client = DriveAsyncClient::at(&peer);
+        let client = DriveClient::at(&peer);
         let mut told = Vec::new();
         let heard = |Left { left }| {
             told.push(left);
             ControlFlow::Continue(())
         };
-        assert_eq!(client.watch_drive(3, heard).await, Ok(Arrived { metres: 7 }));
+        assert_eq!(client.drive(3).watch(heard).await, Ok(Arrived { metres: 7 }));
         assert_eq!(told, [3.0, 2.0, 1.0]);
-        let failed = client.watch_drive(10, |_| unreachable!("it does not begin")).await.unwrap_err();
-        assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(3))));
-        assert_eq!((failed.text.as_str(), failed.values), ("it is too far", Some(TooHeavy { kilograms: 900 })));
+        let failed = client.drive(10).watch(|_| unreachable!("it does not begin")).await.unwrap_err();
+        assert_eq!(failed.error, Error::Service(ServiceError::Failed(3)));
+        assert_eq!((failed.text(), failed.values()), ("it is too far", Some(TooHeavy { kilograms: 900 })));
         assert_eq!(client.drive(0).await, Ok(Arrived { metres: 0 }), "without taking it");
-        let failed = client.watch_drive(9, |_| ControlFlow::Break(())).await.unwrap_err();
-        assert_eq!(failed.error, CallError::Call(Error::Cancelled));
+        let failed = client.drive(9).watch(|_| ControlFlow::Break(())).await.unwrap_err();
+        assert_eq!(failed.error, Error::Cancelled);
     });
     assert!(bench.run_until(|| fork.with_state(|fork| fork.losses).unwrap() == 1, LONG), "its service sees it");
 }
@@ -280,14 +280,14 @@ fn a_typed_failure_comes_with_its_text_and_its_values() {
     });
     let peer = manager.peer("agv").unwrap();
     finish(&bench, &board, async move {
-        let client = LiftAsyncClient::at(&peer);
-        let failed = client.watch_tilt(6, |_| unreachable!("nothing is told")).await.unwrap_err();
-        assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(3))));
-        assert_eq!((failed.text.as_str(), failed.values), ("it is too heavy", Some(TooHeavy { kilograms: 900 })));
-        assert_eq!(client.watch_tilt(5, |_| ControlFlow::Continue(())).await, Ok(()));
-        let client = TiltAsyncClient::at(&peer);
+        let client = LiftClient::at(&peer);
+        let failed = client.tilt(6).watch(|_| unreachable!("nothing is told")).await.unwrap_err();
+        assert_eq!(failed.error, Error::Service(ServiceError::Failed(3)));
+        assert_eq!((failed.text(), failed.values()), ("it is too heavy", Some(TooHeavy { kilograms: 900 })));
+        assert_eq!(client.tilt(5).watch(|_| ControlFlow::Continue(())).await, Ok(()));
+        let client = TiltClient::at(&peer);
         assert_eq!(client.tilt(5).await, Ok(()));
-        let failed = client.watch_tilt(6, |_| unreachable!("nothing is told")).await.unwrap_err();
-        assert_eq!(failed.values, Some(TooHeavy { kilograms: 900 }));
+        let failed = client.tilt(6).watch(|_| unreachable!("nothing is told")).await.unwrap_err();
+        assert_eq!(failed.values(), Some(TooHeavy { kilograms: 900 }));
     });
 }

@@ -107,7 +107,7 @@ fn ask(bench: &Bench, board: &Board, unit: Unit, peer: &str, function: &str, n: 
     let (peer, function) = (unit.peer(peer).unwrap(), function.to_owned());
     finish(bench, board, async move {
         let mut parameters = number(n);
-        peer.block_request_with(&function, &mut parameters, &RequestOptions::renewing(Renew::Process)).await?;
+        peer.call(&function, &mut parameters).renewing(Renew::Process).await?;
         parameters.variable("n")
     })
 }
@@ -253,8 +253,8 @@ fn a_task_takes_calls_and_awaits_before_it_replies() {
     let (told, peer) = (Rc::clone(&driven), manager.peer("agv").unwrap());
     manager_board.spawn(async move {
         let mut parameters = number(50);
-        let driven = peer.block_request_with("go_to", &mut parameters, &RequestOptions::renewing(Renew::Process)).await;
-        told.replace(Some(driven.and_then(|()| parameters.variable("n"))));
+        let driven = peer.call("go_to", &mut parameters).renewing(Renew::Process).await;
+        told.replace(Some(driven.map_err(Error::from).and_then(|()| parameters.variable("n"))));
     });
     bench.run_for(Duration::from_millis(100));
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 1), Ok(2), "other services run meanwhile");
@@ -313,7 +313,7 @@ fn a_task_awaits_the_end_of_its_own_call() {
     let numbers = || ended.borrow().iter().map(|(number, _)| *number).collect::<Vec<_>>();
     let call = |number_of: i64, renew| {
         let options = RequestOptions { renew, ..RequestOptions::default() };
-        peer.request_with("haul", &number(number_of), &options).unwrap();
+        peer.call("haul", &mut number(number_of)).with(options).send().unwrap();
         bench.run_for(Duration::from_secs(1));
     };
     let stops = || agv.with_state(|state| state.stops).unwrap();
@@ -357,11 +357,7 @@ fn a_pulled_cable_runs_each_hook_once_and_the_board_comes_back() {
     agv.publish_my_function_list().unwrap();
     for round in 1..4 {
         assert!(bench.run_until(|| knows(manager, "agv", "go"), LONG), "round {round}");
-        manager
-            .peer("agv")
-            .unwrap()
-            .request_with("go", &number(round), &RequestOptions::renewing(Renew::Process))
-            .unwrap();
+        manager.peer("agv").unwrap().call("go", &mut number(round)).renewing(Renew::Process).send().unwrap();
         assert!(bench.run_until(|| STANDING.is_live(cara_embassy::now()), SHORT));
         agv_board.set_cable(false);
         assert!(bench.run_until(|| !STANDING.is_live(cara_embassy::now()), SHORT));
@@ -395,8 +391,8 @@ fn what_is_cancelled_makes_room_for_the_next() {
         for _ in 0..20 {
             let mut parameters = number(1);
             let options = RequestOptions { timeout: Some(LONG), ..RequestOptions::default() };
-            let call = peer.block_request_with("go_to", &mut parameters, &options);
-            assert!(with_timeout(embassy_time::Duration::from_millis(1), call).await.is_err());
+            let call = peer.call("go_to", &mut parameters).with(options);
+            assert!(with_timeout(embassy_time::Duration::from_millis(1), call.into_future()).await.is_err());
             Timer::after_millis(200).await;
         }
     });
@@ -416,15 +412,15 @@ fn a_reply_that_is_not_fetched_delays_others_only_until_its_deadline() {
     finish(&bench, &manager_board, async move {
         let mut parameters = number(1);
         let options = RequestOptions { timeout: Some(Duration::from_secs(1)), ..RequestOptions::default() };
-        let mut forgotten = Box::pin(peer.block_request_with("double", &mut parameters, &options));
+        let mut forgotten = Box::pin(peer.call("double", &mut parameters).with(options).into_future());
         // It is sent, and polled again only when its time is over.
         assert!(poll_once(&mut forgotten).await.is_none());
         Timer::after_millis(100).await;
         let mut other = number(5);
         let patient = RequestOptions { timeout: Some(LONG), ..RequestOptions::default() };
-        assert_eq!(peer.block_request_with("double", &mut other, &patient).await, Ok(()));
+        assert_eq!(peer.call("double", &mut other).with(patient).await, Ok(()));
         assert_eq!(other.variable::<i64>("n"), Ok(10));
-        assert_eq!(forgotten.await, Err(Error::TimedOut));
+        assert_eq!(forgotten.await, Err(Error::TimedOut.into()));
     });
 }
 

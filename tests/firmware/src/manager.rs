@@ -11,7 +11,7 @@ use cara_apps::mechanic;
 use cara_std::control::Control;
 use cara_std::{
     Builder, CloseReason, CommunicationSystem, Constraints, Duration as CoreDuration, Error, MUnit, Parameters, Peer,
-    Renew, RequestOptions, ServiceError, StartError, UnitEvent,
+    Renew, ServiceError, StartError, UnitEvent,
 };
 
 use crate::board::{Board, FLEET, LONG, Who};
@@ -152,8 +152,8 @@ pub(crate) fn reset(peer: &Peer) -> Result<()> {
 
 /// Sends a vehicle to a place; `false` if this machine was too busy for that and the lease has ended.
 pub(crate) fn sends(peer: &Peer, position: [i64; 2], renew: Renew) -> Result<bool> {
-    match peer.block_request_with("go_to", &mut at(position)?, &RequestOptions::renewing(renew)) {
-        Err(error) if is_of_a_busy_host(&error) => {
+    match peer.call("go_to", &mut at(position)?).renewing(renew).wait() {
+        Err(error) if is_of_a_busy_host(&error.error) => {
             // The call may have run all the same, and its lease is not renewed then.
             peer.release("go_to")?;
             Ok(false)

@@ -216,7 +216,7 @@ macro_rules! context {
 
 impl Side {
     fn ask(&mut self, function: &str, parameters: &ParametersView) -> CallId {
-        let asked = self.session.request(context!(self), function, parameters, &RequestOptions::default(), true);
+        let asked = self.session.request(context!(self), function.into(), parameters, &RequestOptions::default(), true);
         asked.expect("a request is sent")
     }
 

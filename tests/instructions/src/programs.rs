@@ -2,17 +2,19 @@
 //! port and back. Nothing is sent: the peer that is called answers at once.
 
 use core::hint::black_box;
+use core::task::{Context, Poll};
 
 use cara_core::config::Priority;
 use cara_core::distribution::block;
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::services::call::{BlockingCaller, Call, CallError, Callee, Caller, Dynamic, Outgoing};
 use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Instant;
-use cara_core::typed::{BlockingCaller, Caller, Free, Functions, Interface, Method};
+use cara_core::typed::{Free, Functions, Interface, Method};
 use cara_core::{AnyCall, Error, ServiceError, interface};
 
 use crate::{Of, Operation};
@@ -98,31 +100,34 @@ impl Functions<()> for List {
 struct Peer(Signature<'static>);
 
 impl Caller for Peer {
-    fn published<R>(&self, _: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
-        look(Some(self.0))
+    type Pending = ();
+    type Answered = ();
+    type Hold = ();
+    type Details = ();
+    type Room = &'static mut ParametersView;
+    type Canceller = ();
+
+    fn room(_: usize) -> Option<Self::Room> {
+        None
     }
 
-    fn send(&self, _: &str, _: &ParametersView, _: &RequestOptions) -> Result<CallId, Error> {
-        Err(Error::UnknownFunction)
+    fn send(&self, _: Callee<'_>, _: &ParametersView, _: &RequestOptions) -> Result<CallId, CallError> {
+        Err(Error::UnknownFunction.into())
     }
+
+    fn poll(&self, _: &mut Option<()>, outgoing: Outgoing<'_, ()>, _: &mut Context<'_>) -> Poll<Result<(), CallError>> {
+        Poll::Ready(self.wait(outgoing))
+    }
+
+    fn hold(&self, (): ()) {}
 }
 
 impl BlockingCaller for Peer {
-    type Hold = ();
-
-    fn block(&self, function: &str, parameters: &mut ParametersView, _: &RequestOptions) -> Result<(), Error> {
-        black_box(function);
+    fn wait(&self, Outgoing { callee, parameters, .. }: Outgoing<'_, ()>) -> Result<(), CallError> {
+        black_box(callee.name());
+        callee.check(self.0).map_err(|found| Error::Mismatch(found.part))?;
         block::check_results_fit(self.0.results(), parameters)?;
-        parameters.set_value("sum", 7)
-    }
-
-    fn block_and_hold(
-        &self,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<(), Error> {
-        self.block(function, parameters, options)
+        Ok(parameters.set_value("sum", 7)?)
     }
 }
 
@@ -164,7 +169,7 @@ impl Programs {
             sum.add_int("sum", 1)?;
             sum.set_value("a", black_box(3))?;
             sum.set_value("b", black_box(4))?;
-            peer.block("add", &mut sum, &RequestOptions::new())?;
+            Call::new(peer, Dynamic::new("add", &mut sum)).wait()?;
             sum.variable("sum")
         };
         assert_eq!(black_box(call(&self.peer)), Ok(7));
@@ -172,7 +177,7 @@ impl Programs {
 
     fn call_typed(&mut self) {
         let client = AddClient::at(&self.peer);
-        assert_eq!(black_box(client.add(black_box(3), black_box(4))), Ok(7));
+        assert_eq!(black_box(client.add(black_box(3), black_box(4)).wait()), Ok(7));
     }
 
     /// What can be counted. A typed call also compares the peer's signature with its own.

@@ -1,18 +1,12 @@
 //! Distribution: parameters, functions, lists, identities.
 
-use core::ops::ControlFlow;
-
-use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec};
 use cara_core::distribution::function_list::{Entry, FunctionList, TheirFunctionList};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView, Value};
 use cara_core::distribution::value::{Target, Type};
-use cara_core::error::{Error, ServiceError};
-use cara_core::services::requests::CallId;
-use cara_core::services::session::RequestOptions;
 use cara_core::storage::Lent;
-use cara_core::typed::{self, Caller, Field};
+use cara_core::typed::{self, Field};
 
 use crate::linkage::{drain, keep, show, unknown, unknown_slice, unknown_text};
 
@@ -87,12 +81,6 @@ entry!(typed_signatures, {
     }
 });
 
-entry!(typed_details, {
-    keep(typed::hand(parameters(), |()| ControlFlow::Break(())));
-    let failed = typed::Failed::<()>::new(*unknown(), Some(unknown::<Failure>()));
-    show(&failed);
-});
-
 entry!(typed_values, {
     let parameters = parameters();
     keep(typed::argument::<u16>(parameters, *unknown()));
@@ -109,28 +97,6 @@ entry!(typed_values, {
     }
     if let Ok(slot) = parameters.slot_of(*unknown()) {
         keep(unknown::<[i8; 3]>().to_field(slot));
-    }
-});
-
-/// A peer of which nothing is known.
-struct Peer;
-
-impl typed::Caller for Peer {
-    fn published<R>(&self, _: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
-        look(*unknown())
-    }
-
-    fn send(&self, _: &str, _: &ParametersView, _: &RequestOptions) -> Result<CallId, Error> {
-        *unknown()
-    }
-}
-
-entry!(typed_clients, {
-    let client = typed::Client::at(unknown::<Peer>()).with(*unknown()).renewing(*unknown());
-    keep((client.peer().published("", |_| ()), client.options().timeout));
-    if let Err(error) = client.prepare(*unknown::<Signature<'static>>(), parameters()) {
-        show(&error);
-        keep(ServiceError::from(error));
     }
 });
 

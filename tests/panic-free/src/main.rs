@@ -8,6 +8,7 @@
 #[macro_use]
 mod linkage;
 
+mod calls;
 mod distribution;
 mod foundation;
 mod host;

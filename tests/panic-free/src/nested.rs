@@ -72,7 +72,7 @@ entry!(details_declared, {
 entry!(failures, {
     let mut failure = Failure::new(*unknown(), unknown_text());
     keep(failure.values_mut().add_int(unknown_text(), *unknown()));
-    keep((failure.code(), failure.error(), failure.values().len()));
+    keep((failure.code(), failure.error(), failure.values().len(), failure.is_cut()));
     keep(failure.text());
     show(&failure);
     keep((message::encode_progress(*unknown()), FailureDetails::text_bytes(unknown_text())));

@@ -199,7 +199,7 @@ entry!(session_set, {
 });
 
 entry!(session_requests, {
-    keep(session().request(context(), unknown_text(), parameters(), unknown(), *unknown()));
+    keep(session().request(context(), unknown_text().into(), parameters(), unknown(), *unknown()));
     session().cancel(context(), *unknown());
     keep((session().holds(*unknown()), session().last_order(), session().lease_left(*unknown(), *unknown())));
 });
@@ -235,8 +235,9 @@ entry!(replies, {
     if let Event::Reply(_, Ok(results)) = unknown::<Event>()
         && let Ok(block) = session().results(results, unknown_slice())
     {
-        keep((block.read_into(parameters()), block.signature(), block.bytes()));
+        keep((block.read_into(parameters()), block.signature(), block.bytes(), results.function()));
     }
+    keep(session().kept_results(*unknown(), *unknown(), unknown_slice()).is_ok());
     keep(unknown::<ReplyBlock<'static>>().read_into(parameters()));
 });
 

@@ -8,7 +8,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cara_core::config::Constraints;
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
@@ -19,7 +18,7 @@ use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_sim::{BoxedParameters, Path, Sample};
+use cara_sim::{BoxedParameters, CallError, Path, Sample};
 
 use crate::{Need, Service, Spec, UnknownClient, boxed, secs};
 
@@ -179,7 +178,7 @@ pub struct Watched {
     /// The values of its progress `left`, as they came.
     pub told: Vec<i64>,
     /// How it ended.
-    pub outcome: Result<(), CallFailure>,
+    pub outcome: Result<(), CallError>,
 }
 
 /// A heart of a loop, as its port has it.

@@ -75,7 +75,7 @@ fn call(peer: &Peer) -> Result<(), Error> {
     number.add_int("n", 1)?;
     number.set_value("n", fresh_mark())?;
     let options = RequestOptions { timeout: Some(DEADLINE.into()), ..RequestOptions::default() };
-    peer.block_request_with("mark", &mut number, &options)
+    peer.call("mark", &mut number).with(options).wait().map_err(Error::from)
 }
 
 /// Runs `attacker` until it has made enough attempts and the genuine units have done their part: calls within their

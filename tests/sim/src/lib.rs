@@ -100,6 +100,7 @@ pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
 pub use world::{
-    Actuator, BoxedParameters, Heart, Hold, LeaseWatch, LogEvent, MyFunctionList, NewUnit, Outcome, Peer, Ring, Sample,
-    Served, Service, Storing, UnitEvent, UnitHandle, Watched, World, boxed_parameters, for_each_seed, seeds,
+    Actuator, BoxedParameters, CallError, Heart, Hold, LeaseWatch, LogEvent, MyFunctionList, NewUnit, Outcome, Peer,
+    Ring, Sample, Served, Service, Storing, UnitEvent, UnitHandle, Watched, World, boxed_parameters, for_each_seed,
+    seeds,
 };

@@ -44,6 +44,7 @@ pub use events::{LogEvent, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
+pub use replies::CallError;
 pub use requests::{Hold, Watched};
 pub use service::{BoxedParameters, LeaseWatch, Outcome, Served, Service, boxed_parameters};
 pub use state::Storing;

@@ -213,7 +213,7 @@ impl Side {
         let delivery = if how == How::BestEffort { Delivery::BestEffort } else { Delivery::Reliable };
         let options = RequestOptions { delivery, renew: Renew::Process, ..RequestOptions::default() };
         let wants_reply = how == How::Blocking;
-        self.with(|session, cx| session.request(cx, function, parameters, &options, wants_reply)).map(|_| ())
+        self.with(|session, cx| session.request(cx, function.into(), parameters, &options, wants_reply)).map(|_| ())
     }
 
     /// Answers a call.

@@ -65,21 +65,21 @@ fn talk(mut node: Process, manager: &CommunicationSystem, while_leased: impl FnO
     target.add_int("position", 2).unwrap();
     target.set_value("position", [1, 2]).unwrap();
     let wanted = RequestOptions::renewing(Renew::Process);
-    agv.request_with("go_to", &target, &wanted).unwrap();
+    agv.call("go_to", &mut target).with(wanted).send().unwrap();
     assert_eq!(node.expect("run go_to", PATIENCE).unwrap().text, "run go_to {'position': [1, 2]}");
     while_leased(&mut node);
     assert_eq!(position(manager), [1, 2]);
     // An operator does not get what the program holds, unless it takes over.
     let operators = |take_over| {
         let options = RequestOptions { operator: true, take_over, ..wanted };
-        agv.block_request_with("go_to", &mut target.clone(), &options)
+        agv.call("go_to", &mut target.clone()).with(options).wait()
     };
-    assert_eq!(operators(false), Err(Error::Held { by: 1, operator: false }));
+    assert_eq!(operators(false), Err(Error::Held { by: 1, operator: false }.into()));
     assert!(!node.has("replaced"), "{:?}", node.lines());
     assert_eq!(operators(true), Ok(()));
     node.expect("renewals: replaced", PATIENCE).unwrap();
-    let programs = agv.block_request_with("go_to", &mut target.clone(), &wanted);
-    assert_eq!(programs, Err(Error::Held { by: 1, operator: true }));
+    let programs = agv.call("go_to", &mut target.clone()).with(wanted).wait();
+    assert_eq!(programs, Err(Error::Held { by: 1, operator: true }.into()));
     agv.release("go_to").unwrap();
     node.expect("released", PATIENCE).unwrap();
     assert!(!node.has("expired"), "{:?}", node.lines());

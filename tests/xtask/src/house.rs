@@ -41,8 +41,8 @@ const CALL_TRAITS: [&str; 4] =
 const OTHER_TRAITS: [&str; 2] = ["Sealed", "Memory"];
 /// What a call may fail with: types of these names.
 const CALL_ERRORS: [&str; 6] = ["Error", "CallError", "Failed", "CallFailure", "Mismatch", "ServiceError"];
-/// How the derive puts the methods of a function into its clients: each form once for each client that has it.
-const CLIENT_FORMS: [&str; 4] = ["fn #ident(", "#hold\n", "#watch\n", "#request\n"];
+/// How the derive puts the methods of a function into its client.
+const CLIENT_FORMS: [&str; 1] = ["fn #ident "];
 
 /// A figure, and how it is counted.
 struct Figure {
@@ -124,7 +124,7 @@ fn calls(product: &[File]) -> [Figure; 4] {
     let std: BTreeSet<String> = public(product, "std-port/src", &["fn"]).into_iter().collect();
     let is_call = |name: &&String| {
         let name = name.strip_prefix("block_").unwrap_or(name);
-        ["request", "hold"].iter().any(|verb| name == *verb || name.starts_with(&format!("{verb}_")))
+        ["call", "request", "hold"].iter().any(|verb| name == *verb || name.starts_with(&format!("{verb}_")))
     };
     let client: String =
         product.iter().filter(|file| file.is_below("core/derive/src/client.rs")).map(|file| &*file.text).collect();
@@ -137,12 +137,12 @@ fn calls(product: &[File]) -> [Figure; 4] {
         Figure {
             name: "ways to make a call, Linux".into(),
             value: std.iter().filter(is_call).count(),
-            how: "names of public functions of std-port: request…, block_request…, hold…",
+            how: "names of public functions of std-port: call…, request…, block_request…, hold…",
         },
         Figure {
             name: "ways to make a call, typed clients".into(),
             value: forms,
-            how: "methods of one function in the clients for threads and for tasks: its own name, hold_, watch_, request_",
+            how: "methods of one function in its client",
         },
         Figure {
             name: "public call traits".into(),

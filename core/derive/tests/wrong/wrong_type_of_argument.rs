@@ -1,5 +1,5 @@
 use cara_core::interface;
-use cara_core::typed::BlockingCaller;
+use cara_core::services::call::BlockingCaller;
 
 #[interface]
 trait Drive {
@@ -7,7 +7,7 @@ trait Drive {
 }
 
 fn drive(peer: &impl BlockingCaller) {
-    let _ = DriveClient::at(peer).go_to([1.0, 2.0]);
+    let _ = DriveClient::at(peer).go_to([1.0, 2.0]).wait();
 }
 
 fn main() {}

@@ -60,6 +60,13 @@ pub struct ReplyBlock<'b> {
     pub(super) bytes: &'b [u8],
 }
 
+impl Results {
+    /// The function that answered.
+    pub const fn function(&self) -> (Slot, Generation) {
+        (self.slot, self.generation)
+    }
+}
+
 impl<'b> ReplyBlock<'b> {
     /// Updates `parameters` with the results; on an error they are unchanged.
     pub fn read_into(&self, parameters: &mut ParametersView) -> Result<(), Error> {
@@ -168,13 +175,23 @@ impl<P: Port> Session<P> {
     /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
     /// [`Error::ResultLost`] when the peer has replaced the function, or the session has received since then.
     pub fn results<'b>(&'b self, results: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
-        let function = self.theirs.function(results.slot).filter(|function| function.generation == results.generation);
-        match function {
-            Some(Function { signature, .. }) if results.step == self.step => {
-                Ok(ReplyBlock { signature, specs: signature.results(), bytes: self.link.view(results.block, lent) })
-            }
-            _ => Err(Error::ResultLost),
+        if results.step != self.step {
+            return Err(Error::ResultLost);
         }
+        self.kept_results(results.slot, results.generation, self.link.view(results.block, lent))
+    }
+
+    /// Results that were copied from a [`ReplyBlock`] for a caller that reads them later; [`Error::ResultLost`] where the function
+    /// was changed meanwhile.
+    pub fn kept_results<'b>(
+        &'b self,
+        slot: Slot,
+        generation: Generation,
+        bytes: &'b [u8],
+    ) -> Result<ReplyBlock<'b>, Error> {
+        let function = self.theirs.function(slot).filter(|function| function.generation == generation);
+        let signature = function.ok_or(Error::ResultLost)?.signature;
+        Ok(ReplyBlock { signature, specs: signature.results(), bytes })
     }
 
     fn digest(

@@ -9,6 +9,7 @@ use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
+use crate::services::call::Callee;
 use crate::services::heart::Renew;
 use crate::services::requests::{CallId, Made};
 use crate::services::{Context, Port};
@@ -89,21 +90,21 @@ struct Checked {
 }
 
 impl<P: Port> Session<P> {
-    /// Requests `function` of the peer. With `wants_reply`, its end comes as [`Event::Reply`](super::Event::Reply)
+    /// Requests a function of the peer. With `wants_reply`, its end comes as [`Event::Reply`](super::Event::Reply)
     /// under the returned id; without, only a failure comes back.
     ///
-    /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::MissingArgument`], [`Error::WrongType`],
+    /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::Mismatch`], [`Error::MissingArgument`], [`Error::WrongType`],
     /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
     /// [`Error::SlowHeart`], [`Error::NotConnected`].
     pub fn request(
         &mut self,
         cx: &mut Context<'_, P>,
-        function: &str,
+        callee: Callee<'_>,
         parameters: &ParametersView,
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
-        let result = self.try_request(cx, function, parameters, options, wants_reply);
+        let result = self.try_request(cx, callee, parameters, options, wants_reply);
         match result {
             Ok(_) => self.link.counters.count(LinkCounter::RequestsSent),
             Err(_) => self.link.counters.count(LinkCounter::RequestsWithheld),
@@ -120,13 +121,13 @@ impl<P: Port> Session<P> {
     fn try_request(
         &mut self,
         cx: &mut Context<'_, P>,
-        function: &str,
+        callee: Callee<'_>,
         parameters: &ParametersView,
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
         // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
-        let mut checked = self.check(cx, function, parameters, options, wants_reply)?;
+        let mut checked = self.check(cx, callee, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
         let held = checked.lease.filter(|_| options.renew != Renew::Never);
         self.check_held(held, options, slot)?;
@@ -155,7 +156,7 @@ impl<P: Port> Session<P> {
     fn check(
         &self,
         cx: &Context<'_, P>,
-        function: &str,
+        callee: Callee<'_>,
         parameters: &ParametersView,
         options: &RequestOptions,
         wants_reply: bool,
@@ -163,7 +164,8 @@ impl<P: Port> Session<P> {
         if self.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        let function = self.theirs.named(function).ok_or(Error::UnknownFunction)?;
+        let function = self.theirs.named(callee.name()).ok_or(Error::UnknownFunction)?;
+        callee.check(function.signature).map_err(|found| Error::Mismatch(found.part))?;
         #[cfg(feature = "streams")]
         if function.attributes.stream.is_some() {
             return Err(Error::UnknownFunction);

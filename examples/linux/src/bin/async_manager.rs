@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use cara_examples::{Network, Stop, log_to_stderr, say};
-use cara_std::{CommunicationSystem, EventStream, Parameters, Peer, RequestOptions, UnitEvent};
+use cara_std::{CommunicationSystem, Error, EventStream, Parameters, Peer, UnitEvent};
 use clap::Parser;
 
 /// Each vehicle drives for so many of its positions, so far apart.
@@ -55,8 +55,8 @@ async fn manage(options: Options) -> Result<()> {
         agvs.push(agv);
     }
     // One call to each, all at the same time.
-    for (agv, outcome) in manager.request_all_async("pos_info", &position([0, 0])?, &RequestOptions::default()).await {
-        match outcome.and_then(|at| at.variable::<[i64; 2]>("position")) {
+    for (agv, outcome) in manager.call_all("pos_info", &position([0, 0])?).await {
+        match outcome.map_err(Error::from).and_then(|at| at.variable::<[i64; 2]>("position")) {
             Ok(at) => say!("{agv:?} is at {at:?}"),
             Err(error) => say!("{agv:?}: {error}"),
         }
@@ -76,8 +76,7 @@ async fn manage(options: Options) -> Result<()> {
 async fn drive(manager: CommunicationSystem, agv: Peer) -> Result<()> {
     let mut heart = manager.heart(HEART);
     heart.beat();
-    let wanted = RequestOptions::renewing(heart.renew());
-    let order = agv.hold_async("go_to", &mut position([50, 0])?, &wanted).await?;
+    let order = agv.call("go_to", &mut position([50, 0])?).renewing(heart.renew()).hold().await?;
     say!("{agv:?} drives");
     let mut pose = agv.stream("pose")?.subscribe_async(LOOK_EVERY);
     for _ in 0..LOOKS {
@@ -86,7 +85,7 @@ async fn drive(manager: CommunicationSystem, agv: Peer) -> Result<()> {
         let [x, y]: [f64; 2] = sample?.value("position")?;
         say!("{agv:?} is at {x:.2}, {y:.2}");
     }
-    let end = order.release_async(PATIENCE).await?;
+    let end = order.hold.release_async(PATIENCE).await?;
     say!("{agv:?} stands, its order is over: {}", end.word());
     Ok(())
 }

@@ -106,7 +106,7 @@ fn send((name, id): (&str, u32), manager: &NameAndId, count: i64, network: Netwo
         number += 1;
         let speed = 1.0 + (number % 100) as f64 / 100.0;
         // A report that could not be sent is not an error: the next one follows.
-        refused += i64::from(manager.request_with("report", &report(number, speed)?, &best_effort).is_err());
+        refused += i64::from(manager.call("report", &mut report(number, speed)?).with(best_effort).send().is_err());
     }
     say!("sent {number}, refused here {refused}");
     unit.stop();

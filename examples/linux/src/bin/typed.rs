@@ -134,25 +134,28 @@ fn run(network: Network) -> Result<()> {
     let s_unit = &agv_manager.s_units()[0];
     print!("{}", s_unit.their_function_list().show_functions());
     let client = AgvClient::at(s_unit).renewing(Renew::Process);
-    let position = client.pos_info()?;
+    let position = client.pos_info().wait()?;
     say!("position {position:?}");
-    client.request_go_to([1, 2])?;
+    client.go_to([1, 2]).send()?;
     agv_manager.my_function_list().serve(MechanicServer)?;
     s_unit.publish_my_function_list()?;
     agv_manager.publish_my_function_list()?;
     // The listing ends.
     call_mechanic(&agv)?;
     for position in [[4, 6], [400, 6]] {
-        let arrived = client.watch_go_to(position, |Left { left }| {
-            say!("{left} m to go");
-            ControlFlow::Continue(())
-        });
+        let arrived = client
+            .go_to(position)
+            .watch(|Left { left }| {
+                say!("{left} m to go");
+                ControlFlow::Continue(())
+            })
+            .wait();
         match arrived {
             Ok(()) => say!("arrived at {position:?}"),
-            Err(failed) => say!("{failed}: {:?}", failed.values),
+            Err(failed) => say!("{failed}: {:?}", failed.values()),
         }
     }
-    say!("ended at {:?}", client.pos_info()?);
+    say!("ended at {:?}", client.pos_info().wait()?);
     agv_manager.stop();
     agv.stop();
     Ok(())
@@ -174,7 +177,7 @@ fn agv(network: Network, keys: &FleetKeys) -> Result<Unit<Vehicle>> {
 fn call_mechanic(agv: &Unit<Vehicle>) -> Result<()> {
     let manager = agv.manager().ok_or(cara_std::Error::NotConnected)?;
     anyhow::ensure!(manager.wait_for_function("call_mechanic", PATIENCE), "no mechanic is offered");
-    let minutes = MechanicClient::at(&manager).call_mechanic("a wheel squeaks")?;
+    let minutes = MechanicClient::at(&manager).call_mechanic("a wheel squeaks").wait()?;
     say!("a mechanic comes in {minutes} minutes");
     Ok(())
 }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_processes::network::{self, ip};
-use cara_std::{CommunicationSystem, Interfaces, Parameters, Renew, RequestOptions};
+use cara_std::{CommunicationSystem, Interfaces, Parameters, Renew};
 
 /// Long enough for the slowest machine; nothing here is timed.
 const LONG: Duration = Duration::from_secs(60);
@@ -69,7 +69,7 @@ fn talk(manager: &CommunicationSystem, to: [i64; 2]) {
     let mut position = Parameters::new();
     position.add_int("position", 2).unwrap();
     position.set_value("position", to).unwrap();
-    agv.block_request_with("go_to", &mut position, &RequestOptions::renewing(Renew::Process)).unwrap();
+    agv.call("go_to", &mut position).renewing(Renew::Process).wait().unwrap();
     until("the vehicle arrives", || {
         let mut position = Parameters::new();
         position.add_int("position", 2).unwrap();

@@ -3,7 +3,7 @@
 use std::sync::PoisonError;
 use std::time::{Duration, Instant};
 
-use cara_std::{CommunicationSystem, Error, Parameters, Peer, RequestOptions};
+use cara_std::{CallError, CommunicationSystem, Error, Parameters, Peer};
 
 use super::driver::Command;
 use super::known::State;
@@ -22,11 +22,11 @@ impl Manager {
         let system = self.system.clone();
         std::thread::spawn(move || {
             let began = Instant::now();
-            let outcomes = system.block_request_all("stop", &Parameters::new(), &RequestOptions::default());
+            let outcomes = system.call_all("stop", &Parameters::new()).wait();
             let took = began.elapsed();
             let stopped = outcomes.iter().filter(|(_, outcome)| outcome.is_ok()).count();
             // One that is switched off, or just now, slows down by itself.
-            let is_off = |error: &Error| matches!(error, Error::NotConnected | Error::Interrupted);
+            let is_off = |failed: &CallError| matches!(failed.error, Error::NotConnected | Error::Interrupted);
             let asked = outcomes.iter().filter(|(_, outcome)| !outcome.as_ref().is_err_and(is_off)).count();
             println!("stopped-all {stopped} {asked} {}", took.as_micros());
         });
@@ -72,7 +72,7 @@ pub(super) fn stop(vehicle: &Peer<Desk>) {
     let vehicle = vehicle.clone();
     std::thread::spawn(move || {
         let began = Instant::now();
-        match BrakeClient::at(&vehicle).stop() {
+        match BrakeClient::at(&vehicle).stop().wait() {
             Ok(()) => println!("call stop {}", began.elapsed().as_micros()),
             Err(error) => println!("failed stop {vehicle:?}: {error}"),
         }
@@ -81,7 +81,8 @@ pub(super) fn stop(vehicle: &Peer<Desk>) {
 
 /// Calls the mechanic to a vehicle; where he is away, it is tried again later.
 fn call_mechanic(system: &CommunicationSystem<Desk>, vehicle: &str) {
-    let called = system.m_unit(MECHANIC.0).map(|mechanic| WorkshopClient::at(&mechanic).call_mechanic(vehicle, FAULT));
+    let called =
+        system.m_unit(MECHANIC.0).map(|mechanic| WorkshopClient::at(&mechanic).call_mechanic(vehicle, FAULT).wait());
     match called {
         Ok(Ok(seconds)) => println!("mechanic {vehicle} {seconds}"),
         Ok(Err(error)) => println!("failed mechanic {vehicle}: {error}"),

@@ -71,11 +71,11 @@ fn drive(vehicle: usize, peer: &Peer<Desk>, renew: Renew, commands: &Receiver<Co
     for command in commands {
         let began = Instant::now();
         let answer = match command {
-            Command::Place => asked.place().map(Answer::Place),
-            Command::Advance(cell) => driven.advance(cell.numbers()).map(Answer::Moves),
-            Command::Load(order) => asked.load(order as i64).map(|()| Answer::Done),
-            Command::Unload(order) => asked.unload(order as i64).map(|()| Answer::Done),
-            Command::Reset { mended } => asked.reset(mended).map(|()| Answer::Done),
+            Command::Place => asked.place().wait().map(Answer::Place),
+            Command::Advance(cell) => driven.advance(cell.numbers()).wait().map(Answer::Moves),
+            Command::Load(order) => asked.load(order as i64).wait().map(|()| Answer::Done),
+            Command::Unload(order) => asked.unload(order as i64).wait().map(|()| Answer::Done),
+            Command::Reset { mended } => asked.reset(mended).wait().map(|()| Answer::Done),
         };
         let outcome = Outcome { vehicle, command, answer, took: began.elapsed() };
         if outcomes.send(outcome).is_err() {

@@ -26,9 +26,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use cara_std::{
-    CallError, CommunicationSystem, Error, Heart, Identity, LinkCounter, ServiceError, StartError, UnitEvent,
-};
+use cara_std::{CallError, CommunicationSystem, Error, Heart, Identity, LinkCounter, StartError, UnitEvent};
 
 use crate::book::{Book, BookError};
 use crate::files::{MapFiles, read};
@@ -301,12 +299,12 @@ impl Manager {
                 vehicle.lost();
             }
             // It was stopped before, and has a fault beside that.
-            (Command::Reset { .. }, Err(CallError::Call(Error::Service(ServiceError::Failed(refusal::FAULTY))))) => {
+            (Command::Reset { .. }, Err(failed)) if failed.code() == Some(refusal::FAULTY) => {
                 vehicle.reset = None;
                 vehicle.stopped(0, FAULT);
             }
             (Command::Reset { .. }, Err(_)) => {}
-            (_, Err(CallError::Call(Error::Inhibited { by, reason }))) => vehicle.stopped(*by, *reason),
+            (_, Err(CallError { error: Error::Inhibited { by, reason }, .. })) => vehicle.stopped(*by, *reason),
             _ => vehicle.lost(),
         }
         Ok(())

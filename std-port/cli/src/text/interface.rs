@@ -23,7 +23,7 @@ const KEYWORDS: [&str; 46] = [
 pub(crate) fn interface(node: &str, functions: &[FunctionInfo]) -> Result<String, String> {
     let name = trait_name(node);
     // A record is made of something, so it is none of these.
-    let made = ["Server", "Client", "AsyncClient"].map(|what| format!("{name}{what}"));
+    let made = ["Server", "Client"].map(|what| format!("{name}{what}"));
     let used = [&*name, "ServiceError", "TypedCall", "Variables", "Result", "Option", "String", "Vec"];
     let known =
         used.into_iter().chain(made.iter().map(String::as_str)).map(|taken| (Vec::new(), taken.to_owned())).collect();

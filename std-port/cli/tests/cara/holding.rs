@@ -189,7 +189,7 @@ fn what_the_program_of_a_manager_moves_is_held_unless_it_is_taken_over() {
     let driver = Driver::join(&stage);
     let peer = manager.s_unit("driver").unwrap();
     let wanted = RequestOptions::renewing(Renew::Process);
-    let program = || peer.block_request_with("drive", &mut Parameters::new(), &wanted);
+    let program = || peer.call("drive", &mut Parameters::new()).with(wanted).wait();
     assert_eq!(program(), Ok(()));
     stage.ends(1, &["call", "driver", "drive"]).says("driver/99: Held: ").says("is held by unit 1:");
     stage.ends(1, &["call", "driver", "--hold", "--detached", "drive"]).says("is held by unit 1:");
@@ -197,7 +197,7 @@ fn what_the_program_of_a_manager_moves_is_held_unless_it_is_taken_over() {
     assert_eq!(driver.made_safe(), 0);
     let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--take-over", "drive"]));
     held.expect("drive()");
-    assert_eq!(program(), Err(Error::Held { by: 1, operator: true }));
+    assert_eq!(program(), Err(Error::Held { by: 1, operator: true }.into()));
     assert!(driver.lease.is_live());
     held.interrupt();
     until(|| driver.made_safe() == 1);

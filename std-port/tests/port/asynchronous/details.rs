@@ -1,19 +1,14 @@
 //! Failures, progress and cancellation for callers and handlers that are futures.
 
+use std::cell::Cell;
 use std::ops::ControlFlow;
 
-use cara_std::{
-    CallError, Definition, Error, Failure, Parameters, RequestOptions, Served, ServiceError, ServiceOptions,
-};
+use cara_std::{Definition, Error, Failure, Parameters, ParametersView, Served, ServiceError, ServiceOptions};
 
-use super::{patient, runtime};
+use super::{once, patient, runtime};
 use crate::details::{assert_blocked, blocked, left, serve};
 use crate::support::{counter, fleet, meet, number, pair, system, unit, until, value};
-use crate::typed::{Blocked, DockAsyncClient, DockServer, Gate, Left, NewerDockAsyncClient};
-
-fn watched() -> RequestOptions {
-    RequestOptions { progress: true, ..patient() }
-}
+use crate::typed::{Blocked, DockClient, DockServer, Gate, Left, NewerDockClient};
 
 #[test]
 fn a_failure_tells_its_text_and_its_values_to_a_task() {
@@ -29,18 +24,12 @@ fn a_failure_tells_its_text_and_its_values_to_a_task() {
     let (peer, _) = meet(&manager, &agv);
     runtime().block_on(async {
         let mut parameters = number(1);
-        let mut call = peer.request_async("says", &mut parameters, &watched()).unwrap();
-        assert_eq!((&mut call).await, Err(Error::Service(ServiceError::Failed(7))));
-        assert_blocked(call.failure().as_deref());
-        // Nothing is kept for a caller that did not ask.
-        let mut parameters = number(1);
-        let mut call = peer.request_async("says", &mut parameters, &patient()).unwrap();
-        assert_eq!((&mut call).await, Err(Error::Service(ServiceError::Failed(7))));
-        assert!(call.failure().is_none());
-        let mut parameters = number(1);
-        let mut call = peer.request_async("awaits", &mut parameters, &watched()).unwrap();
-        assert_eq!((&mut call).await, Err(Error::Service(ServiceError::Failed(9))));
-        assert_eq!(call.failure().map(|failure| failure.text().to_owned()).as_deref(), Some("on its way"));
+        let failed = peer.call("says", &mut parameters).with(patient()).await.unwrap_err();
+        assert_eq!(failed, Error::Service(ServiceError::Failed(7)));
+        assert_blocked(failed.failure());
+        let failed = peer.call("awaits", &mut parameters).with(patient()).await.unwrap_err();
+        assert_eq!(failed, Error::Service(ServiceError::Failed(9)));
+        assert_eq!(failed.text(), "on its way");
     });
 }
 
@@ -52,19 +41,19 @@ fn a_task_awaits_what_a_typed_call_tells() {
     agv.my_function_list().serve(DockServer).unwrap();
     let (peer, _) = meet(&manager, &agv);
     runtime().block_on(async {
-        let client = DockAsyncClient::at(&peer).with(patient());
+        let client = DockClient::at(&peer).with(patient());
         let mut told = None;
         let on_progress = |left| {
             told = told.or(Some(left));
             ControlFlow::Continue(())
         };
-        let failed = client.watch_dock(11, on_progress).await.unwrap_err();
+        let failed = client.dock(11).watch(on_progress).await.unwrap_err();
         assert_eq!(told, Some(Left { left: 10 }));
-        assert_eq!((failed.text.as_str(), failed.values), ("the way is blocked", Some(Blocked { at: [3, -4] })));
-        let failed = client.watch_dock(500, |_| ControlFlow::Break(())).await.unwrap_err();
-        assert_eq!(failed, CallError::Call(Error::Cancelled).into());
-        let newer = NewerDockAsyncClient::at(&peer);
-        let failed = newer.watch_dock(1, |_| unreachable!("nothing is sent")).await.unwrap_err();
+        assert_eq!((failed.text(), failed.values()), ("the way is blocked", Some(Blocked { at: [3, -4] })));
+        let failed = client.dock(500).watch(|_| ControlFlow::Break(())).await.unwrap_err();
+        assert_eq!(failed, Error::Cancelled);
+        let newer = NewerDockClient::at(&peer);
+        let failed = newer.dock(1).watch(|_| unreachable!("nothing is sent")).await.unwrap_err();
         assert!(failed.to_string().contains("its progress left is int there and float here"), "{failed}");
     });
     until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 1));
@@ -92,19 +81,28 @@ fn a_task_hears_progress_and_gives_its_call_up() {
     let (peer, _) = meet(&manager, &agv);
     runtime().block_on(async {
         let mut parameters = number(1);
-        let mut call = peer.request_async("three", &mut parameters, &watched()).unwrap();
         let mut last = -1;
-        while let Some(told) = call.progress().await {
+        let rises = |told: &ParametersView| {
             let metres: i64 = told.variable("left").unwrap();
             assert!(metres > last, "{metres} behind {last}");
             last = metres;
-        }
-        assert_eq!(call.await, Ok(()));
+            ControlFlow::Continue(())
+        };
+        assert_eq!(peer.call("three", &mut parameters).with(patient()).watch(rises).await, Ok(()));
         assert_eq!(value(&parameters), 10);
+        let heard = Cell::new(None);
         let mut parameters = number(1);
-        let mut call = peer.request_async("waits", &mut parameters, &watched()).unwrap();
-        let told = call.progress().await.expect("it runs").variable::<i64>("left");
-        assert_eq!(told, Ok(5));
+        let call = peer.call("waits", &mut parameters).with(patient()).watch(|told| {
+            heard.set(Some(told.variable::<i64>("left")));
+            ControlFlow::Continue(())
+        });
+        let mut call = call.into_future();
+        while heard.get().is_none() {
+            assert_eq!(once(&mut call).await, None);
+            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+        }
+        assert_eq!(heard.get(), Some(Ok(5)));
+        // Dropped when it has told something.
         drop(call);
     });
     let cancelled = || counter(&agv.manager().unwrap().counters(), "RunningCancelled") == 1;

@@ -11,7 +11,7 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use cara_std::{Constraints, Error, Parameters, Peer, RequestOptions, ServiceError};
+use cara_std::{CallError, Constraints, Error, Parameters, Peer, RequestOptions, ServiceError};
 
 use crate::support::{Gate, ask, counter, fleet, held, meet, number, pair, service, system, unit, until, value};
 
@@ -38,7 +38,7 @@ async fn once<F: Future + Unpin>(future: &mut F) -> Option<F::Output> {
 
 async fn echo(peer: &Peer, number_in: i64) -> Result<i64, Error> {
     let mut parameters = number(number_in);
-    peer.request_async("echo", &mut parameters, &patient())?.await.map(|()| value(&parameters))
+    peer.call("echo", &mut parameters).with(patient()).await.map(|()| value(&parameters)).map_err(Error::from)
 }
 
 #[test]
@@ -50,8 +50,8 @@ fn a_request_can_be_awaited_and_fails_like_any_other() {
         for number in 0..100 {
             assert_eq!(echo(&peer, number).await, Ok(number));
         }
-        let refused = peer.request_async("no_such", &mut number(1), &patient()).err();
-        assert_eq!(refused, Some(Error::UnknownFunction));
+        let refused = peer.call("no_such", &mut number(1)).with(patient()).await;
+        assert_eq!(refused, Err(Error::UnknownFunction.into()));
     });
     agv.stop();
     until("it has left", || !peer.is_connected());
@@ -95,15 +95,15 @@ fn a_future_times_out_and_a_dropped_one_frees_its_slot() {
     runtime().block_on(async {
         // Long enough for the call to be run on a busy machine: one that comes too late is answered.
         let mut parameters = number(5);
-        let outcome = peer.request_async("hang", &mut parameters, &within_millis(500)).unwrap().await;
-        assert_eq!((outcome, value(&parameters)), (Err(Error::TimedOut), 5));
+        let outcome = peer.call("hang", &mut parameters).with(within_millis(500)).await;
+        assert_eq!((outcome, value(&parameters)), (Err(Error::TimedOut.into()), 5));
         // More than there are slots, each given up before its reply.
         for _ in 0..300 {
             let mut parameters = number(5);
-            let pending = peer.request_async("hang", &mut parameters, &within_millis(30)).unwrap();
+            let pending = peer.call("hang", &mut parameters).with(within_millis(30)).into_future();
             match tokio::time::timeout(Duration::ZERO, pending).await {
                 Err(_) => {}
-                Ok(Err(Error::Busy | Error::TimedOut | Error::Expired)) => {} // The peer refuses those beyond its own limit.
+                Ok(Err(CallError { error: Error::Busy | Error::TimedOut | Error::Expired, .. })) => {} // The peer refuses those beyond its own limit.
                 Ok(outcome) => panic!("{outcome:?}"),
             }
         }
@@ -123,12 +123,12 @@ fn a_future_ends_when_its_link_does() {
         let peer = peer.clone();
         async move {
             let mut parameters = number(5);
-            peer.request_async("hang", &mut parameters, &patient())?.await
+            peer.call("hang", &mut parameters).with(patient()).await
         }
     });
     until("it runs", || gate.came() == 1);
     manager.stop();
-    assert_eq!(runtime.block_on(waiting).unwrap(), Err(Error::Interrupted));
+    assert_eq!(runtime.block_on(waiting).unwrap(), Err(Error::Interrupted.into()));
     gate.open();
 }
 
@@ -146,10 +146,10 @@ fn a_future_waits_for_the_interval_within_its_deadline() {
         assert_eq!(echo(&peer, 2).await, Ok(2));
         assert!(began.elapsed() >= interval.into(), "{:?}", began.elapsed());
         let mut parameters = number(3);
-        let refused = peer.request_async("echo", &mut parameters, &within_millis(20)).err();
-        assert!(matches!(refused, Some(Error::TooSoon { .. })), "{refused:?}");
+        let refused = peer.call("echo", &mut parameters).with(within_millis(20)).await.map_err(Error::from);
+        assert!(matches!(refused, Err(Error::TooSoon { .. })), "{refused:?}");
         // Dropped while it waits, it is never sent.
-        let mut pending = peer.request_async("echo", &mut parameters, &patient()).unwrap();
+        let mut pending = peer.call("echo", &mut parameters).with(patient()).into_future();
         assert_eq!(once(&mut pending).await, None);
         drop(pending);
         tokio::time::sleep(Duration::from_millis(1_200)).await;
@@ -174,14 +174,14 @@ fn calls_to_all_have_an_outcome_each_and_are_given_up_when_they_are_dropped() {
     }
     crate::support::retire_absent(&manager);
     runtime().block_on(async {
-        let outcomes = manager.request_all_async("echo", &number(4), &patient()).await;
+        let outcomes = manager.call_all("echo", &number(4)).with(patient()).await;
         let mut outcomes: Vec<_> =
             outcomes.into_iter().map(|(peer, outcome)| (peer.id(), outcome.map(|results| value(&results)))).collect();
         outcomes.sort_by_key(|(id, _)| *id);
-        assert_eq!(outcomes, [(1, Ok(4)), (2, Ok(4)), (3, Err(Error::Service(ServiceError::Panicked)))]);
+        assert_eq!(outcomes, [(1, Ok(4)), (2, Ok(4)), (3, Err(Error::Service(ServiceError::Panicked).into()))]);
         let (parameters, options) = (number(4), patient());
-        let all = manager.request_all_async("hang", &parameters, &options);
-        assert!(tokio::time::timeout(Duration::from_millis(100), all).await.is_err());
+        let all = manager.call_all("hang", &parameters).with(options);
+        assert!(tokio::time::timeout(Duration::from_millis(100), all.into_future()).await.is_err());
     });
     let cancelled = |peer: &Peer| counter(&peer.counters(), "CallsCancelled");
     assert!(manager.s_units().iter().all(|peer| cancelled(peer) == 1));
@@ -199,8 +199,8 @@ fn a_method_that_waits_for_a_future_is_told_at_once_of_a_call_that_waits_for_it(
     let forwards = move |mut parameters: Parameters| {
         let there = there.clone();
         async move {
-            let asked = there.get().unwrap().request_async("last", &mut parameters, &patient()).unwrap().await;
-            if asked == Err(Error::WouldDeadlock) {
+            let asked = there.get().unwrap().call("last", &mut parameters).with(patient()).await;
+            if asked == Err(Error::WouldDeadlock.into()) {
                 parameters.set_value("number", -1).unwrap();
             }
             parameters
@@ -213,11 +213,11 @@ fn a_method_that_waits_for_a_future_is_told_at_once_of_a_call_that_waits_for_it(
     let runtime = runtime();
     let one = || {
         let mut parameters = number(4);
-        let asked = peer.request_async("forwards", &mut parameters, &patient()).unwrap();
-        runtime.block_on(asked).map(|()| value(&parameters))
+        let asked = peer.call("forwards", &mut parameters).with(patient());
+        runtime.block_on(asked.into_future()).map(|()| value(&parameters)).map_err(Error::from)
     };
     let all = || {
-        let outcomes = manager.block_request_all("forwards", &number(4), &patient());
+        let outcomes = manager.call_all("forwards", &number(4)).with(patient()).wait();
         outcomes
             .iter()
             .find(|(asked, _)| asked.id() == 7)

@@ -5,11 +5,11 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use cara_std::{
-    Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions, Served, ServiceError,
-    ServiceOptions, Unit,
+    CallError, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew, RequestOptions, Served,
+    ServiceError, ServiceOptions, Unit,
 };
 
-use super::{patient, runtime, within_millis};
+use super::{once, patient, runtime, within_millis};
 use crate::support::{ask, counter, fleet, meet, number, pair, system, unit, until, value};
 
 /// How many handlers are inside, and how many have been dropped before their end.
@@ -126,7 +126,7 @@ fn handlers_that_wait_hold_no_thread() {
             .map(|(peer, number_in)| {
                 tokio::spawn(async move {
                     let mut parameters = number(number_in);
-                    peer.request_async("wait", &mut parameters, &patient())?.await.map(|()| value(&parameters))
+                    peer.call("wait", &mut parameters).with(patient()).await.map(|()| value(&parameters))
                 })
             })
             .collect();
@@ -177,15 +177,19 @@ fn a_handler_whose_call_is_given_up_is_dropped_or_told() {
         // Its caller's time is over.
         let outcome = runtime.block_on(async {
             let mut parameters = number(1);
-            peer.request_async("wait", &mut parameters, &within_millis(300)).unwrap().await
+            peer.call("wait", &mut parameters).with(within_millis(300)).await
         });
         // One that is told may answer before its caller has looked at the time.
-        assert!(matches!(outcome, Err(Error::TimedOut | Error::Expired)) || told, "{outcome:?}");
+        assert!(
+            matches!(outcome, Err(CallError { error: Error::TimedOut | Error::Expired, .. })) || told,
+            "{outcome:?}"
+        );
         ended(1);
         // Its caller has given its order up.
         let mut parameters = number(1);
         let wanted = RequestOptions { renew: Renew::Process, ..patient() };
-        let call = peer.request_async("drive", &mut parameters, &wanted).unwrap();
+        let mut call = peer.call("drive", &mut parameters).with(wanted).into_future();
+        assert_eq!(runtime.block_on(once(&mut call)), None);
         inside();
         drop(call);
         ended(2);
@@ -209,11 +213,11 @@ fn calls_of_an_executor_that_ends_are_answered() {
     let own = runtime();
     let running = own.spawn({
         let peer = peer.clone();
-        async move { peer.request_async("wait", &mut number(1), &patient())?.await }
+        async move { peer.call("wait", &mut number(1)).with(patient()).await }
     });
     until("it is inside", || seen.inside.load(Ordering::SeqCst) == 1);
     executor.shutdown_background();
-    assert_eq!(own.block_on(running).unwrap(), Err(Error::Service(ServiceError::NotReady)));
+    assert_eq!(own.block_on(running).unwrap(), Err(Error::Service(ServiceError::NotReady).into()));
     // One that it does not even take.
     assert_eq!(ask(&peer, "wait", 1), Err(Error::Service(ServiceError::NotReady)));
     assert_eq!(counter(&peer.counters(), "CallsTimedOut"), 0);
@@ -229,7 +233,7 @@ fn services_that_wait_call_each_other_back() {
     let outer = move |mut parameters: Parameters| {
         let there = there.clone();
         async move {
-            there.1.get().unwrap().request_async("middle", &mut parameters, &patient()).unwrap().await.unwrap();
+            there.1.get().unwrap().call("middle", &mut parameters).with(patient()).await.unwrap();
             parameters
         }
     };
@@ -237,7 +241,7 @@ fn services_that_wait_call_each_other_back() {
     let middle = move |mut parameters: Parameters| {
         let there = there.clone();
         async move {
-            there.0.get().unwrap().request_async("inner", &mut parameters, &patient()).unwrap().await.unwrap();
+            there.0.get().unwrap().call("inner", &mut parameters).with(patient()).await.unwrap();
             parameters
         }
     };

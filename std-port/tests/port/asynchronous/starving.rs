@@ -45,11 +45,13 @@ fn calls_starve_no_other_task() {
     retire_absent(&manager);
     let [one, all, kept] = gates.map(|gate| move || gate.open());
     let mut parameters = number(5);
-    let call = async { peer.request_async("hang0", &mut parameters, &within_millis(25_000))?.await };
+    let call = async { peer.call("hang0", &mut parameters).with(within_millis(25_000)).await };
     assert_eq!(beside(call, one), Ok(()));
-    let outcomes = beside(manager.request_all_async("hang1", &number(4), &within_millis(25_000)), all);
+    let outcomes = beside(manager.call_all("hang1", &number(4)).with(within_millis(25_000)).into_future(), all);
     assert_eq!(outcomes.iter().map(|(_, outcome)| outcome.as_ref().map(|p| value(p))).collect::<Vec<_>>(), [Ok(4)]);
-    assert!(beside(peer.hold_async("hang2", &mut number(1), &within_millis(25_000)), kept).is_ok());
+    let mut parameters = number(1);
+    let held = peer.call("hang2", &mut parameters).with(within_millis(25_000)).hold();
+    assert!(beside(held.into_future(), kept).is_ok());
 }
 
 /// One that blocks does starve the other: the check can fail.
@@ -61,7 +63,7 @@ fn a_call_that_blocks_starves_the_other_task() {
     let (peer, _) = meet(&manager, &agv);
     let open = gate.clone();
     let blocked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-        let call = async { peer.block_request_with("hang", &mut number(5), &within_millis(300)) };
+        let call = async { peer.call("hang", &mut number(5)).with(within_millis(300)).wait() };
         beside(call, move || open.open())
     }));
     gate.open();
@@ -134,15 +136,15 @@ fn a_service_that_waits_and_its_caller_share_a_thread() {
     let called = async {
         let runtime = tokio::runtime::Handle::current();
         agv.run_services_on(move |task| drop(runtime.spawn(task)));
-        peer.request_async("waits", &mut parameters, &within_millis(25_000))?.await
+        peer.call("waits", &mut parameters).with(within_millis(25_000)).await
     };
     assert_eq!(beside(called, move || opens.store(1, Ordering::SeqCst)), Ok(()));
     let unrenewed = RequestOptions { renew: cara_std::Renew::Never, ..patient() };
     let called = async {
         let runtime = tokio::runtime::Handle::current();
         agv.run_services_on(move |task| drop(runtime.spawn(task)));
-        peer.request_async("leased", &mut number(1), &unrenewed)?.await
+        peer.call("leased", &mut number(1)).with(unrenewed).await
     };
     // The order ends by itself, and with it the handler.
-    assert_eq!(beside(called, || ()), Err(Error::Expired));
+    assert_eq!(beside(called, || ()), Err(Error::Expired.into()));
 }

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use cara_std::{
-    Actuator, AnyCall, AsyncState, CallError, CommunicationSystem, Error, LeaseWatch, Peer, Priority, Renew,
-    ServiceError, TypedCall, Unit, Variables, interface,
+    Actuator, AnyCall, AsyncState, CommunicationSystem, Error, LeaseWatch, Peer, Priority, Renew, ServiceError,
+    TypedCall, Unit, Variables, interface,
 };
 
 use super::services::run_on;
@@ -144,11 +144,11 @@ fn pair_with_crane() -> (CommunicationSystem, Peer, Unit<Hook>, LeaseWatch) {
 fn an_async_fn_answers_threads_and_tasks() {
     let (manager, peer, crane, _) = pair_with_crane();
     let client = CraneClient::at(&peer);
-    assert_eq!(client.greet("crane"), Ok(("hello crane".to_owned(), 5)));
-    assert_eq!(client.load(), Ok(Load::default()));
-    assert_eq!(client.hang(Load { kilograms: 900 }), Ok(()));
+    assert_eq!(client.greet("crane").wait(), Ok(("hello crane".to_owned(), 5)));
+    assert_eq!(client.load().wait(), Ok(Load::default()));
+    assert_eq!(client.hang(Load { kilograms: 900 }).wait(), Ok(()));
     runtime().block_on(async {
-        let client = CraneAsyncClient::at(&peer);
+        let client = CraneClient::at(&peer);
         assert_eq!(client.load().await, Ok(Load { kilograms: 900 }));
         assert_eq!(client.greet("task").await, Ok(("hello task".to_owned(), 4)));
         assert_eq!(client.wait().await, Ok(()), "it has no reason to");
@@ -171,13 +171,13 @@ fn an_async_fn_waits_while_others_are_answered() {
     run_on(&crane, &runtime);
     let waiting = runtime.spawn({
         let peer = peer.clone();
-        async move { CraneAsyncClient::at(&peer).with(patient()).wait().await }
+        async move { CraneClient::at(&peer).with(patient()).wait().await }
     });
     let client = CraneClient::at(&peer);
-    until("it waits", || client.waiting() == Ok(1));
-    assert_eq!(client.load(), Ok(Load::default()));
+    until("it waits", || client.waiting().wait() == Ok(1));
+    assert_eq!(client.load().wait(), Ok(Load::default()));
     assert!(!waiting.is_finished());
-    assert_eq!(client.hang(Load { kilograms: 1 }), Ok(()));
+    assert_eq!(client.hang(Load { kilograms: 1 }).wait(), Ok(()));
     assert_eq!(runtime.block_on(waiting).unwrap(), Ok(()));
     manager.stop();
     crane.stop();
@@ -189,19 +189,22 @@ fn an_async_fn_tells_progress_and_why_it_failed() {
     let runtime = runtime();
     run_on(&crane, &runtime);
     let client = CraneClient::at(&peer).with(patient());
-    let failed = client.watch_lift(11, |left| {
-        assert_eq!(left, Left { left: 11 });
-        client.request_hang(Load { kilograms: 900 }).unwrap();
-        ControlFlow::Continue(())
-    });
+    let failed = client
+        .lift(11)
+        .watch(|left| {
+            assert_eq!(left, Left { left: 11 });
+            client.hang(Load { kilograms: 900 }).send().unwrap();
+            ControlFlow::Continue(())
+        })
+        .wait();
     let failed = failed.unwrap_err();
-    assert_eq!((failed.text.as_str(), failed.values), ("the way is blocked", Some(Blocked { at: [3, -4] })));
-    assert_eq!(failed.error, CallError::Call(Error::Service(ServiceError::Failed(7))));
+    assert_eq!((failed.text(), failed.values()), ("the way is blocked", Some(Blocked { at: [3, -4] })));
+    assert_eq!(failed.error, Error::Service(ServiceError::Failed(7)));
     runtime.block_on(async {
-        let client = CraneAsyncClient::at(&peer);
-        let failed = client.watch_lift(11, |_| ControlFlow::Continue(())).await.unwrap_err();
+        let client = CraneClient::at(&peer);
+        let failed = client.lift(11).watch(|_| ControlFlow::Continue(())).await.unwrap_err();
         assert_eq!(failed.to_string(), "the way is blocked (code 7)");
-        assert_eq!(client.watch_lift(3, |_| ControlFlow::Continue(())).await, Ok(()));
+        assert_eq!(client.lift(3).watch(|_| ControlFlow::Continue(())).await, Ok(()));
     });
     assert_eq!(crane.with_state(|hook| hook.lifted), Ok(3));
     manager.stop();
@@ -215,18 +218,18 @@ fn an_async_fn_is_dropped_with_its_order() {
     let ended = crane.with_state(|hook| hook.ended.clone()).unwrap();
     let ended_are = |count| until("it is dropped", || ended.load(Ordering::SeqCst) == count && !order.is_live());
     runtime().block_on(async {
-        let client = CraneAsyncClient::at(&peer).with(patient()).renewing(Renew::Process);
-        let failed = client.watch_lift(0, |_| ControlFlow::Break(())).await.unwrap_err();
-        assert_eq!(failed.error, CallError::Call(Error::Cancelled));
+        let client = CraneClient::at(&peer).with(patient()).renewing(Renew::Process);
+        let failed = client.lift(0).watch(|_| ControlFlow::Break(())).await.unwrap_err();
+        assert_eq!(failed.error, Error::Cancelled);
         ended_are(1);
         // Stopped while it waits.
         let stopping = |_| {
             assert!(order.is_live());
-            CraneClient::at(&peer).request_halt().unwrap();
+            CraneClient::at(&peer).halt().send().unwrap();
             ControlFlow::Continue(())
         };
-        let failed = client.watch_lift(0, stopping).await.unwrap_err();
-        assert_eq!(failed.error, CallError::Call(Error::Expired));
+        let failed = client.lift(0).watch(stopping).await.unwrap_err();
+        assert_eq!(failed.error, Error::Expired);
         ended_are(2);
     });
     manager.stop();
@@ -240,10 +243,10 @@ fn an_async_fn_commits_nothing_behind_the_end_of_its_order() {
     let client = CraneClient::at(&peer).with(patient());
     let stopping = |Left { left }| {
         assert_eq!(left, 5);
-        client.request_halt().unwrap();
+        client.halt().send().unwrap();
         ControlFlow::Continue(())
     };
-    assert!(client.watch_lift(5, stopping).is_err());
+    assert!(client.lift(5).watch(stopping).wait().is_err());
     until("it has ended", || crane.with_state(|hook| hook.ended.load(Ordering::SeqCst)) == Ok(1));
     assert_eq!(crane.with_state(|hook| hook.lifted), Ok(0));
     manager.stop();

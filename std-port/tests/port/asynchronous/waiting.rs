@@ -109,14 +109,14 @@ fn what_is_held_is_released_and_its_end_is_told() {
     let (peer, _) = meet(&manager, &agv);
     let wanted = RequestOptions { renew: Renew::Process, ..patient() };
     runtime().block_on(async {
-        let held = peer.hold_async("lift", &mut number(1), &wanted).await.unwrap();
+        let held = peer.call("lift", &mut number(1)).with(wanted).hold().await.unwrap();
         assert!(held.is_held() && lease.is_live());
-        let end = held.release_async(Duration::from_secs(20)).await;
+        let end = held.hold.release_async(Duration::from_secs(20)).await;
         assert_eq!((end, lease.is_live()), (Ok(LeaseEnd::Released), false));
         // Dropped while it waits for the end, it is released all the same.
-        let held = peer.hold_async("lift", &mut number(1), &wanted).await.unwrap();
+        let held = peer.call("lift", &mut number(1)).with(wanted).hold().await.unwrap();
         assert!(lease.is_live());
-        drop(held.release_async(Duration::from_secs(20)));
+        drop(held.hold.release_async(Duration::from_secs(20)));
     });
     until("it is released", || !lease.is_live());
     assert_eq!(counter(&peer.counters(), "CallsTimedOut"), 0);

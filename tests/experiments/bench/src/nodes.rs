@@ -122,7 +122,7 @@ fn exchange(manager: &CommunicationSystem) -> Result<()> {
     let (sent, mut parameters) = (text(TEXT_BYTES), text_parameters()?);
     for peer in manager.s_units() {
         parameters.set_value("text", sent.as_str())?;
-        let outcome = peer.block_request_with("echo", &mut *parameters, &options());
+        let outcome = peer.call("echo", &mut *parameters).with(options()).wait();
         outcome.with_context(|| format!("the long text to {}", peer.name()))?;
     }
     Ok(())
@@ -135,7 +135,7 @@ fn block(manager: &CommunicationSystem, calls: u32, each: bool) -> Result<Vec<u6
     let mut round_trips = Vec::with_capacity(calls as usize);
     for peer in peers.iter().cycle().take(calls as usize) {
         let began = clock::now();
-        peer.block_request_with("touch", &mut number, &options())?;
+        peer.call("touch", &mut number).with(options()).wait()?;
         round_trips.push(clock::now() - began);
     }
     Ok(round_trips)

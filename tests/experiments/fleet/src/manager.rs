@@ -80,7 +80,7 @@ fn exchange(manager: &CommunicationSystem, chars: usize) -> Result<Called> {
     let began = Instant::now();
     let outcomes = manager.s_units().into_iter().map(|peer| {
         let outcome = text.set_value("text", sent.as_str());
-        let outcome = outcome.and_then(|()| peer.block_request_with("echo", &mut *text, &options()));
+        let outcome = outcome.and_then(|()| peer.call("echo", &mut *text).with(options()).wait().map_err(Error::from));
         (peer.name().to_owned(), outcome)
     });
     Ok(called(began, outcomes))
@@ -89,8 +89,8 @@ fn exchange(manager: &CommunicationSystem, chars: usize) -> Result<Called> {
 fn call_all(manager: &CommunicationSystem) -> Result<Called> {
     let number = number()?;
     let began = Instant::now();
-    let outcomes = manager.block_request_all("touch", &number, &options()).into_iter();
-    Ok(called(began, outcomes.map(|(peer, outcome)| (peer.name().to_owned(), outcome.map(|_| ())))))
+    let outcomes = manager.call_all("touch", &number).with(options()).wait().into_iter();
+    Ok(called(began, outcomes.map(|(peer, outcome)| (peer.name().to_owned(), outcome.map(drop).map_err(Error::from)))))
 }
 
 /// Calls in a row, of one node or of each in turn.
@@ -104,7 +104,7 @@ fn block(manager: &CommunicationSystem, node: Option<u32>, calls: usize) -> Resu
     let cpu = proc::own_cpu_time()?;
     for peer in peers.iter().cycle().take(calls) {
         let began = Instant::now();
-        peer.block_request_with("touch", &mut number, &options())?;
+        peer.call("touch", &mut number).with(options()).wait()?;
         round_trips.push(began.elapsed().as_nanos() as u64);
     }
     Ok(Block::new(round_trips, proc::own_cpu_time()?.saturating_sub(cpu)))

@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use cara_processes::cable::{Cable, Wire};
 use cara_std::{
-    Capacities, CommunicationSystem, Constraints, Definition, Parameters, Peer, Priority, Relay, RequestOptions,
-    ServiceOptions, Stream, Subscription, Threads, Unit,
+    Capacities, CommunicationSystem, Constraints, Definition, Parameters, Peer, Priority, Relay, ServiceOptions,
+    Stream, Subscription, Threads, Unit,
 };
 use clap::Args;
 use rustix::time::{ClockId, clock_gettime};
@@ -442,8 +442,7 @@ fn call(system: &CommunicationSystem, function: &str, calls: u32) -> Result<Vec<
     for peer in peers.iter().cycle().take(calls as usize) {
         std::thread::sleep(PAUSE);
         let began = Instant::now();
-        peer.block_request_with(function, &mut number, &RequestOptions::default())
-            .with_context(|| format!("{peer:?}: {function}"))?;
+        peer.call(function, &mut number).wait().with_context(|| format!("{peer:?}: {function}"))?;
         times.push(began.elapsed().as_micros() as u64);
     }
     Ok(times)

@@ -36,9 +36,7 @@ pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     ensure!(position(&agv)? == [0, 0], "it begins elsewhere");
-    drives(&board, [1, 2], || {
-        Ok(agv.request_with("go_to", &at([1, 2])?, &RequestOptions::renewing(Renew::Process)).map(drop)?)
-    })?;
+    drives(&board, [1, 2], || Ok(agv.call("go_to", &mut at([1, 2])?).renewing(Renew::Process).send().map(drop)?))?;
     arrives(&agv, [1, 2])?;
     drives(&board, [0, 2], || sets_out(&agv, [0, 2]))?;
     arrives(&agv, [0, 2])?;
@@ -65,7 +63,7 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     let agv = manager.meet(&Who::agv(17))?;
     let once = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     let mut far = at([1_000, 0])?;
-    patiently(|| agv.block_request_with("go_to", &mut far, &once))?;
+    patiently(|| agv.call("go_to", &mut far).with(once).wait().map_err(Error::from))?;
     board.logs("stopped at")?;
     let [x, _] = position(&agv)?;
     ensure!((0..10).contains(&x), "it stands at {x}");
@@ -118,7 +116,7 @@ pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::renewing(Renew::Process) };
-    drives(&board, [1, 1], || Ok(agv.request_with("go_to", &at([1, 1])?, &one_datagram).map(drop)?))?;
+    drives(&board, [1, 1], || Ok(agv.call("go_to", &mut at([1, 1])?).with(one_datagram).send().map(drop)?))?;
     Ok("in one datagram".into())
 }
 

@@ -1,9 +1,9 @@
 //! Orders with lists, for a board that has them and for one that does not.
 
 use anyhow::{Context, Result, ensure};
-use cara_std::typed::CallError;
 use cara_std::{
-    Definition, Error, ParametersView, Peer, Served, ServiceError, ServiceOptions, UnitEvent, Variables, interface,
+    CallError, Definition, Error, ParametersView, Peer, Served, ServiceError, ServiceOptions, UnitEvent, Variables,
+    interface,
 };
 
 use crate::board::{Bench, Who};
@@ -70,7 +70,7 @@ pub(super) fn large_order(bench: &Bench, _: u32) -> Result<String> {
     let follows = |nodes, expected: Followed| {
         let mut told = None;
         patiently(|| match follow(&agv, nodes) {
-            Err(CallError::Call(error)) => Err(error),
+            Err(failed) if failed.mismatch().is_none() => Err(failed.error),
             followed => {
                 told = Some(followed);
                 Ok(())
@@ -109,7 +109,7 @@ pub(super) fn unreadable_function(bench: &Bench, _: u32) -> Result<String> {
 
 fn follow(agv: &Peer, nodes: u32) -> Result<Followed, CallError> {
     let (nodes, edges) = order(nodes);
-    FollowClient::at(agv).follow(nodes, edges)
+    FollowClient::at(agv).follow(nodes, edges).wait()
 }
 
 fn requests_sent(agv: &Peer) -> Result<u64> {

@@ -17,8 +17,8 @@ pub(super) fn hung(bench: &Bench, _: u32) -> Result<String> {
     let agv = manager.meet(&Who::agv(17))?;
     board.freeze()?;
     let soon = RequestOptions { timeout: Some(Duration::from_millis(300).into()), ..RequestOptions::default() };
-    let ended = agv.block_request_with("pos_info", &mut at([0, 0])?, &soon);
-    ensure!(ended == Err(Error::TimedOut), "{ended:?}");
+    let ended = agv.call("pos_info", &mut at([0, 0])?).with(soon).wait();
+    ensure!(ended == Err(Error::TimedOut.into()), "{ended:?}");
     board.thaw()?;
     let agv = manager.meet(&Who::agv(17))?;
     position(&agv)?;

@@ -88,8 +88,8 @@ impl EmulatedBoard {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();
             let wanted = RequestOptions::renewing(Renew::Process);
-            let held = match agv.hold("go_to", &mut at([9_000, 0])?, &wanted) {
-                Err(error) if is_of_a_busy_host(&error) => continue,
+            let held = match agv.call("go_to", &mut at([9_000, 0])?).with(wanted).hold().wait() {
+                Err(error) if is_of_a_busy_host(&error.error) => continue,
                 held => held?,
             };
             let line = self.board.logs_behind(line, ON)?;
@@ -114,8 +114,8 @@ fn goes_on(manager: &Manager, agv: &Peer, is_held: &SyncSender<()>, ends: &Atomi
     let (mut heart, deadline) = (manager.system.heart(PERIOD), Instant::now() + LONG);
     let held = loop {
         heart.beat();
-        match agv.hold(CREEP, &mut arguments(0, 0)?, &RequestOptions::renewing(heart.renew())) {
-            Err(error) if is_of_a_busy_host(&error) && Instant::now() < deadline => {}
+        match agv.call(CREEP, &mut arguments(0, 0)?).renewing(heart.renew()).hold().wait() {
+            Err(error) if is_of_a_busy_host(&error.error) && Instant::now() < deadline => {}
             held => break held.context(CREEP)?,
         }
     };

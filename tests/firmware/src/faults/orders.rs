@@ -5,7 +5,7 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use cara_std::{Error, Parameters, Peer, Renew, RequestOptions};
+use cara_std::{CallError, Error, Parameters, Peer, Renew, RequestOptions};
 
 use super::Stop;
 use super::inject::{EmulatedBoard, ON, STANDS, pause};
@@ -64,9 +64,9 @@ impl EmulatedBoard {
                 let timeout = Some(TIMEOUT);
                 let options = RequestOptions { timeout, ..RequestOptions::renewing(Renew::Process) };
                 loop {
-                    match agv.block_request_with(CREEP, &mut arguments(1, NEVER)?, &options) {
+                    match agv.call(CREEP, &mut arguments(1, NEVER)?).with(options).wait() {
                         // It did not begin: the clock of this board runs ahead while it computes a proof.
-                        Err(error) if error != Error::TimedOut && is_of_a_busy_host(&error) => {}
+                        Err(error) if error != Error::TimedOut && is_of_a_busy_host(&error.error) => {}
                         outcome => break outcome,
                     }
                 }
@@ -79,7 +79,7 @@ impl EmulatedBoard {
         });
         let line = ends?;
         let outcome = outcome.ok().context("the call panicked")?;
-        ensure!(matches!(outcome, Err(Error::TimedOut)), "the call came to {outcome:?}");
+        ensure!(matches!(outcome, Err(CallError { error: Error::TimedOut, .. })), "the call came to {outcome:?}");
         let stopped = self.stopped(line);
         if is_deaf {
             self.cable.join()?;
@@ -151,7 +151,7 @@ const MOVES: &str = " moves";
 /// Calls the service, which answers at once and goes on.
 fn creep(agv: &Peer, speed: i64) -> Result<()> {
     let wanted = RequestOptions::renewing(Renew::Process);
-    patiently(|| agv.block_request_with(CREEP, &mut arguments(speed, 0)?, &wanted)).context(CREEP)
+    patiently(|| agv.call(CREEP, &mut arguments(speed, 0)?).with(wanted).wait().map_err(Error::from)).context(CREEP)
 }
 
 pub(super) fn arguments(speed: i64, answers: i64) -> Result<Parameters, Error> {

@@ -49,7 +49,7 @@ impl EmulatedBoard {
             }
             // As an emergency too, or it would wait behind the flood.
             let urgent = RequestOptions { priority: Some(Priority::Emergency), ..RequestOptions::default() };
-            let announced = patiently(|| agv.block_request_with("fault", &mut fault(0)?, &urgent));
+            let announced = patiently(|| agv.call("fault", &mut fault(0)?).with(urgent).wait().map_err(Error::from));
             let is_late = self.has_logged(line, OFF);
             let stopped = announced.and_then(|()| patiently(|| agv.block_request("stop", &mut Parameters::new())));
             floods.store(false, Ordering::Relaxed);

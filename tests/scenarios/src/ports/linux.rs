@@ -13,13 +13,13 @@ use std::thread;
 use cara_core::config::{Constraints, Mode, PLAIN_PORT};
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function::Definition;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
+use cara_core::services::call::{Caller, Detail};
 use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
@@ -27,8 +27,8 @@ use cara_core::time::{Duration, Instant};
 use cara_sim::Sample;
 use cara_std::access::AccessTable;
 use cara_std::{
-    BuildError, Builder, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, Served,
-    ServiceOptions, Unit as SUnit, UnitEvent,
+    BuildError, Builder, CallError, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer,
+    Served, ServiceOptions, Unit as SUnit, UnitEvent,
 };
 use tempfile::TempDir;
 
@@ -598,13 +598,15 @@ impl Node for Handle {
         parameters: &ParametersView,
         options: RequestOptions,
     ) -> Result<CallId, Error> {
-        self.node.peer(peer)?.request_with(function, parameters, &options)
+        Ok(self.node.peer(peer)?.send(function.into(), parameters, &options)?)
     }
 
     fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
         let system = self.system().inspect(retire_unknown_clients);
-        let requested = system.map(|system| system.request_all(function, parameters)).unwrap_or_default();
-        requested.into_iter().map(|(peer, result)| (peer.identity().clone(), result)).collect()
+        let requested = system.map(|system| system.call_all(function, parameters).send()).unwrap_or_default();
+        let short =
+            |(peer, result): (Peer, Result<_, CallError>)| (peer.identity().clone(), result.map_err(Error::from));
+        requested.into_iter().map(short).collect()
     }
 
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
@@ -613,7 +615,7 @@ impl Node for Handle {
         let (peer, function) = (peer.to_owned(), function.to_owned());
         thread::spawn(move || {
             let asked = node.peer(&peer);
-            let result = asked.and_then(|peer| peer.block_request_with(&function, &mut parameters, &options));
+            let result = asked.and_then(|peer| Ok(peer.call(&function, &mut parameters).with(options).wait()?));
             told.end(result.map(|()| parameters), node.now());
         });
         pending
@@ -627,8 +629,10 @@ impl Node for Handle {
         let system = self.system();
         thread::spawn(move || {
             let system = system.inspect(retire_unknown_clients);
-            let outcomes = system.map(|system| system.block_request_all(&function, &copy, &RequestOptions::default()));
-            let short = |(peer, outcome): (Peer, Result<_, Error>)| (peer.identity().clone(), outcome.map(drop));
+            let outcomes = system.map(|system| system.call_all(&function, &copy).wait());
+            let short = |(peer, outcome): (Peer, Result<_, CallError>)| {
+                (peer.identity().clone(), outcome.map(drop).map_err(Error::from))
+            };
             told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
         });
         pending
@@ -652,10 +656,13 @@ impl Node for Handle {
                 told.push(left);
                 if left < enough { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             };
-            let asked = node.peer(&peer).map_err(|error| Box::new(CallFailure::from(error)));
-            let outcome = asked
-                .and_then(|peer| peer.block_request_with_progress(&function, &mut parameters, &options, &mut listen));
-            ended.end(Ok(Watched { told, outcome: outcome.map_err(|failed| *failed) }), node.now());
+            let call = |peer: Peer| peer.call(&function, &mut parameters).with(options).watch(&mut listen).wait();
+            let outcome = node.peer(&peer).map_err(CallError::from).and_then(call);
+            let kept = |failed: CallError| {
+                let failure = failed.failure().cloned();
+                cara_sim::CallError::new(failed.error, failure.map(Detail::Service))
+            };
+            ended.end(Ok(Watched { told, outcome: outcome.map_err(kept) }), node.now());
         });
         pending
     }

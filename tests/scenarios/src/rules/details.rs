@@ -40,7 +40,7 @@ fn a_failure_brings_its_text_and_its_values(world: &mut dyn World) {
     let (manager, _) = pair(world, &go().fails(blocked));
     let call = watch(&manager, ALL);
     let failed = finish(world, &call).outcome.expect_err("it fails");
-    let failure = failed.failure.expect("its service says why");
+    let failure = failed.failure().expect("its service says why");
     assert_eq!(failed.error, Error::Service(ServiceError::Failed(7)));
     assert_eq!((failure.code(), failure.text()), (7, "the way is blocked"));
     assert_eq!(failure.values().variable("at"), Ok([3_i64, 4]));

@@ -7,16 +7,16 @@ use std::rc::Rc;
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::connection_handler::{ClaimEvent, Command, NodeCounter};
 use cara_core::distribution::datagram;
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
+use cara_core::services::call::Detail;
 use cara_core::services::session::Event;
 
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
-use super::replies::Promise;
+use super::replies::{CallError, Promise};
 use super::service::{BoxedParameters, Handler, LeaseWatch, Served, Serving};
 use super::state::{NODE_TIMER, Storing};
 use super::streams::Sample;
@@ -354,7 +354,7 @@ impl Inner {
         let job = async move {
             let outcome = service.run(told, parameters).await;
             let failure = running.failure.take();
-            let failed = |error| Box::new(CallFailure { error: Error::Service(error), failure });
+            let failed = |error| Box::new(CallError::new(Error::Service(error), failure.map(Detail::Service)));
             handle.answer(stream, ticket, outcome.map_err(failed));
         };
         self.spawned.push((owner, Box::pin(job)));

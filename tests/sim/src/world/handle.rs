@@ -6,7 +6,6 @@ use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
 use cara_core::distribution::claim::{Claim, TaggedClaim};
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
@@ -17,7 +16,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::functions::MyFunctionList;
 use super::links::{Link, Links, SimSession};
-use super::replies::Promise;
+use super::replies::{CallError, Promise};
 use super::service::BoxedParameters;
 use super::state::Machine;
 use super::tasks::Owner;
@@ -325,7 +324,7 @@ impl UnitHandle {
         cancelled.unwrap_or(true)
     }
 
-    pub(super) fn answer(&self, stream: StreamId, ticket: Ticket, outcome: Result<BoxedParameters, Box<CallFailure>>) {
+    pub(super) fn answer(&self, stream: StreamId, ticket: Ticket, outcome: Result<BoxedParameters, Box<CallError>>) {
         let answered = self.machine(|machine, network| {
             let index = machine.links.of_stream(stream)?;
             machine.links.answer(network, index, ticket, outcome);

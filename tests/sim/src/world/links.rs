@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use cara_core::distribution::connection_handler::Directive;
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::access::Access;
+use cara_core::services::call::Detail;
 use cara_core::services::hub::Hub;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::{Event, Session};
@@ -18,7 +18,7 @@ use cara_core::time::Instant;
 use super::audited::Audited;
 use super::keys::Keys;
 use super::mail::{LazyPool, SimMailman};
-use super::replies::{Promise, Waiting};
+use super::replies::{CallError, Promise, Waiting};
 use super::service::{BoxedParameters, Handler, Serving};
 use super::streams::Reading;
 use crate::event::{HostId, StreamId};
@@ -49,7 +49,7 @@ pub(super) struct Link {
     unread: Vec<u8>,
     waiting: BTreeMap<CallId, Waiting>,
     acknowledgements: Vec<(u32, Promise<bool>)>,
-    unanswered: Vec<(Ticket, Result<BoxedParameters, Box<CallFailure>>)>,
+    unanswered: Vec<(Ticket, Result<BoxedParameters, Box<CallError>>)>,
     /// Calls of the peer that run.
     running: Vec<Rc<Serving>>,
     /// The newest progress of those that could not be sent.
@@ -194,8 +194,8 @@ impl Links {
         waiting: Option<Waiting>,
     ) -> Result<CallId, Error> {
         let wants_reply = waiting.is_some();
-        let requested =
-            self.with(network, index, |session, cx| session.request(cx, function, parameters, options, wants_reply));
+        let requested = self
+            .with(network, index, |session, cx| session.request(cx, function.into(), parameters, options, wants_reply));
         let id = requested.unwrap_or(Err(Error::NotConnected))?;
         if let (Some(link), Some(waiting)) = (self.link_mut(index), waiting) {
             link.waiting.insert(id, waiting);
@@ -227,7 +227,7 @@ impl Links {
         network: &mut Network,
         index: u16,
         ticket: Ticket,
-        outcome: Result<BoxedParameters, Box<CallFailure>>,
+        outcome: Result<BoxedParameters, Box<CallError>>,
     ) {
         if let Some(link) = self.link_mut(index) {
             link.running.retain(|running| running.ticket != ticket);
@@ -235,7 +235,7 @@ impl Links {
         }
         let answered = self.with(network, index, |session, cx| match &outcome {
             Ok(results) => session.answer(cx, ticket, Ok(results)),
-            Err(failed) => match &failed.failure {
+            Err(failed) => match failed.failure() {
                 Some(failure) if failed.error == failure.into() => session.answer_failed(cx, ticket, failure),
                 _ => session.answer(cx, ticket, Err(failed.error)),
             },
@@ -501,7 +501,7 @@ fn note(
             let failure = if outcome.is_err() { link.session.failure(lent) } else { None };
             if let Some(waiting) = link.waiting.remove(&id) {
                 let outcome = outcome.and_then(|results| link.session.results(&results, lent));
-                waiting.finish(outcome.map_err(|error| CallFailure { error, failure }));
+                waiting.finish(outcome.map_err(|error| CallError::new(error, failure.map(Detail::Service))));
             }
         }
         Some(Event::Progress(id, values)) => {

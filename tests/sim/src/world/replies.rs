@@ -6,7 +6,7 @@ use std::pin::Pin;
 use std::rc::Rc;
 use std::task::{Context, Poll, Waker};
 
-use cara_core::distribution::failure::CallFailure;
+use cara_core::services::call::{self, Detail};
 use cara_core::services::session::ReplyBlock;
 
 use super::service::BoxedParameters;
@@ -66,10 +66,13 @@ impl<T> Future for Promise<T> {
     }
 }
 
+/// Why a call in the simulator has no results.
+pub type CallError = call::CallError<(), Option<Detail>>;
+
 /// A call in flight: a copy of the caller's parameters that the results are put into.
 pub(super) struct Waiting {
     pub(super) parameters: BoxedParameters,
-    pub(super) promise: Promise<Result<BoxedParameters, Box<CallFailure>>>,
+    pub(super) promise: Promise<Result<BoxedParameters, Box<CallError>>>,
     /// The newest that it has told, until it is looked at.
     pub(super) progress: Newest,
 }
@@ -97,7 +100,7 @@ impl Newest {
 }
 
 impl Waiting {
-    pub(super) fn finish(mut self, result: Result<ReplyBlock<'_>, CallFailure>) {
+    pub(super) fn finish(mut self, result: Result<ReplyBlock<'_>, CallError>) {
         let result = match result.map(|block| block.read_into(&mut self.parameters)) {
             Ok(Ok(())) => Ok(self.parameters),
             Ok(Err(error)) => Err(Box::new(error.into())),

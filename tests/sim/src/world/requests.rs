@@ -2,7 +2,6 @@
 
 use std::task::Poll;
 
-use cara_core::distribution::failure::CallFailure;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -10,7 +9,7 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 
 use super::handle::{Peer, UnitHandle};
-use super::replies::{Newest, Promise, Waiting};
+use super::replies::{CallError, Newest, Promise, Waiting};
 use super::service::{BoxedParameters, LeaseWatch, boxed_parameters};
 use crate::event::StreamId;
 
@@ -226,7 +225,7 @@ struct InFlight {
     unit: UnitHandle,
     stream: StreamId,
     id: CallId,
-    promise: Promise<Result<BoxedParameters, Box<CallFailure>>>,
+    promise: Promise<Result<BoxedParameters, Box<CallError>>>,
     progress: Newest,
     has_succeeded: bool,
 }
@@ -254,13 +253,13 @@ impl Watched {
     }
 
     /// Its results, or all that is known of why there are none.
-    pub async fn results(self) -> Result<BoxedParameters, Box<CallFailure>> {
+    pub async fn results(self) -> Result<BoxedParameters, Box<CallError>> {
         self.0.results().await
     }
 }
 
 impl InFlight {
-    async fn results(mut self) -> Result<BoxedParameters, Box<CallFailure>> {
+    async fn results(mut self) -> Result<BoxedParameters, Box<CallError>> {
         let results = self.promise.clone().await;
         self.has_succeeded = results.is_ok();
         results

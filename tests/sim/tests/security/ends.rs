@@ -235,7 +235,7 @@ impl End {
         let mut parameters = Parameters::<64>::sized();
         parameters.add_int("n", 1).expect("room for it");
         let options = RequestOptions { priority: Some(priority), ..RequestOptions::default() };
-        let _ = self.session.request(context!(self), "stop", &parameters, &options, false);
+        let _ = self.session.request(context!(self), "stop".into(), &parameters, &options, false);
         self.session.flush_gathered(context!(self));
     }
 
@@ -249,7 +249,7 @@ impl End {
     /// Asks for `function`, and renews it if it has a lease, until [`Self::give_up`].
     pub(crate) fn order(&mut self, function: &str) {
         let options = RequestOptions::renewing(Renew::Process);
-        let asked = self.session.request(context!(self), function, &Parameters::<64>::sized(), &options, false);
+        let asked = self.session.request(context!(self), function.into(), &Parameters::<64>::sized(), &options, false);
         assert!(asked.is_ok(), "{function}: {asked:?}");
         self.session.flush_gathered(context!(self));
     }

@@ -116,7 +116,7 @@ impl Side {
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
-        let id = self.session.request(context!(self), function, parameters, options, wants_reply)?;
+        let id = self.session.request(context!(self), function.into(), parameters, options, wants_reply)?;
         if wants_reply {
             let mut results: Arguments = Box::default();
             results.copy_from(parameters).unwrap();

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail};
 use cara_examples::say;
-use cara_std::{CommunicationSystem, Parameters, Peer, Renew, RequestOptions};
+use cara_std::{CommunicationSystem, Parameters, Peer, Renew};
 
 /// How long an s_unit may take to tell its functions.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -86,7 +86,7 @@ fn pos_info(agv: &Peer) -> Result<String> {
 fn go_to(agv: &Peer, target: [i64; 2]) -> Result<String> {
     let mut pos = position()?;
     pos.set_value("position", target)?;
-    agv.request_with("go_to", &pos, &RequestOptions::renewing(Renew::Process))?;
+    agv.call("go_to", &mut pos).renewing(Renew::Process).send()?;
     Ok(format!("accepted {target:?}"))
 }
 

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::Result;
 use cara_apps::mechanic;
 use cara_examples::{Network, Stop, ended, log_to_stderr, say};
-use cara_std::{CommunicationSystem, Parameters, Renew, RequestOptions};
+use cara_std::{CommunicationSystem, Parameters, Renew};
 use clap::Parser;
 
 mod console;
@@ -91,8 +91,7 @@ fn listing(options: &Options, transcript: &Transcript) -> Result<CommunicationSy
     coordinates[1] = 2; // 17
     pos.set_value("position", coordinates)?; // 18
     transcript.after(18, format_args!("position set to {:?}", pos.variable::<[i64; 2]>("position")?))?;
-    let wanted = RequestOptions::renewing(Renew::Process);
-    agv_manager.s_units()[0].request_with("go_to", &pos, &wanted)?; // 19
+    agv_manager.s_units()[0].call("go_to", &mut pos).renewing(Renew::Process).send()?; // 19
     transcript.after(19, "accepted")?;
     let mut arguments = Parameters::new(); // 20
     arguments.add_string("fault", 64)?; // 21

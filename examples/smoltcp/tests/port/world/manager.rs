@@ -228,7 +228,7 @@ impl Manager {
     ) -> Result<CallId, Error> {
         let session = self.sessions[link].as_mut().ok_or(Error::NotConnected)?;
         self.due = Instant::START;
-        session.request(context!(self, now), function, &number(value), options, wants_reply)
+        session.request(context!(self, now), function.into(), &number(value), options, wants_reply)
     }
 
     pub(crate) fn poll(&mut self, now: Instant) {

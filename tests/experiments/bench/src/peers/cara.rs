@@ -304,7 +304,8 @@ impl Caller for Echo {
         };
         let options = RequestOptions { delivery, ..RequestOptions::default() };
         let sent = self.parameters.set_value("text", text);
-        let sent = sent.and_then(|()| self.passive.request_with("take", &*self.parameters, &options));
+        let sent = sent
+            .and_then(|()| self.passive.call("take", &mut *self.parameters).with(options).send().map_err(Into::into));
         sent.map(|_| ()).map_err(|error| error.to_string())
     }
 

@@ -12,6 +12,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
+use cara_core::services::call::Caller;
 use cara_core::services::heart::{self, Renew};
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
@@ -240,7 +241,7 @@ impl Node for Rc<BoardNode> {
         parameters: &ParametersView,
         options: RequestOptions,
     ) -> Result<CallId, Error> {
-        self.peer(peer)?.request_with(function, parameters, &options)
+        Ok(self.peer(peer)?.send(function.into(), parameters, &options)?)
     }
 
     fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
@@ -254,7 +255,7 @@ impl Node for Rc<BoardNode> {
         let function = function.to_owned();
         self.board().spawn(async move {
             let result = match asked {
-                Ok(peer) => peer.block_request_with(&function, &mut parameters, &options).await,
+                Ok(peer) => peer.call(&function, &mut parameters).with(options).await.map_err(Error::from),
                 Err(error) => Err(error),
             };
             told.end(result.map(|()| parameters), now());

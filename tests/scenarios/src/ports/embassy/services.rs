@@ -92,11 +92,8 @@ async fn run(
 ) -> Result<(), ServiceError> {
     if let Some(function) = &service.calls_back {
         let patient = RequestOptions { timeout: Some(Duration::from_secs(8)), ..RequestOptions::default() };
-        let called = unit
-            .node(&call.caller)
-            .expect("a caller has joined")
-            .block_request_with(function, parameters, &patient)
-            .await;
+        let called =
+            unit.node(&call.caller).expect("a caller has joined").call(function, parameters).with(patient).await;
         called.map_err(|_| ServiceError::NotReady)?;
     }
     (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters)?;
