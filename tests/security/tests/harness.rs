@@ -10,6 +10,9 @@ use cara_security::tally::{Report, Row};
 use cara_security::target::Target;
 use cara_security::{discovery, permission};
 
+/// A replay that the machine's load has spoiled is tried again.
+const TRIES: usize = 5;
+
 fn row<'r>(report: &'r Report, attack: &str, target: &dyn Target) -> &'r Row {
     let found = report.rows.iter().find(|row| row.attack.contains(attack) && row.target == target.name());
     found.unwrap_or_else(|| panic!("no row for {attack}, {}", target.name()))
@@ -35,12 +38,22 @@ fn a_unit_that_believes_recorded_words_is_found_out() {
     let linux = Linux::new(64, Weakness::Plain).unwrap();
     let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
     for target in [&manager as &dyn Target, &vehicles] {
-        let mut report = Report::default();
-        links::replays(&mut report, target, Extent::Quick, Mode::Plain).unwrap();
-        for attack in ["frames of another link", "frames of the same link", "whole recorded conversations"] {
-            let row = row(&report, attack, target);
-            assert!(row.successes > 0, "{row:?}");
+        let attacks = ["frames of another link", "frames of the same link", "whole recorded conversations"];
+        // What is replayed in a datagram must be read before what follows it in the stream: on a busy machine it may not be.
+        let is_found = || {
+            let mut report = Report::default();
+            links::replays(&mut report, target, Extent::Quick, Mode::Plain).unwrap();
+            attacks.map(|attack| row(&report, attack, target).successes > 0)
+        };
+        let mut found = [false; 3];
+        for _ in 0..TRIES {
+            let now = is_found();
+            found = std::array::from_fn(|index| found[index] || now[index]);
+            if found == [true; 3] {
+                break;
+            }
         }
+        assert_eq!(found, [true; 3], "{attacks:?} at {}", target.name());
     }
 }
 
