@@ -222,8 +222,8 @@ impl<T> Drop for Hold<T> {
 }
 
 impl<T> Handle<T> {
-    /// Nothing waits for a call any more, and what it started is not wanted. While the machine is in use, as in a hook that makes
-    /// safe, it is given up right behind that.
+    /// Nothing waits for a call any more, and what it started is not wanted. While the machine is in use, it is given up right
+    /// behind that.
     fn give_up(&self, call: InFlight) {
         match self.shared.machine.try_borrow_mut() {
             Ok(mut machine) => machine.give_up(&call),

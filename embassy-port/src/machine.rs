@@ -61,7 +61,8 @@ pub(crate) struct Shared<T: 'static> {
 
 type GiveUp<T> = fn(&mut Machine<T>, &InFlight);
 
-/// Calls that the machine gives up when it is free: outside of its cell, for a guard that is dropped by a hook that makes safe.
+/// Calls that the machine gives up when it is free: outside of its cell, for a hold that is dropped while it is in use. Executors on
+/// the heap drop a task with its last waker, which the machine may have.
 pub(crate) struct Unwanted<T: 'static> {
     calls: Cell<heapless::Vec<InFlight, LEASES>>,
     /// A pointer, so that an image that calls nothing has nothing of it.

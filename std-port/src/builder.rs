@@ -22,8 +22,8 @@ use crate::access::{AccessError, watch::FileWatch};
 use crate::config::Capacities;
 use crate::engine::claims::TakeOver;
 use crate::engine::{Engine, EngineParts, HubCell, Keys, message_buffer_bytes, node_storage};
-use crate::error::StartError;
 use crate::error::system_refused;
+use crate::error::{CallError, StartError};
 use crate::handle::{Handle, MUnit, Owner, SUnit};
 use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
@@ -405,6 +405,13 @@ pub enum BuildError {
     /// It does not start.
     #[error(transparent)]
     Start(#[from] StartError),
+}
+
+/// So that a `main` which builds a unit and calls others needs one error.
+impl<F> From<CallError<F>> for BuildError {
+    fn from(error: CallError<F>) -> Self {
+        Self::Unit(error.error)
+    }
 }
 
 /// Where the keys of a unit are to come from.

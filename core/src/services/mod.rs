@@ -176,7 +176,7 @@
 //! {
 //!     let End { hub, session, functions, buffers, wire, .. } = &mut depot;
 //!     let mut cx = Context { now, mailman: wire, buffers, functions, access: None, hub, keys: &mut () };
-//!     session.request(&mut cx, "double", &arguments, &RequestOptions::default(), true)?;
+//!     session.request(&mut cx, "double".into(), &arguments, &RequestOptions::default(), true)?;
 //! }
 //! carry(&mut depot, &mut agv);
 //! assert_eq!(depot.replied, Some(42));
