@@ -413,7 +413,7 @@ impl<'c, C: Caller, Q: Request, W: Watch<Q>, K: Kind<C, Q::Results>> IntoFuture 
     fn into_future(self) -> Self::IntoFuture {
         let Self { caller, request, options, canceller, watch, kind } = self;
         let options = self::options::<Q, W>(options);
-        Reply { caller, frame: request.frame(), options, canceller, watch, pending: None, kind }
+        Reply { caller, frame: request.frame(), options, canceller, watch, pending: None, is_over: false, kind }
     }
 }
 
@@ -426,6 +426,8 @@ pub struct Reply<'c, C: Caller, Q: Request, W = Unwatched, K = Once> {
     canceller: Option<&'c C::Canceller>,
     watch: W,
     pending: Option<C::Pending>,
+    /// It was ready. Polled once more, it must not call again.
+    is_over: bool,
     kind: PhantomData<K>,
 }
 
@@ -442,14 +444,20 @@ impl<C: Caller, Q: Request, W: Watch<Q>, K: Kind<C, Q::Results>> Future for Repl
     type Output = Result<K::Output, CallError<Q::Failure, C::Details>>;
 
     fn poll(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
-        let Self { caller, frame, options, canceller, watch, pending, .. } = self.get_mut();
+        let Self { caller, frame, options, canceller, watch, pending, is_over, .. } = self.get_mut();
+        if core::mem::replace(is_over, true) {
+            return Poll::Ready(Err(Error::Interrupted.into()));
+        }
         Q::open::<C>(frame)?;
         let (callee, parameters) = Q::parts(frame);
         let mut hear = |values: &ParametersView| watch.hear(values);
         let progress: Option<OnProgress<'_>> = if W::WATCHES { Some(&mut hear) } else { None };
         let outgoing = Outgoing { callee, parameters, options, progress, canceller: *canceller };
         match caller.poll(pending, outgoing, cx) {
-            Poll::Pending => Poll::Pending,
+            Poll::Pending => {
+                *is_over = false;
+                Poll::Pending
+            }
             Poll::Ready(Err(error)) => Poll::Ready(Err(error.typed())),
             Poll::Ready(Ok(answered)) => Poll::Ready(finish::<C, Q, K>(caller, frame, answered)),
         }

@@ -99,21 +99,20 @@ impl<T: Send + 'static> Pending<T> {
         outgoing: &mut Outgoing<'_, Canceller>,
         cx: &Context<'_>,
     ) -> Poll<Result<Answered, CallError>> {
-        if let Some(canceller) = outgoing.canceller {
-            if canceller.is_cancelled() && self.stage == Stage::Unsent {
-                return self.over(Err(Error::Cancelled.into()));
-            }
-            self.alarm.set(self.engine.now() + PAUSE, cx.waker());
+        if self.stage == Stage::Unsent && outgoing.canceller.is_some_and(Canceller::is_cancelled) {
+            return self.over(Err(Error::Cancelled.into()));
         }
         let (parameters, options) = (&*outgoing.parameters, outgoing.options);
-        match self.send(outgoing.callee, parameters, options, cx.waker(), PAUSE) {
-            Err(error) => self.over(Err(error)),
-            Ok(Some(at)) => {
-                self.alarm.set(at, cx.waker());
-                Poll::Pending
-            }
-            Ok(None) => self.poll_reply(outgoing, cx),
+        let (polled, again) = match self.send(outgoing.callee, parameters, options, cx.waker(), PAUSE) {
+            Err(error) => return self.over(Err(error)),
+            Ok(again) => (if again.is_some() { Poll::Pending } else { self.poll_reply(outgoing, cx) }, again),
+        };
+        // There is one alarm: the pause before the next try may be longer than the time in which a canceller is heard.
+        let look = outgoing.canceller.filter(|_| polled.is_pending()).map(|_| self.engine.now() + PAUSE);
+        if let Some(at) = again.into_iter().chain(look).min() {
+            self.alarm.set(at, cx.waker());
         }
+        polled
     }
 
     /// Sends it unless it has been sent; when to try again where that is worth while.

@@ -3,7 +3,10 @@
 use std::cell::Cell;
 use std::ops::ControlFlow;
 
-use cara_std::{Definition, Error, Failure, Parameters, ParametersView, Served, ServiceError, ServiceOptions};
+use cara_std::{
+    Canceller, Constraints, Definition, Error, Failure, LinkCounter, Parameters, ParametersView, Served, ServiceError,
+    ServiceOptions,
+};
 
 use super::{once, patient, runtime};
 use crate::details::{assert_blocked, blocked, left, serve};
@@ -59,6 +62,43 @@ fn a_task_awaits_what_a_typed_call_tells() {
     until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 1));
     manager.stop();
     agv.stop();
+}
+
+/// The next call waits for longer than a canceller is heard in.
+#[test]
+fn a_canceller_ends_a_task_s_call_that_is_not_sent_yet_and_no_poll_sends_it_again() {
+    let (manager, agv) = pair();
+    serve(&agv, "go", ServiceOptions::new(), |_, _| Ok(()));
+    let (peer, _) = meet(&manager, &agv);
+    let interval = cara_std::Duration::from_secs(60);
+    manager.set_constraints(Constraints { minimum_interval: interval, ..manager.constraints() }).unwrap();
+    peer.block_request("go", &mut number(1)).unwrap();
+    let (canceller, sent) = (Canceller::new(), manager.counted(LinkCounter::RequestsSent));
+    runtime().block_on(async {
+        let mut parameters = number(1);
+        let call = peer.call("go", &mut parameters).timeout(cara_std::Duration::from_secs(120));
+        let mut call = call.cancelled_by(&canceller).into_future();
+        // It waits for its turn by then: this poll is the last before the alarm.
+        assert_eq!(once(&mut call).await, None);
+        let button = canceller.clone();
+        std::thread::spawn(move || {
+            std::thread::sleep(std::time::Duration::from_millis(100));
+            button.cancel();
+        });
+        let began = std::time::Instant::now();
+        assert_eq!(call.await, Err(Error::Cancelled.into()));
+        assert!(began.elapsed() < std::time::Duration::from_secs(30), "the next try is in a minute");
+    });
+    manager
+        .set_constraints(Constraints { minimum_interval: cara_std::Duration::ZERO, ..manager.constraints() })
+        .unwrap();
+    runtime().block_on(async {
+        let mut parameters = number(1);
+        let mut call = peer.call("no_such", &mut parameters).into_future();
+        assert_eq!((&mut call).await, Err(Error::UnknownFunction.into()));
+        assert_eq!((&mut call).await, Err(Error::Interrupted.into()), "it is over");
+    });
+    assert_eq!(manager.counted(LinkCounter::RequestsSent), sent);
 }
 
 /// The handler goes on until its call is given up, which its caller does by dropping the reply.
