@@ -169,7 +169,7 @@ impl Refusal {
 
     /// The refusal of a byte on the wire. A unit that speaks other versions has told them in its hello before; only version
     /// 1 did not.
-    pub const fn from_wire(code: u8) -> Self {
+    pub(crate) const fn from_wire(code: u8) -> Self {
         match code {
             1 => Self::Version(Versions { first: 1, last: 1 }),
             2 => Self::Fleet,

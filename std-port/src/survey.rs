@@ -71,7 +71,6 @@ pub struct Survey {
     voice: UdpSocket,
     set: Epoll,
     keys: SurveyKeys,
-    asks_in_plain: bool,
     opened: Instant,
     identity: Identity,
     epoch: Epoch,
@@ -105,7 +104,6 @@ impl Survey {
             voice,
             set,
             keys: SurveyKeys::default(),
-            asks_in_plain: true,
             opened: Instant::now(),
             identity: Identity::s_unit(NAME, std::process::id())?,
             epoch: Epoch(random()),
@@ -122,12 +120,6 @@ impl Survey {
     /// Asks secured fleets as well, those of which there are keys.
     pub fn with_keys(mut self, keys: SurveyKeys) -> Self {
         self.keys = keys;
-        self
-    }
-
-    /// Asks secured fleets alone.
-    pub fn without_plain(mut self) -> Self {
-        self.asks_in_plain = false;
         self
     }
 
@@ -226,10 +218,10 @@ impl Survey {
             known: Default::default(),
             skipped: 0,
         };
-        let plain = self.asks_in_plain.then(|| encoded(&question(first.wrapping_add(1)), fleet, &Plain));
+        let plain = encoded(&question(first.wrapping_add(1)), fleet, &Plain);
         let secured = self.keys.signers(fleet).zip(2..);
         let secured = secured.map(|(signer, place)| encoded(&question(first.wrapping_add(place)), fleet, &signer));
-        let questions: Vec<_> = plain.into_iter().chain(secured).collect();
+        let questions: Vec<_> = std::iter::once(plain).chain(secured).collect();
         self.sequence = first.wrapping_add(1).wrapping_add(questions.len() as u32);
         questions
     }

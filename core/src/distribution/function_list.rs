@@ -97,15 +97,9 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         self.table.function(usize::from(slot.0))
     }
 
-    /// The handler of the function in a place, for one that changes with each call.
-    pub fn handler_mut(&mut self, slot: Slot) -> Option<&mut H> {
-        let entry = self.table.entries.get_mut(usize::from(slot.0))?;
-        entry.function.as_mut().map(|stored| &mut stored.handler)
-    }
-
     /// The function that a request names: [`Error::StaleFunction`] if it was removed or replaced since,
     /// [`Error::UnknownFunction`] if there never was one.
-    pub fn lookup(&self, slot: Slot, generation: Generation) -> Result<Function<'_, H>, Error> {
+    pub(crate) fn lookup(&self, slot: Slot, generation: Generation) -> Result<Function<'_, H>, Error> {
         let entry = self.table.entries.get(usize::from(slot.0)).ok_or(Error::UnknownFunction)?;
         if entry.generation != generation {
             return Err(Error::StaleFunction);
@@ -124,7 +118,7 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
     }
 
     /// How many places there are, empty ones included.
-    pub fn places(&self) -> u16 {
+    pub(crate) fn places(&self) -> u16 {
         u16::try_from(self.table.entries.len()).unwrap_or(u16::MAX)
     }
 
@@ -147,7 +141,6 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
 /// The functions that a peer has published to this unit (paper: `their_function_list`).
 pub struct TheirFunctionList<S: Storage> {
     table: Table<S, ()>,
-    only: Option<&'static [&'static str]>,
     skipped: u32,
     /// Functions and bytes of signatures that it may grow to.
     most: (usize, usize),
@@ -156,18 +149,13 @@ pub struct TheirFunctionList<S: Storage> {
 impl<S: Storage> TheirFunctionList<S> {
     /// An empty list with room for as many functions as there are entries, and for `bytes` of signatures.
     pub fn new(entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> Self {
-        Self { table: Table::new(entries, bytes), only: None, skipped: 0, most: (0, 0) }
+        Self { table: Table::new(entries, bytes), skipped: 0, most: (0, 0) }
     }
 
     /// Lets it grow to so many functions, and so many bytes of signatures, where the storage has an allocator. It keeps help on
     /// functions then, as long as there is room for all functions.
-    pub const fn let_grow(&mut self, functions: usize, bytes: usize) {
+    pub(crate) const fn let_grow(&mut self, functions: usize, bytes: usize) {
         self.most = (functions, bytes);
-    }
-
-    /// Keeps functions of these names only from now on; the others count as skipped.
-    pub const fn keep_only(&mut self, names: &'static [&'static str]) {
-        self.only = Some(names);
     }
 
     /// Applies what the peer published about one of its slots; it replaces the function in the slot and any of the same
@@ -175,7 +163,7 @@ impl<S: Storage> TheirFunctionList<S> {
     ///
     /// On an error what was in the slot is gone, and the function counts as skipped: [`Error::Full`], or [`Error::Malformed`]
     /// for a signature that this version cannot read.
-    pub fn insert(
+    pub(crate) fn insert(
         &mut self,
         slot: Slot,
         generation: Generation,
@@ -193,10 +181,6 @@ impl<S: Storage> TheirFunctionList<S> {
         let name = signature.name();
         if let Some(index) = self.table.find(name) {
             self.table.take(index);
-        }
-        if self.only.is_some_and(|names| !names.contains(&name)) {
-            self.skipped = self.skipped.saturating_add(1);
-            return Ok(());
         }
         // A list that does not grow, as on a board, has no use for help. Rather all without it than one function skipped.
         let keeps_help = cfg!(feature = "help") && self.most.1 > 0;

@@ -64,7 +64,7 @@ impl<'b> Items<'b> {
     }
 
     /// The bytes of the items that follow.
-    pub const fn rest(&self) -> &'b [u8] {
+    pub(crate) const fn rest(&self) -> &'b [u8] {
         self.rest
     }
 }

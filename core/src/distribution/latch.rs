@@ -61,7 +61,7 @@ impl LatchWord {
     }
 
     /// Takes the latch of another one along, unless it was reset from just that stop.
-    pub fn inherit(&self, from: &Self) {
+    pub(crate) fn inherit(&self, from: &Self) {
         let at = from.inhibited.load(Ordering::Acquire);
         let Some(latch) = from.latch().filter(|_| !self.is_inhibited()) else { return };
         // What is not latched was cleared of the last stop that it has seen, so this differs from that.

@@ -291,12 +291,12 @@ impl<'b> FailureDetails<'b> {
     }
 
     /// Bytes of a text with its length and padding.
-    pub const fn text_bytes(text: &str) -> usize {
+    pub(crate) const fn text_bytes(text: &str) -> usize {
         text.len().next_multiple_of(8).saturating_add(8)
     }
 
     /// Writes a text, which takes [`text_bytes`](Self::text_bytes).
-    pub fn put_text(text: &str, to: &mut impl Put) {
+    pub(crate) fn put_text(text: &str, to: &mut impl Put) {
         to.put(&(text.len() as u64).to_le_bytes());
         to.put(text.as_bytes());
         to.put([0; 8].get(..text.len().wrapping_neg() & 7).unwrap_or_default());

@@ -35,7 +35,7 @@ impl Type {
     pub const FLAT: [Self; 5] = [Self::Int, Self::Float, Self::String, Self::Bool, Self::Bytes];
 
     /// The type that travels as `byte`.
-    pub const fn from_wire(byte: u8) -> Option<Self> {
+    pub(crate) const fn from_wire(byte: u8) -> Option<Self> {
         match byte {
             0 => Some(Self::Int),
             1 => Some(Self::Float),

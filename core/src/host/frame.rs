@@ -130,7 +130,7 @@ pub fn encode(frame: &Frame<'_>, overhead: usize, out: &mut [u8]) -> usize {
 }
 
 /// Bytes on the wire of a frame that is no chunk.
-pub fn encoded_length(frame: &Frame<'_>, overhead: usize) -> usize {
+pub(crate) fn encoded_length(frame: &Frame<'_>, overhead: usize) -> usize {
     let payload = kind_and_payload(frame).map_or(0, |(_, payload)| payload.len());
     payload.saturating_add(HEADER_BYTES).saturating_add(1).saturating_add(overhead)
 }
@@ -151,7 +151,7 @@ fn kind_and_payload<'b>(frame: &'b Frame<'_>) -> Option<(u8, &'b [u8])> {
 }
 
 /// Whether the frame at the start of `bytes` (not sealed yet) is a [`Frame::TURN`].
-pub fn is_turn(bytes: &[u8], overhead: usize) -> bool {
+pub(crate) fn is_turn(bytes: &[u8], overhead: usize) -> bool {
     bytes.get(HEADER_BYTES) == Some(&PROOF) && first_frame_length(bytes) == Some(encoded_length(&Frame::TURN, overhead))
 }
 
@@ -287,7 +287,7 @@ pub fn first_frame_length(bytes: &[u8]) -> Option<usize> {
 }
 
 /// Whether the frame at the start of `bytes` (not sealed yet) ends a message, or is no chunk at all.
-pub fn ends_message(bytes: &[u8]) -> bool {
+pub(crate) fn ends_message(bytes: &[u8]) -> bool {
     match bytes.get(HEADER_BYTES) {
         Some(kind) if kind & CHUNK != 0 => kind & LAST != 0,
         _ => true,

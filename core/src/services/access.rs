@@ -116,7 +116,7 @@ impl<N> Who<N> {
 
 impl<N: AsRef<str>> Who<N> {
     /// Whether the rule matches `principal`.
-    pub fn means(&self, principal: Principal<'_>) -> bool {
+    pub(crate) fn means(&self, principal: Principal<'_>) -> bool {
         match (self, principal) {
             (Self::Operator, Principal::Operator) => true,
             (Self::Node { role, name, id }, Principal::Node(identity)) => {
@@ -140,7 +140,7 @@ pub enum Functions<L = &'static [&'static str]> {
 
 impl<L> Functions<L> {
     /// Whether the rule is about a function.
-    pub fn contain<N: AsRef<str>>(&self, function: &str) -> bool
+    pub(crate) fn contain<N: AsRef<str>>(&self, function: &str) -> bool
     where
         L: AsRef<[N]>,
     {

@@ -42,7 +42,7 @@ struct Declared {
 
 impl Callee<'static> {
     /// A function of an interface: a peer that has another version of it is not called.
-    pub fn declared(signature: Signature<'static>) -> Self {
+    pub(crate) fn declared(signature: Signature<'static>) -> Self {
         Self { name: signature.name(), declared: Some(Declared { signature, check: Mismatch::check }) }
     }
 }

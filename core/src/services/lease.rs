@@ -311,7 +311,7 @@ impl Lease {
     }
 
     /// Takes a latch along: that of the service that this one's replaces, or of the unit that it is new in.
-    pub fn inherit(&self, from: &LatchWord) {
+    pub(crate) fn inherit(&self, from: &LatchWord) {
         self.latch.inherit(from);
         if self.is_inhibited() {
             self.seen_dead.store(true, Ordering::Release);
@@ -319,7 +319,7 @@ impl Lease {
     }
 
     /// Its latch.
-    pub const fn latch_word(&self) -> &LatchWord {
+    pub(crate) const fn latch_word(&self) -> &LatchWord {
         &self.latch
     }
 
@@ -345,7 +345,7 @@ impl Lease {
     }
 
     /// Whether an order is dead and has not been ended: it was cut or inhibited, or a reader saw its time pass.
-    pub fn is_cut(&self, order: Order) -> bool {
+    pub(crate) fn is_cut(&self, order: Order) -> bool {
         self.seen_dead.load(Ordering::Acquire) && self.is_held_by(order)
     }
 

@@ -31,7 +31,7 @@ pub struct Value<'v> {
 
 impl Value<'_> {
     /// Its age at `now`.
-    pub fn age_at(&self, now: Instant) -> Duration {
+    pub(crate) fn age_at(&self, now: Instant) -> Duration {
         self.age + now.since(self.published)
     }
 }

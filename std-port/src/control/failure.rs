@@ -19,7 +19,7 @@ impl Failure {
     }
 
     /// A failure for which the unit lacks something.
-    pub fn resource(error: &str, text: impl Display) -> Self {
+    pub(crate) fn resource(error: &str, text: impl Display) -> Self {
         Self::new(Cause::Resource, error, text)
     }
 

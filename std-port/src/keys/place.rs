@@ -40,7 +40,7 @@ pub fn find(identity: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
 }
 
 /// As [`find`], for an s_unit that joins `manager`: where there are no keys, the error's command makes those of both.
-pub fn find_joining(identity: &Identity, manager: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
+pub(crate) fn find_joining(identity: &Identity, manager: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
     Environment::of_process().find(identity, Some(manager), fleet)
 }
 
@@ -51,14 +51,14 @@ pub fn own_folder() -> Option<PathBuf> {
 }
 
 /// The folders in which keys are looked for.
-pub fn folders() -> Vec<PathBuf> {
+pub(crate) fn folders() -> Vec<PathBuf> {
     let mut folders = Environment::of_process().folders();
     folders.retain(|folder| folder.is_dir());
     folders
 }
 
 /// The key files in those folders, of all owners, by name; or the one that `CARA_KEYS` names.
-pub fn rings() -> Vec<PathBuf> {
+pub(crate) fn rings() -> Vec<PathBuf> {
     if let Some(file) = Environment::of_process().file() {
         return vec![file.to_owned()];
     }

@@ -130,7 +130,8 @@ impl KeyRing {
     }
 
     /// The key for discovery of one generation.
-    pub fn discovery_in(&self, generation: u32) -> Option<&DiscoveryKey> {
+    #[cfg(test)]
+    pub(crate) fn discovery_in(&self, generation: u32) -> Option<&DiscoveryKey> {
         self.discoveries().find(|(number, _)| *number == generation).map(|(_, key)| key)
     }
 

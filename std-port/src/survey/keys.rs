@@ -68,14 +68,14 @@ impl SurveyKeys {
     }
 
     /// Adds those of a unit's ring.
-    pub fn add_ring(&mut self, ring: &KeyRing) {
+    pub(crate) fn add_ring(&mut self, ring: &KeyRing) {
         for (generation, key) in ring.discoveries() {
             self.add(ring.fleet(), generation, key.clone(), generation == ring.generation());
         }
     }
 
     /// Adds those of a fleet's root: of generations that are over as well, so that a unit that was left behind is known.
-    pub fn add_root(&mut self, root: &FleetKeys) {
+    pub(crate) fn add_root(&mut self, root: &FleetKeys) {
         let (fleet, used) = (root.members().fleet(), root.members().generation());
         let newest = root.members().generations().max().unwrap_or(used);
         for generation in newest.saturating_sub(OLD).max(1)..=newest {

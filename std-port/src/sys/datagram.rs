@@ -72,7 +72,7 @@ impl Datagrams {
     }
 
     /// The port of the own socket, from which everything is sent.
-    pub const fn own_port(&self) -> u16 {
+    pub(crate) const fn own_port(&self) -> u16 {
         self.own_port
     }
 
@@ -82,7 +82,7 @@ impl Datagrams {
     }
 
     /// The descriptor to watch for one of the sockets.
-    pub fn fd(&self, socket: Socket) -> BorrowedFd<'_> {
+    pub(crate) fn fd(&self, socket: Socket) -> BorrowedFd<'_> {
         match socket {
             Socket::Shared => self.shared.as_fd(),
             Socket::Own => self.own.as_fd(),
@@ -118,7 +118,7 @@ impl Datagrams {
     }
 
     /// The same from an address of this host.
-    pub fn send_from(&self, from: Ipv4Addr, to: SocketAddr, datagram: &[u8]) -> bool {
+    pub(crate) fn send_from(&self, from: Ipv4Addr, to: SocketAddr, datagram: &[u8]) -> bool {
         let SocketAddr::V4(to) = to else { return self.send_to(to, datagram) };
         let source = in_pktinfo {
             ipi_ifindex: 0,
@@ -169,7 +169,7 @@ impl Datagrams {
     }
 
     /// The interfaces that are used, with those that are down.
-    pub fn targets(&self) -> Arc<[Interface]> {
+    pub(crate) fn targets(&self) -> Arc<[Interface]> {
         let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
         if targets.asked.elapsed() >= REFRESH {
             targets.look(self.interfaces);
@@ -179,14 +179,14 @@ impl Datagrams {
 
     /// Names of the interfaces on which broadcasts can go out, as any unit of the process has seen them half a second ago at
     /// most.
-    pub fn usable(&self) -> Vec<String> {
+    pub(crate) fn usable(&self) -> Vec<String> {
         let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
         targets.look(self.interfaces);
         targets.list.iter().filter(|interface| interface.is_usable()).map(|interface| interface.name.clone()).collect()
     }
 
     /// Whether nodes that this unit may look for can be reached on the interfaces of these names.
-    pub fn reaches_others(&self, usable: &[String]) -> bool {
+    pub(crate) fn reaches_others(&self, usable: &[String]) -> bool {
         let targets = self.targets();
         let elsewhere = |interface: &Interface| !interface.address.is_loopback() && usable.contains(&interface.name);
         match self.interfaces {

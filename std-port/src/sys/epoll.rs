@@ -44,7 +44,7 @@ impl Interest {
     pub const WRITE_ONCE: Self = Self { readable: false, writable: true, trigger: Trigger::OneShot };
 
     /// The same, and writable as well.
-    pub const fn and_writable(self) -> Self {
+    pub(crate) const fn and_writable(self) -> Self {
         Self { writable: true, ..self }
     }
 
@@ -142,11 +142,6 @@ impl Epoll {
     /// Watches `fd` for something else, arms a one-shot descriptor again, or re-reports an edge that is still there.
     pub fn modify(&self, fd: impl AsFd, token: u64, interest: Interest) -> io::Result<()> {
         Ok(epoll::modify(&self.set, fd, EventData::new_u64(token), interest.flags())?)
-    }
-
-    /// Keeps `fd` in the set without reporting data or room; only errors and a full hang-up are reported, once.
-    pub fn disarm(&self, fd: impl AsFd, token: u64) -> io::Result<()> {
-        Ok(epoll::modify(&self.set, fd, EventData::new_u64(token), EventFlags::ONESHOT)?)
     }
 
     /// Takes `fd` out of the set; one that is not in it is fine.
@@ -270,18 +265,6 @@ mod tests {
         far.write_all(b"x").unwrap();
         assert!(ready(&set, NOW).is_empty());
         set.modify(&near, 1, Interest::READ_ONCE).unwrap();
-        assert_eq!(ready(&set, LIMIT).len(), 1);
-    }
-
-    #[test]
-    fn a_disarmed_descriptor_is_silent_and_an_armed_one_reports_what_came_meanwhile() {
-        let set = Epoll::new().unwrap();
-        let (near, mut far) = UnixStream::pair().unwrap();
-        set.add(&near, 1, Interest::READ_EDGE).unwrap();
-        set.disarm(&near, 1).unwrap();
-        far.write_all(b"x").unwrap();
-        assert!(ready(&set, NOW).is_empty());
-        set.modify(&near, 1, Interest::READ_EDGE).unwrap();
         assert_eq!(ready(&set, LIMIT).len(), 1);
     }
 

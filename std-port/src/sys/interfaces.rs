@@ -61,7 +61,7 @@ pub struct Interface {
 
 impl Interface {
     /// Whether broadcasts can go out here.
-    pub const fn is_usable(&self) -> bool {
+    pub(crate) const fn is_usable(&self) -> bool {
         self.up && self.broadcast.is_some()
     }
 }

@@ -10,7 +10,7 @@ const BESIDES: u64 = 64;
 /// Raises the soft limit of open files to the hard one, so that as many links fit as the administrator allows.
 ///
 /// Most systems begin with 1,024, for programs that still use `select`. Returns the limit in force.
-pub fn raise() -> u64 {
+pub(crate) fn raise() -> u64 {
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     let Some(soft) = current else { return u64::MAX };
     if maximum.is_some_and(|hard| hard <= soft) {
@@ -42,7 +42,7 @@ pub fn most_links() -> u64 {
 
 /// How many descriptors the process may open beyond this one. It is the newest, and the system gives the lowest number that is
 /// free: so all below are taken.
-pub fn left_above(newest: impl AsFd) -> u64 {
+pub(crate) fn left_above(newest: impl AsFd) -> u64 {
     let number = u64::try_from(newest.as_fd().as_raw_fd()).unwrap_or(0);
     getrlimit(Resource::Nofile).current.map_or(u64::MAX, |limit| limit.saturating_sub(number + 1))
 }

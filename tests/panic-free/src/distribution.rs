@@ -62,7 +62,6 @@ entry!(parameters_placed, {
     let parameters = parameters();
     keep(parameters.lay_out(*unknown::<Signature<'static>>()));
     keep(parameters.value_of(*unknown()));
-    keep(parameters.target_of(*unknown()).is_ok());
 });
 
 entry!(typed_signatures, {
@@ -112,7 +111,7 @@ entry!(values, {
 
 entry!(types, {
     let kind: &Type = unknown();
-    keep((Type::from_wire(*unknown()), kind.word(), kind.is_fixed(), kind.width(), kind.bytes_of(*unknown())));
+    keep((kind.word(), kind.is_fixed(), kind.width(), kind.bytes_of(*unknown())));
 });
 
 entry!(definitions, {
@@ -154,19 +153,15 @@ entry!(own_list, {
     keep(list.add_signature(*unknown::<Signature<'static>>(), *unknown(), *unknown()));
     keep(list.replace_signature(*unknown::<Signature<'static>>(), *unknown(), *unknown()));
     keep(list.remove(unknown_text()));
-    keep((list.find(unknown_text()), list.function(*unknown()), list.lookup(*unknown(), *unknown())));
-    keep(list.handler_mut(*unknown()));
+    keep((list.find(unknown_text()), list.function(*unknown())));
     keep((list.generation(*unknown()), list.len(), list.is_empty()));
-    keep((list.stopped(), list.places()));
+    keep(list.stopped());
     drain(list.iter());
 });
 
 entry!(their_list, {
     keep(TheirFunctionList::<Lent>::new(unknown_slice(), unknown_slice()));
     let list: &mut TheirFunctionList<Lent> = unknown();
-    list.keep_only(*unknown());
-    list.let_grow(*unknown(), *unknown());
-    keep(list.insert(*unknown(), *unknown(), *unknown(), unknown_slice()));
     keep(list.remove(*unknown()));
     keep((list.find(unknown_text()), list.named(unknown_text()), list.function(*unknown())));
     keep((list.len(), list.is_empty(), list.skipped()));

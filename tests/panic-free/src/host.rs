@@ -37,9 +37,7 @@ type AnyLink = Link<Lent, AnyCipher>;
 entry!(frames, {
     keep(Frame::parse(unknown_slice()));
     keep(frame::encode(unknown(), *unknown(), unknown_slice()));
-    keep((frame::first_frame_length(unknown_slice()), frame::ends_message(unknown_slice())));
-    keep(frame::is_turn(unknown_slice(), *unknown()));
-    keep(frame::encoded_length(&Frame::Proof(unknown_slice()), *unknown()));
+    keep(frame::first_frame_length(unknown_slice()));
 });
 
 entry!(chunks, {
@@ -62,23 +60,18 @@ entry!(link_receives, {
         keep(link.view(place.last(*unknown()), unknown_slice()));
     }
     keep(link.view(*unknown::<Place>(), unknown_slice()));
-    keep(link.view(Place::lent(*unknown()), unknown_slice()));
 });
 
 entry!(link_sends, {
     let link: &mut AnyLink = unknown();
     let pool: &mut Pool<Lent> = unknown();
-    let write = |writer: &mut ChunkWriter<'_>| writer.put(unknown_slice());
-    keep(link.send_message(&mut AnyMailman, pool, *unknown(), *unknown(), *unknown(), write));
     keep(link.send_frame(unknown()));
     keep(link.flush(&mut AnyMailman, pool));
-    keep((link.wants_to_write(), link.queued(), link.id()));
+    keep((link.wants_to_write(), link.id()));
 });
 
 entry!(link_set, {
     let link: &mut AnyLink = unknown();
-    link.set_peer_limits(*unknown());
-    link.set_message_limit(*unknown());
     link.release(unknown::<Pool<Lent>>());
 });
 
@@ -94,7 +87,6 @@ entry!(link_counters, {
 entry!(liveness, {
     let mut liveness = Liveness::new(*unknown(), *unknown());
     liveness.heard(*unknown());
-    keep((liveness.heard_datagram(*unknown()), liveness.reported(*unknown(), *unknown(), *unknown())));
     keep((liveness.hears(), liveness.is_heard(), liveness.is_deaf(), liveness.stream_silent_for(*unknown())));
     keep((liveness.deadline(), liveness.poll(*unknown(), *unknown())));
 });

@@ -2,7 +2,7 @@
 
 use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function::{Definition, Signature, VariableSpec, VariableSpecs};
-use cara_core::distribution::message::{self, FailureDetails};
+use cara_core::distribution::message;
 use cara_core::distribution::nested::{Elements, Fields};
 use cara_core::distribution::parameters::{Parameters, ParametersView, Value};
 use cara_core::distribution::value::Type;
@@ -75,7 +75,5 @@ entry!(failures, {
     keep((failure.code(), failure.error(), failure.values().len(), failure.is_cut()));
     keep(failure.text());
     show(&failure);
-    keep((message::encode_progress(*unknown()), FailureDetails::text_bytes(unknown_text())));
-    let mut writer = cara_core::distribution::block::SliceWriter::new(unknown_slice());
-    FailureDetails::put_text(unknown_text(), &mut writer);
+    keep(message::encode_progress(*unknown()));
 });

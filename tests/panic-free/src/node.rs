@@ -41,7 +41,6 @@ entry!(node_asked, {
 
 entry!(node_set, {
     node().set_constraints(*unknown());
-    node().set_maximum_nodes(*unknown());
     keep((node().nonce(), node().hello(*unknown(), *unknown(), *unknown())));
     node().choose(unknown_slice());
     node().expect(*unknown());
@@ -66,7 +65,7 @@ entry!(node_hears, {
     node().claim_kept(unknown(), *unknown(), *unknown());
     node().left_unread();
     node().store_claims();
-    keep((node().claim(), node().take_claim_event(), node().obeyed(unknown()), node().forget_claim(unknown())));
+    keep((node().claim(), node().take_claim_event(), node().obeyed(unknown())));
 });
 
 entry!(node_dials, {

@@ -229,13 +229,6 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// Obeys any claim of this manager again; whether there was one. Only while no order of it is live.
-    pub fn forget_claim(&mut self, manager: &Identity) -> bool {
-        let before = self.claims.obeyed.len();
-        self.claims.obeyed.retain(|(identity, _)| identity != manager);
-        self.claims.obeyed.len() != before
-    }
-
     /// What the port is to do about claims; one at a time, until there is none.
     pub fn take_claim_event(&mut self) -> Option<ClaimEvent> {
         if P::MANAGES

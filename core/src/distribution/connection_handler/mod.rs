@@ -269,7 +269,8 @@ impl<P: Port> Node<P> {
     }
 
     /// Changes the most nodes that may be connected at a time.
-    pub fn set_maximum_nodes(&mut self, maximum_nodes: u16) {
+    #[cfg(test)]
+    pub(crate) fn set_maximum_nodes(&mut self, maximum_nodes: u16) {
         self.config.constraints.maximum_nodes = maximum_nodes;
     }
 

@@ -107,7 +107,7 @@ impl Liveness {
     }
 
     /// A datagram of the session arrived; whether they have begun to pass.
-    pub fn heard_datagram(&mut self, now: Instant) -> bool {
+    pub(crate) fn heard_datagram(&mut self, now: Instant) -> bool {
         self.silence = Silence::new(now, self.period);
         self.datagrams = Silence::new(now, self.period);
         self.next_question = Instant::FAR_FUTURE;
@@ -117,7 +117,7 @@ impl Liveness {
 
     /// The peer told what it receives, when `sent` bytes had been written into the stream. When the stream is dead: whether more
     /// than one segment is missing there.
-    pub fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<bool> {
+    pub(crate) fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<bool> {
         self.is_heard = report.hears;
         let lossy = self.missed_at.is_some_and(|at| now < at + LOSSY);
         self.delivery.reported(now, sent, report, self.stream_heard, lossy).map(is_long)

@@ -62,7 +62,7 @@ pub struct Place {
 
 impl Place {
     /// All of a lent slice of `length` bytes.
-    pub const fn lent(length: usize) -> Self {
+    pub(crate) const fn lent(length: usize) -> Self {
         Self { store: Store::Lent, start: 0, end: length }
     }
 
@@ -145,13 +145,13 @@ impl<S: Storage, C: Seal> Link<S, C> {
     }
 
     /// Sets the longest chunk that the peer takes, as its hello told.
-    pub fn set_peer_limits(&mut self, chunk: usize) {
+    pub(crate) fn set_peer_limits(&mut self, chunk: usize) {
         self.sender.set_chunk(chunk.max(MINIMUM_CHUNK_BYTES));
     }
 
     /// Raises the longest message that this unit accepts. A limit below the one advertised to the peer changes nothing
     /// here, since longer messages may be in flight: the reader of the message refuses them.
-    pub fn set_message_limit(&mut self, limit: usize) {
+    pub(crate) fn set_message_limit(&mut self, limit: usize) {
         self.receiver.raise_message_limit(limit);
     }
 
@@ -188,7 +188,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
     /// unless it is to `hold`. Refused before the first byte when it cannot be kept: [`Error::Full`] when it can be
     /// later, [`Error::TooLarge`] when it never can.
     #[cfg_attr(target_os = "none", inline(never))]
-    pub fn send_message<E>(
+    pub(crate) fn send_message<E>(
         &mut self,
         mailman: &mut dyn Mailman<E>,
         buffers: &mut dyn Buffers<S>,
@@ -277,7 +277,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
     }
 
     /// Bytes that wait to be written.
-    pub fn queued(&self) -> usize {
+    pub(crate) fn queued(&self) -> usize {
         self.sender.queued()
     }
 

@@ -320,11 +320,6 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The link's index.
-    pub const fn link(&self) -> LinkId {
-        self.link.id()
-    }
-
     /// This unit opened the connection.
     pub const fn dialed(&self) -> bool {
         !P::MANAGES || self.dialed
