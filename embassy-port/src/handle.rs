@@ -152,7 +152,7 @@ impl<T> Handle<T> {
     }
 
     /// How many links the unit has room for.
-    pub(crate) fn links(&self) -> u16 {
+    pub fn links(&self) -> u16 {
         self.look(|machine| machine.indices().end)
     }
 
