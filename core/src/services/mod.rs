@@ -246,11 +246,11 @@ impl<P: Port> Keys<P> for () {
 pub trait OwnFunctions {
     /// [`FunctionList::function`]
     fn function(&self, slot: Slot) -> Option<Function<'_, dyn Service>>;
-    /// [`FunctionList::lookup`]
+    /// The function that a request names, or why there is none.
     fn lookup(&self, slot: Slot, generation: Generation) -> Result<Function<'_, dyn Service>, Error>;
     /// [`FunctionList::generation`]
     fn generation(&self, slot: Slot) -> Option<Generation>;
-    /// [`FunctionList::places`]
+    /// How many slots there are, empty ones included.
     fn places(&self) -> u16;
     /// [`FunctionList::stopped`]
     fn stopped(&self) -> &LatchWord;
