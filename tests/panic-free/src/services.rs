@@ -72,7 +72,7 @@ fn taken<T: 'static>() -> Option<T> {
 entry!(own_functions, {
     let functions: &dyn OwnFunctions = unknown::<FunctionList<Lent, Handler>>();
     keep((functions.function(*unknown()).is_some(), functions.generation(*unknown())));
-    if let Some(function) = functions.function(*unknown()) {
+    if let Ok(function) = functions.lookup(*unknown(), *unknown()) {
         let service = function.handler;
         keep((service.begin_lease(*unknown(), *unknown(), unknown()), service.renew_lease(*unknown(), *unknown())));
         service.inhibit(*unknown(), *unknown());
