@@ -344,7 +344,6 @@ impl ParametersView {
     }
 
     /// The variable in a place, to be set.
-    #[doc(hidden)]
     pub(crate) fn target_of(&mut self, place: usize) -> Result<Target<'_>, Error> {
         if place < self.len() { self.target(place).ok_or(Error::UnknownVariable) } else { Err(Error::UnknownVariable) }
     }

@@ -108,4 +108,5 @@ entry!(frames_of_calls, {
     keep(frame.lay_out::<Peer>(*unknown()).is_ok());
     keep(frame.parts().0.name());
     keep(frame.len());
+    keep(unknown::<Callee<'static>>().check(*unknown()).is_ok());
 });

@@ -38,7 +38,7 @@ entry!(claims, {
 
 entry!(pools, {
     let mut pool: Pool<Lent> = Pool::new(unknown_slice());
-    keep((pool.take(), pool.free()));
+    keep((pool.take(), pool.take_leaving(*unknown()), pool.free()));
     pool.give(unknown_slice());
     keep(pool);
 });

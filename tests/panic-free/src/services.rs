@@ -5,6 +5,7 @@ use core::net::SocketAddrV4;
 
 use cara_core::config::{Mode, VERSIONS};
 use cara_core::distribution::datagram;
+use cara_core::distribution::function::Signature;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
@@ -72,6 +73,7 @@ fn taken<T: 'static>() -> Option<T> {
 entry!(own_functions, {
     let functions: &dyn OwnFunctions = unknown::<FunctionList<Lent, Handler>>();
     keep((functions.function(*unknown()).is_some(), functions.generation(*unknown())));
+    keep((functions.places(), functions.stopped()));
     if let Ok(function) = functions.lookup(*unknown(), *unknown()) {
         let service = function.handler;
         keep((service.begin_lease(*unknown(), *unknown(), unknown()), service.renew_lease(*unknown(), *unknown())));
@@ -84,6 +86,18 @@ entry!(own_functions, {
             stream.newest(&mut |value| keep(value));
         }
     }
+});
+
+// What moves leaves its latch to what takes its place: only a list of handlers with leases gets there.
+entry!(own_functions_changed, {
+    let list = unknown::<FunctionList<Lent, Handler>>();
+    if let Some(handler) = taken() {
+        keep(list.add_signature(*unknown::<Signature<'static>>(), *unknown(), handler).is_ok());
+    }
+    if let Some(handler) = taken() {
+        keep(list.replace_signature(*unknown::<Signature<'static>>(), *unknown(), handler).is_ok());
+    }
+    keep(list.remove(unknown_text()).is_ok());
 });
 
 entry!(session_made, {
