@@ -48,10 +48,10 @@ impl<T> TakenCall<T> {
     /// caller.
     pub fn progress(&self, values: &ParametersView) -> Result<(), Error> {
         let Some(running) = self.running else { return Ok(()) };
-        let told = self
+        let reported = self
             .unit
             .act(|machine| machine.on_link_of(&running, |session, cx| session.progress(cx, running.ticket, values)));
-        told.unwrap_or(Ok(()))
+        reported.unwrap_or(Ok(()))
     }
 
     /// Whether the caller has given the call up, waits no longer, or is gone: no answer reaches it then.
@@ -94,10 +94,10 @@ impl<T> Handle<T> {
     /// has looked takes its place. Values that take more than [`FAILURE_VALUES_BYTES`] are passed over.
     pub(crate) fn hear(&self, call: &InFlight, outgoing: &mut Outgoing<'_, Infallible>) -> ControlFlow<()> {
         let Some(hear) = &mut outgoing.progress else { return ControlFlow::Continue(()) };
-        let mut told = Parameters::<FAILURE_VALUES_BYTES>::sized();
+        let mut reported = Parameters::<FAILURE_VALUES_BYTES>::sized();
         // What it does may use the unit.
-        let is_told = self.shared.machine.borrow_mut().take_told(call, &mut told);
-        if is_told { hear(&told) } else { ControlFlow::Continue(()) }
+        let is_reported = self.shared.machine.borrow_mut().take_reported(call, &mut reported);
+        if is_reported { hear(&reported) } else { ControlFlow::Continue(()) }
     }
 }
 

@@ -27,7 +27,7 @@ use crate::line::{Progress, address_of};
 use crate::machine::{Board, LinkSession, Machine};
 use crate::replies::ended;
 #[cfg(feature = "details")]
-use crate::replies::told;
+use crate::replies::reported;
 #[cfg(feature = "streams")]
 use crate::subscriptions::came;
 use crate::time::now;
@@ -52,7 +52,7 @@ pub(crate) enum Job {
 /// The call that the runner is to run next, if there is one; its arguments are in the runner's parameters.
 // A wide tag, and nothing narrow beside the call: it is then moved in words, and not byte by byte.
 #[repr(u32)]
-pub(crate) enum Begun {
+pub(crate) enum Started {
     Nothing,
     Call(Incoming),
 }
@@ -83,7 +83,7 @@ impl<T> Machine<T> {
         let event = session.poll(&mut cx)?;
         ended(link, reply, &event, &[]);
         #[cfg(feature = "details")]
-        told(link, reply, &event, &[]);
+        reported(link, reply, &event, &[]);
         #[cfg(feature = "streams")]
         came(&self.readings, link, now(), &event, &[]);
         Some(event)
@@ -113,7 +113,7 @@ impl<T> Machine<T> {
         if let Some(event) = &receipt.event {
             ended(link, reply, event, lent);
             #[cfg(feature = "details")]
-            told(link, reply, event, lent);
+            reported(link, reply, event, lent);
             #[cfg(feature = "streams")]
             came(&self.readings, link, now(), event, lent);
         }
@@ -153,7 +153,7 @@ impl<T> Machine<T> {
         if let Some(address) = self.hub.node.take_duplicate() {
             let peer = Some(self.hub.node.identity().clone());
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
-            self.tell(UnitEvent::NotJoined { address, peer, reason });
+            self.notify(UnitEvent::NotJoined { address, peer, reason });
         }
         Some(None)
     }
@@ -164,14 +164,14 @@ impl<T> Machine<T> {
         match self.hub.node.take_claim_event() {
             None => {}
             Some(ClaimEvent::Keep(manager, tagged)) => self.unstored = Some((manager, tagged)),
-            Some(ClaimEvent::Unkept(peer, claim)) => self.tell(UnitEvent::ClaimNotKept { peer, claim }),
+            Some(ClaimEvent::Unkept(peer, claim)) => self.notify(UnitEvent::ClaimNotKept { peer, claim }),
             Some(ClaimEvent::Raise(above)) if Board::MANAGES => {
                 let claimant = self.proof.seed();
                 self.raise_claim(above.raised(claimant));
             }
             Some(ClaimEvent::StepDown(by)) if Board::MANAGES => {
                 self.stop();
-                self.tell(UnitEvent::Fenced { claim: by.claim });
+                self.notify(UnitEvent::Fenced { claim: by.claim });
             }
             Some(_) => {}
         }
@@ -216,7 +216,7 @@ impl<T> Machine<T> {
             self.with(index, |session, cx| session.announce_claim(cx));
         }
         self.hub.node.broadcast(now());
-        self.tell(UnitEvent::Raised { claim });
+        self.notify(UnitEvent::Raised { claim });
     }
 
     /// Ends every connection in an orderly way, and searches no more.
@@ -318,8 +318,8 @@ impl<T> Machine<T> {
             self.hub.node.network_changed(now);
         }
         // That there is one at last is no news at the start.
-        if core::mem::replace(&mut self.has_begun, true) {
-            self.tell(UnitEvent::NetworkChanged { up: address });
+        if core::mem::replace(&mut self.has_started, true) {
+            self.notify(UnitEvent::NetworkChanged { up: address });
         }
         for index in self.indices() {
             self.disconnected(index, CloseReason::Reset);
@@ -330,49 +330,49 @@ impl<T> Machine<T> {
     }
 
     /// Does what an event asks for, or leaves it to the runner.
-    pub(crate) fn noted(&mut self, index: u16, event: Event) -> Option<Job> {
+    pub(crate) fn recorded(&mut self, index: u16, event: Event) -> Option<Job> {
         #[cfg(feature = "streams")]
         self.note_subscriptions(index, &event);
         match event {
             // No handle here pings.
             Event::Reply(..) | Event::Answered => {}
-            Event::Incoming(call) => (self.begun, self.begun_on) = (Begun::Call(call), index),
+            Event::Incoming(call) => (self.started, self.started_on) = (Started::Call(call), index),
             Event::Closed(reason) => return self.closed(index, reason),
             Event::Acknowledged { skipped: 0, .. } => self.wakers.news.wake(),
             Event::LeaseExpired(slot) => {
-                self.tell_of(index, event);
+                self.notify_of(index, event);
                 self.wakers.leases.wake();
                 return Some(Job::Safe(slot));
             }
             // A task that waits for the end of its call looks again.
             #[cfg(feature = "details")]
             Event::Cancelled(_) => self.wakers.leases.wake(),
-            event => self.tell_of(index, event),
+            event => self.notify_of(index, event),
         }
         None
     }
 
     #[inline(never)]
-    fn tell_of(&mut self, index: u16, event: Event) {
+    fn notify_of(&mut self, index: u16, event: Event) {
         let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
         let name = |name: &str| Name::try_from(name).unwrap_or_default();
-        let Some(told) = UnitEvent::of(event, session, &self.functions, name) else { return };
-        match &told {
+        let Some(reported) = UnitEvent::of(event, session, &self.functions, name) else { return };
+        match &reported {
             UnitEvent::Joined { peer } => log!("{} has joined", peer.name()),
             UnitEvent::Left { peer, .. } => log!("{} has left", peer.name()),
             UnitEvent::NotJoined { peer, reason, .. } => self.log_refused(peer.as_ref(), *reason),
             _ => {}
         }
-        self.tell(told);
+        self.notify(reported);
     }
 
     /// Does what the hub wants done.
     pub(crate) fn act(&mut self, command: Command<SocketAddrV4>) {
         match command {
             Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
-            Command::Tell(LinkId(index), directive) => {
+            Command::Notify(LinkId(index), directive) => {
                 if let Some(Some(event)) = self.with(index, |session, cx| session.direct(cx, directive)) {
-                    self.tell_of(index, event);
+                    self.notify_of(index, event);
                 }
             }
         }
@@ -396,7 +396,7 @@ impl<T> Machine<T> {
 
     /// A link has ended.
     fn closed(&mut self, index: u16, reason: CloseReason) -> Option<Job> {
-        self.tell_of(index, Event::Closed(reason));
+        self.notify_of(index, Event::Closed(reason));
         let had_joined = self.end(index)?;
         // Calls that no task has taken yet must not begin for a caller that is gone.
         self.forget_calls_of(index);
@@ -408,11 +408,11 @@ impl<T> Machine<T> {
     }
 
     /// Peers can make links end in this way as fast as they can dial, so the log is rate-limited.
-    fn log_refused(&mut self, told: Option<&Identity>, reason: CloseReason) {
+    fn log_refused(&mut self, reported: Option<&Identity>, reason: CloseReason) {
         let now = now();
         if now >= self.logged {
             self.logged = now + LOGGED;
-            log!("{} could not join, or be joined: {:?}", told.map_or("somebody", Identity::name), reason);
+            log!("{} could not join, or be joined: {:?}", reported.map_or("somebody", Identity::name), reason);
         }
     }
 
@@ -426,7 +426,7 @@ impl<T> Machine<T> {
         let had_joined = session.peer().is_some();
         link.storage = Some(session.into_storage(pool));
         link.interrupt();
-        link.told = None;
+        link.reported = None;
         link.serial = link.serial.wrapping_add(1);
         Some(had_joined)
     }

@@ -33,10 +33,10 @@ impl<T> Handle<T> {
     pub async fn publish_and_wait(&self) -> Result<(), Error> {
         self.publish_my_function_list()?;
         for link in 0..self.links() {
-            let Some((serial, told)) = self.look(|machine| machine.told(link)) else { continue };
+            let Some((serial, reported)) = self.look(|machine| machine.reported(link)) else { continue };
             poll_fn(|cx| {
                 let mut machine = self.shared.machine.borrow_mut();
-                if machine.has_read(link, serial, told) {
+                if machine.has_read(link, serial, reported) {
                     return Poll::Ready(());
                 }
                 machine.wakers.news.register(cx.waker());

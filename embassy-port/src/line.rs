@@ -84,9 +84,9 @@ impl Line {
             self.socket.abort();
         }
         let to = IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port());
-        let begun = !matches!(poll_once(self.socket.connect(to)), Some(Err(_)));
-        self.doing = if begun { Doing::Dialing } else { Doing::Nothing };
-        begun
+        let started = !matches!(poll_once(self.socket.connect(to)), Some(Err(_)));
+        self.doing = if started { Doing::Dialing } else { Doing::Nothing };
+        started
     }
 
     /// Ends the connection behind what was written.

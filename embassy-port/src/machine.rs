@@ -20,7 +20,7 @@ use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
 use crate::config::Table;
-use crate::driving::Begun;
+use crate::driving::Started;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::limits::Limits;
@@ -101,13 +101,21 @@ pub(crate) struct Link {
     /// Places of emergencies, where the others are taken.
     pub(crate) urgent: [Option<Waiter>; EMERGENCIES],
     /// The serial of the list that was last sent to the peer, for tasks that wait until it is read.
-    pub(crate) told: Option<u32>,
+    pub(crate) reported: Option<u32>,
 }
 
 impl Link {
     pub(crate) fn new(storage: SessionStorage<Lent>, waiters: &'static mut [Option<Waiter>]) -> Self {
         let urgent = [const { None }; EMERGENCIES];
-        Self { session: None, storage: Some(storage), serial: 0, since: Instant::START, waiters, urgent, told: None }
+        Self {
+            session: None,
+            storage: Some(storage),
+            serial: 0,
+            since: Instant::START,
+            waiters,
+            urgent,
+            reported: None,
+        }
     }
 
     /// The peer, from joining to leaving.
@@ -143,9 +151,9 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) readings: crate::subscriptions::Readings,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
-    pub(crate) begun: Begun,
+    pub(crate) started: Started,
     /// The link that it came on.
-    pub(crate) begun_on: u16,
+    pub(crate) started_on: u16,
     /// The runner is to let other tasks run.
     pub(crate) yields: bool,
     pub(crate) lost_hook: Option<&'static Hook<T>>,
@@ -156,7 +164,7 @@ pub(crate) struct Machine<T: 'static> {
     /// When the cable and the address are looked at again.
     pub(crate) look: Instant,
     /// It has had an address.
-    pub(crate) has_begun: bool,
+    pub(crate) has_started: bool,
     /// It has been stopped, and only ends its connections.
     pub(crate) stopped: bool,
     /// When the next refused link may be logged.
@@ -289,7 +297,7 @@ impl<T> Machine<T> {
     }
 
     /// Queues an event for the application.
-    pub(crate) fn tell(&mut self, event: UnitEvent) {
+    pub(crate) fn notify(&mut self, event: UnitEvent) {
         self.events.put(event);
         // Lets the reader of events run, so that a short queue suffices for any number of events.
         self.yields |= self.wakers.events.occupied();

@@ -18,7 +18,7 @@ impl<T> Machine<T> {
         let Self { functions, hub, .. } = self;
         functions.iter().try_for_each(|function| hub.publications.publish_to_all(function.slot))?;
         for index in self.indices() {
-            self.tell_list(index);
+            self.notify_list(index);
         }
         Ok(())
     }
@@ -28,30 +28,30 @@ impl<T> Machine<T> {
         let Self { functions, hub, .. } = self;
         functions.iter().try_for_each(|function| hub.publications.publish_to(identity, function.slot))?;
         if let Some(index) = self.link_to(identity) {
-            self.tell_list(index);
+            self.notify_list(index);
         }
         Ok(())
     }
 
-    fn tell_list(&mut self, index: u16) {
+    fn notify_list(&mut self, index: u16) {
         if self.link(index).is_none_or(|link| !link.is_live()) {
             return;
         }
         let serial = self.with(index, |session, cx| session.publish(cx));
         if let Some(link) = self.link_mut(index) {
-            link.told = serial;
+            link.reported = serial;
         }
     }
 
     /// The life of a link, and the serial of the list that its peer was last told.
-    pub(crate) fn told(&self, index: u16) -> Option<(u32, u32)> {
+    pub(crate) fn reported(&self, index: u16) -> Option<(u32, u32)> {
         let link = self.link(index).filter(|link| link.is_live())?;
-        Some((link.serial, link.told?))
+        Some((link.serial, link.reported?))
     }
 
     /// Whether the peer of that life of the link has read the list, or has left.
-    pub(crate) fn has_read(&self, index: u16, serial: u32, told: u32) -> bool {
+    pub(crate) fn has_read(&self, index: u16, serial: u32, reported: u32) -> bool {
         let link = self.link(index).filter(|link| link.serial == serial && link.is_live());
-        link.and_then(|link| link.session.as_ref()).is_none_or(|session| session.is_acknowledged(told))
+        link.and_then(|link| link.session.as_ref()).is_none_or(|session| session.is_acknowledged(reported))
     }
 }

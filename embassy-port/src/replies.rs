@@ -49,7 +49,7 @@ pub(crate) struct ReplyBox {
     failure: Option<(InFlight, Failure)>,
     /// What a call has told last while it runs: it waits in the same room, and makes way for a reply.
     #[cfg(feature = "details")]
-    told: Option<(InFlight, usize)>,
+    reported: Option<(InFlight, usize)>,
 }
 
 impl ReplyBox {
@@ -60,7 +60,7 @@ impl ReplyBox {
             #[cfg(feature = "details")]
             failure: None,
             #[cfg(feature = "details")]
-            told: None,
+            reported: None,
         }
     }
 
@@ -76,21 +76,21 @@ impl ReplyBox {
         self.held = Some((call, copy(block, self.bytes)));
         #[cfg(feature = "details")]
         {
-            self.told = None;
+            self.reported = None;
         }
         Ok(())
     }
 
     #[cfg(feature = "details")]
-    fn tell(&mut self, call: InFlight, block: &[u8]) {
+    fn notify(&mut self, call: InFlight, block: &[u8]) {
         if self.held.is_none() && block.len() <= self.bytes.len() {
-            self.told = Some((call, copy(block, self.bytes)));
+            self.reported = Some((call, copy(block, self.bytes)));
         }
     }
 
     #[cfg(feature = "details")]
-    fn take_told(&mut self, call: &InFlight) -> Option<&[u8]> {
-        let (_, length) = self.told.take_if(|(told, _)| told == call)?;
+    fn take_reported(&mut self, call: &InFlight) -> Option<&[u8]> {
+        let (_, length) = self.reported.take_if(|(reported, _)| reported == call)?;
         self.bytes.get(..length)
     }
 
@@ -147,13 +147,13 @@ impl Waiter {
 
 /// Keeps what a call has told for the task that waits for it, if that is what happened and there is one.
 #[cfg(feature = "details")]
-pub(crate) fn told(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: &[u8]) {
+pub(crate) fn reported(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: &[u8]) {
     let Event::Progress(id, values) = event else { return };
     let (serial, session) = (link.serial, &link.session);
     let mut waiting = link.waiters.iter_mut().chain(&mut link.urgent).flatten();
     let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == *id) else { return };
     if let Some(Ok(block)) = session.as_ref().map(|session| session.progress_values(values, lent)) {
-        reply.tell(waiter.call, block.bytes());
+        reply.notify(waiter.call, block.bytes());
         waiter.wake();
     }
 }
@@ -232,13 +232,13 @@ impl<T> Machine<T> {
     /// Reads what a call has told last into `values`, once; `false` when there is nothing new, no room for it, or when the call
     /// has ended.
     #[cfg(feature = "details")]
-    pub(crate) fn take_told(&mut self, call: &InFlight, values: &mut ParametersView) -> bool {
+    pub(crate) fn take_reported(&mut self, call: &InFlight, values: &mut ParametersView) -> bool {
         let Self { links, reply, .. } = self;
-        let goes_on = |waiter: &Waiter| waiter.call == *call && waiter.outcome.is_none();
+        let continues = |waiter: &Waiter| waiter.call == *call && waiter.outcome.is_none();
         let link = links.get(usize::from(call.link));
-        let goes_on = link.is_some_and(|link| link.waiting().any(goes_on));
-        let (told, called) = (reply.take_told(call), called(links, call).filter(|_| goes_on));
-        told.zip(called).is_some_and(|(bytes, called)| block::read(called.progress(), bytes, values).is_ok())
+        let continues = link.is_some_and(|link| link.waiting().any(continues));
+        let (reported, called) = (reply.take_reported(call), called(links, call).filter(|_| continues));
+        reported.zip(called).is_some_and(|(bytes, called)| block::read(called.progress(), bytes, values).is_ok())
     }
 
     /// Nothing waits for a call any more, and what it started is not wanted.

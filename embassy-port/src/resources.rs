@@ -24,7 +24,7 @@ use embassy_net::Stack;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 
 use crate::config::Config;
-use crate::driving::Begun;
+use crate::driving::Started;
 use crate::event::{Events, UnitEvent};
 use crate::handle::Handle;
 use crate::handler::Listed;
@@ -296,9 +296,9 @@ impl<
                 tcp_port,
                 address: None,
                 look: Instant::START,
-                begun: Begun::Nothing,
-                begun_on: 0,
-                has_begun: false,
+                started: Started::Nothing,
+                started_on: 0,
+                has_started: false,
                 stopped: false,
                 logged: Instant::START,
                 renews_every: HANDSHAKE_LIFE,

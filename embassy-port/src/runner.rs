@@ -11,7 +11,7 @@ use cara_core::error::Error;
 use cara_core::services::session::Incoming;
 use cara_core::time::{Duration, Instant};
 
-use crate::driving::{Begun, Job};
+use crate::driving::{Job, Started};
 use crate::handle::Handle;
 use crate::handler::{Hook, Listed, Served};
 use crate::lease::LeaseWatch;
@@ -66,7 +66,7 @@ impl<T> Runner<T> {
                     self.run_job(job);
                     false
                 }
-                Step::Again => self.serve_begun(),
+                Step::Again => self.serve_started(),
                 Step::Idle => true,
             };
             if is_through && self.rest(context) {
@@ -96,7 +96,7 @@ impl<T> Runner<T> {
         if is_due {
             for index in machine.indices() {
                 if let Some(event) = machine.poll_link(index, awaits_hook) {
-                    return machine.noted(index, event).map_or(Step::Again, Step::Job);
+                    return machine.recorded(index, event).map_or(Step::Again, Step::Job);
                 }
             }
             machine.expire_reply(now());
@@ -112,7 +112,7 @@ impl<T> Runner<T> {
             machine.look_at_claims();
         }
         if let Some(event) = machine.read_datagram(self.scratch, context) {
-            let job = event.and_then(|(index, event)| machine.noted(index, event));
+            let job = event.and_then(|(index, event)| machine.recorded(index, event));
             return job.map_or(Step::Again, Step::Job);
         }
         // What waits to be written goes out before more is read, or a peer that only sends would keep every answer back.
@@ -125,12 +125,12 @@ impl<T> Runner<T> {
         for index in machine.indices() {
             let arguments = if busy { None } else { Some(&mut *self.arguments) };
             if let Some(event) = machine.read_link(index, self.scratch, arguments) {
-                let job = event.and_then(|event| machine.noted(index, event));
+                let job = event.and_then(|event| machine.recorded(index, event));
                 return job.map_or(Step::Again, Step::Job);
             }
             if !busy && let Some(Some(call)) = machine.with(index, |session, cx| session.next_call(cx, self.arguments))
             {
-                (machine.begun, machine.begun_on) = (Begun::Call(call), index);
+                (machine.started, machine.started_on) = (Started::Call(call), index);
                 return Step::Again;
             }
         }
@@ -172,12 +172,12 @@ impl<T> Runner<T> {
 
     /// Runs the call that has begun, if one has. Whether nothing can have become due by it, so that another step would
     /// find nothing.
-    fn serve_begun(&mut self) -> bool {
-        let (begun, link) = {
+    fn serve_started(&mut self) -> bool {
+        let (started, link) = {
             let machine = &mut *self.shared.machine.borrow_mut();
-            (core::mem::replace(&mut machine.begun, Begun::Nothing), machine.begun_on)
+            (core::mem::replace(&mut machine.started, Started::Nothing), machine.started_on)
         };
-        let Begun::Call(call) = begun else { return false };
+        let Started::Call(call) = started else { return false };
         self.serve(link, &call);
         self.unanswered.is_none() && self.shared.machine.borrow().has_read_all()
     }
@@ -204,7 +204,7 @@ impl<T> Runner<T> {
 
     /// Runs a call; `None` when it is answered, or a task is left to do so.
     fn begin(&mut self, running: Running, call: &Incoming) -> Option<Result<(), Error>> {
-        let (told, handler) = {
+        let (reported, handler) = {
             let machine = &mut *self.shared.machine.borrow_mut();
             let Some(function) = machine.functions.function(call.slot) else {
                 return Some(Err(Error::StaleFunction));
@@ -220,7 +220,7 @@ impl<T> Runner<T> {
             if handler.is_task() {
                 return machine.leave_to_task(running, *call, caller, self.arguments).err().map(Err);
             }
-            let told = Served {
+            let reported = Served {
                 caller,
                 priority: call.priority,
                 deadline: call.deadline,
@@ -232,14 +232,14 @@ impl<T> Runner<T> {
                 #[cfg(feature = "details")]
                 running: Some(running).into(),
             };
-            (told, handler)
+            (reported, handler)
         };
-        let result = handler.run(&self.shared.state, &told, self.arguments);
+        let result = handler.run(&self.shared.state, &reported, self.arguments);
         #[cfg(feature = "details")]
-        told.running.take()?;
+        reported.running.take()?;
         // Where it cannot be kept now, its code waits alone.
         #[cfg(feature = "details")]
-        if let Some(failure) = told.failure.take()
+        if let Some(failure) = reported.failure.take()
             && result == Err((&failure).into())
             && self.shared.machine.borrow_mut().answer_failed(&running, &failure)
         {

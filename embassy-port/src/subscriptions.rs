@@ -146,7 +146,7 @@ impl<T> Machine<T> {
         match *event {
             Event::ListChanged => {
                 for reading in self.readings.iter() {
-                    self.tell_subscription(index, reading);
+                    self.notify_subscription(index, reading);
                 }
             }
             Event::Subscribed(slot, answer) => {
@@ -160,7 +160,7 @@ impl<T> Machine<T> {
     }
 
     /// Tells the node of a link what is wanted of the stream of a cell: of several subscriptions to it the shortest interval.
-    fn tell_subscription(&mut self, index: u16, reading: &Reading) {
+    fn notify_subscription(&mut self, index: u16, reading: &Reading) {
         let state = reading.state.borrow();
         let Some(Wanted { peer, stream, .. }) = &state.wanted else { return };
         if self.link(index).and_then(Link::peer) != Some(peer) {
@@ -168,7 +168,7 @@ impl<T> Machine<T> {
         }
         let interval = |reading: &Reading| Some(reading.state.borrow().wanted.as_ref()?.interval);
         let interval = self.readings.of(peer, stream).filter_map(interval).min();
-        let told = self.with(index, |session, cx| match interval {
+        let reported = self.with(index, |session, cx| match interval {
             Some(interval) => session.subscribe(cx, stream, interval).map(drop),
             None => {
                 session.unsubscribe(cx, stream);
@@ -176,19 +176,19 @@ impl<T> Machine<T> {
             }
         });
         drop(state);
-        if let Some(Err(error @ Error::UnknownFunction)) = told {
+        if let Some(Err(error @ Error::UnknownFunction)) = reported {
             reading.was_answered(Some(error));
         }
     }
 
     fn begin_reading(&mut self, reading: &'static Reading) {
         self.readings.add(reading);
-        self.indices().for_each(|index| self.tell_subscription(index, reading));
+        self.indices().for_each(|index| self.notify_subscription(index, reading));
     }
 
     fn end_reading(&mut self, reading: &'static Reading) {
         self.readings.remove(reading);
-        self.indices().for_each(|index| self.tell_subscription(index, reading));
+        self.indices().for_each(|index| self.notify_subscription(index, reading));
         reading.state.borrow_mut().wanted = None;
     }
 }

@@ -218,7 +218,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
-    /// The file with the unit's keys, instead of where [`place`](crate::keys::place) looks, which is the default.
+    /// The file with the unit's keys, instead of where [`location`](crate::keys::location) looks, which is the default.
     pub fn key_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.keys = KeySource::File(path.into());
         self

@@ -273,8 +273,8 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// As [`publish_my_function_list`](Self::publish_my_function_list), and returns when every connected node has read
     /// the list, or after `timeout` the nodes that have not.
     pub fn publish_and_wait(&self, timeout: impl Into<Duration>) -> Result<Vec<Identity>, Error> {
-        let told = self.engine().publish(None)?;
-        let missing = self.engine().await_acknowledgements(&told, timeout.into());
+        let reported = self.engine().publish(None)?;
+        let missing = self.engine().await_acknowledgements(&reported, timeout.into());
         Ok(missing.iter().filter_map(|link| link.peer.get()).map(|peer| peer.identity.clone()).collect())
     }
 

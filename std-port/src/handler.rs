@@ -99,7 +99,7 @@ impl Served {
     /// }
     /// ```
     pub fn progress(&self, values: &ParametersView) -> Result<(), Error> {
-        self.serving.tell(values)
+        self.serving.notify(values)
     }
 
     /// Whether the caller has given the call up, waits no longer, or is gone: what the handler returns then reaches nothing. For

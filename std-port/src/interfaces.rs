@@ -37,7 +37,7 @@ impl AnyCall for Served {
         Self::fail(self, failure)
     }
 
-    fn tell(&self, progress: &ParametersView) -> Result<(), Error> {
+    fn notify(&self, progress: &ParametersView) -> Result<(), Error> {
         Self::progress(self, progress)
     }
 

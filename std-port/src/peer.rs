@@ -356,7 +356,7 @@ impl<T: Send + 'static> Peer<T> {
     ///     agv.wait_for_function("go_to", std::time::Duration::from_secs(10));
     ///     match agv.outcome_of("go_to") {
     ///         OrderOutcome::Ended(how) => println!("it began, and is over: {}", how.word()),
-    ///         OrderOutcome::NotBegun => println!("it did not move"),
+    ///         OrderOutcome::NotStarted => println!("it did not move"),
     ///         outcome => println!("look where it is: {outcome:?}"),
     ///     }
     /// }
@@ -441,8 +441,8 @@ impl<T: Send + 'static> Peer<T> {
     /// As [`publish_my_function_list`](Self::publish_my_function_list), and returns when the node has read the list;
     /// [`Error::TimedOut`] otherwise.
     pub fn publish_and_wait(&self, timeout: impl Into<Duration>) -> Result<(), Error> {
-        let told = self.engine.publish(Some(&self.cell.identity))?;
-        match self.engine.await_acknowledgements(&told, timeout.into()).is_empty() {
+        let reported = self.engine.publish(Some(&self.cell.identity))?;
+        match self.engine.await_acknowledgements(&reported, timeout.into()).is_empty() {
             true => Ok(()),
             false => Err(Error::TimedOut),
         }

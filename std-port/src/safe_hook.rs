@@ -345,7 +345,7 @@ mod tests {
     fn an_order_whose_time_passes_while_it_waits_for_the_hook_does_not_begin() {
         static AHEAD: AtomicU64 = AtomicU64::new(0);
         let clock = Clock::moved_by(&AHEAD);
-        let (runs, (goes_on, may_go_on)) = (Arc::new(AtomicUsize::new(0)), channel::<()>());
+        let (runs, (continues, may_go_on)) = (Arc::new(AtomicUsize::new(0)), channel::<()>());
         let (counted, may_go_on) = (runs.clone(), Mutex::new(may_go_on));
         let hook = Arc::new(move || {
             counted.fetch_add(1, Ordering::SeqCst);
@@ -363,7 +363,7 @@ mod tests {
                 let waits = scope.spawn(|| safe.begin(end, &CLAIM));
                 // Less than a hook may take.
                 AHEAD.fetch_add(50_000, Ordering::SeqCst);
-                goes_on.send(()).unwrap();
+                continues.send(()).unwrap();
                 let order = waits.join().unwrap();
                 assert_eq!(order.err(), (!begins).then_some(Error::Expired));
                 assert_eq!(safe.shared.lease().is_live(clock.now()), begins);
@@ -407,13 +407,13 @@ mod tests {
             let before = seen();
             std::thread::scope(|scope| {
                 let writing = lock(&safe.shared.state);
-                let (begins, begun) = channel();
+                let (begins, started) = channel();
                 let safe = &safe;
                 let other = scope.spawn(move || {
                     begins.send(()).unwrap();
                     write(safe, order, now)
                 });
-                begun.recv().unwrap();
+                started.recv().unwrap();
                 std::thread::sleep(std::time::Duration::from_millis(20));
                 assert!(!other.is_finished() && seen() == before, "it has been written during another write");
                 drop(writing);
@@ -429,7 +429,7 @@ mod tests {
     fn an_order_does_not_begin_while_the_hook_of_the_one_before_runs() {
         const LONG: Duration = Duration::from_secs(3_600);
         let clock = Clock::new();
-        let ((came, comes), (goes_on, may_go_on)) = (channel(), channel::<()>());
+        let ((came, comes), (continues, may_go_on)) = (channel(), channel::<()>());
         let may_go_on = Mutex::new(may_go_on);
         let hook = Arc::new(move || {
             came.send(()).unwrap();
@@ -442,7 +442,7 @@ mod tests {
         comes.recv().unwrap();
         assert_eq!(safe.begin(clock.now() + LONG, &CLAIM), Err(ServiceError::NotReady.into()));
         assert!(!safe.shared.lease().is_live(clock.now()));
-        goes_on.send(()).unwrap();
+        continues.send(()).unwrap();
         until(|| safe.begin(clock.now() + LONG, &CLAIM).is_ok());
         safe.end();
     }

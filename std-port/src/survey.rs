@@ -220,7 +220,8 @@ impl Survey {
         };
         let plain = encoded(&question(first.wrapping_add(1)), fleet, &Plain);
         let secured = self.keys.signers(fleet).zip(2..);
-        let secured = secured.map(|(signer, place)| encoded(&question(first.wrapping_add(place)), fleet, &signer));
+        let secured =
+            secured.map(|(signer, location)| encoded(&question(first.wrapping_add(location)), fleet, &signer));
         let questions: Vec<_> = std::iter::once(plain).chain(secured).collect();
         self.sequence = first.wrapping_add(1).wrapping_add(questions.len() as u32);
         questions
@@ -293,8 +294,8 @@ impl Survey {
 
     fn note_unit(&mut self, news: &News) {
         let now = self.opened.elapsed();
-        let place = match self.heard.iter().position(|known| known.is(news)) {
-            Some(place) => place,
+        let location = match self.heard.iter().position(|known| known.is(news)) {
+            Some(location) => location,
             None if self.heard.len() >= HEARD => {
                 self.dropped = self.dropped.saturating_add(1);
                 return;
@@ -304,7 +305,7 @@ impl Survey {
                 self.heard.len().saturating_sub(1)
             }
         };
-        let Some(heard) = self.heard.get_mut(place) else { return };
+        let Some(heard) = self.heard.get_mut(location) else { return };
         heard.take(news, now);
     }
 

@@ -82,10 +82,10 @@ struct State {
     registration: Registration,
     waiters: Vec<Waiter>,
     /// Callers that were told to take the token and have not looked yet.
-    told: Vec<u32>,
+    reported: Vec<u32>,
     stopped: bool,
     /// The clock is to look.
-    clock_told: bool,
+    clock_reported: bool,
     /// Calls of the peer that the pool has read.
     called: u32,
 }
@@ -137,9 +137,10 @@ impl Link {
     }
 
     fn build(together: usize, keeps: bool, reading: ReadPolicy) -> Arc<Self> {
-        let (waiters, told) = (vec![], vec![]);
+        let (waiters, reported) = (vec![], vec![]);
         let registration = Registration { readable: true, writable: false, is_out: false };
-        let state = State { reading, registration, waiters, told, stopped: false, clock_told: false, called: 0 };
+        let state =
+            State { reading, registration, waiters, reported, stopped: false, clock_reported: false, called: 0 };
         let wire = Wire { armed: true, ..Wire::default() };
         Arc::new(Self {
             wire: Mutex::new(wire),
@@ -164,7 +165,7 @@ impl Link {
         if duties.enlist {
             self.watch.enlist(LINK);
             if self.watch.begins() {
-                state.clock_told = true;
+                state.clock_reported = true;
                 self.changed.notify_all();
             }
         }
@@ -182,7 +183,7 @@ impl Link {
         let is_read = match state.reading.reader() {
             Reader::Led { .. } | Reader::Serving { .. } => true,
             Reader::Kept { .. } => self.keeps,
-            Reader::Offered => !state.told.is_empty(),
+            Reader::Offered => !state.reported.is_empty(),
             Reader::Opening | Reader::Pool => armed,
         };
         assert!(is_read, "no thread reads");
@@ -274,7 +275,7 @@ impl Link {
         self.send(id);
         let mut looks = 0;
         loop {
-            state.told.retain(|told| *told != id);
+            state.reported.retain(|reported| *reported != id);
             if self.take_outcome(&mut state, id) {
                 match token {
                     Some(token) => self.leave_with_reply(state, token),
@@ -376,9 +377,9 @@ impl Link {
             }
             let mut state = self.lock();
             self.read_by(&mut state, Cause::Ends(token));
-            let goes_on = state.reading.is_held(token);
+            let continues = state.reading.is_held(token);
             self.settle(state);
-            if !goes_on || calls_back.is_some() {
+            if !continues || calls_back.is_some() {
                 break;
             }
         }
@@ -389,13 +390,13 @@ impl Link {
     fn clock(&self) {
         let mut state = self.lock();
         loop {
-            while !state.clock_told && !state.stopped {
+            while !state.clock_reported && !state.stopped {
                 state = self.changed.wait(state).unwrap();
             }
             if state.stopped {
                 return;
             }
-            state.clock_told = false;
+            state.clock_reported = false;
             drop(state);
             while self.watch.look(|_| self.look_at_link()) {}
             state = self.lock();
@@ -435,7 +436,7 @@ fn next_reader(state: &State) -> Option<CallId> {
 
 fn wake(state: &mut State, duties: Duties) {
     let Some(CallId(id)) = duties.wake else { return };
-    state.told.push(id);
+    state.reported.push(id);
     state
         .waiters
         .iter()
@@ -623,8 +624,8 @@ fn nothing_happens_behind_the_back_of_the_clock() {
         let other = watch.clone();
         let happens = thread::spawn(move || other.begins());
         while watch.look(|_| false) {}
-        let is_told = happens.join().unwrap();
-        assert!(is_told || !watch.look(|_| false), "the clock sleeps, and has not seen it");
+        let is_reported = happens.join().unwrap();
+        assert!(is_reported || !watch.look(|_| false), "the clock sleeps, and has not seen it");
     });
 }
 
@@ -640,7 +641,7 @@ struct Pool {
 #[derive(Default)]
 struct Flags {
     /// The clock is to look.
-    told: bool,
+    reported: bool,
     /// Handlers need not wait any more.
     released: bool,
 }
@@ -672,7 +673,7 @@ impl Pool {
             let Some(call) = call else { return };
             // `Engine::may_run_at_once`.
             if self.idle.load(Ordering::SeqCst) == 0 && self.watch.begins() {
-                self.flags.lock().unwrap().told = true;
+                self.flags.lock().unwrap().reported = true;
                 self.changed.notify_all();
             }
             self.run(call);
@@ -692,7 +693,7 @@ impl Pool {
     fn clock(&self) {
         let mut flags = self.flags.lock().unwrap();
         while !flags.released {
-            if !std::mem::take(&mut flags.told) {
+            if !std::mem::take(&mut flags.reported) {
                 flags = self.changed.wait(flags).unwrap();
                 continue;
             }

@@ -106,7 +106,7 @@ impl Shared {
 }
 
 /// A lease and its first order.
-fn begun(lock: Option<Mutex<()>>) -> (Arc<Shared>, Order) {
+fn started(lock: Option<Mutex<()>>) -> (Arc<Shared>, Order) {
     let shared = Arc::new(Shared { lease: Lease::new(), lock });
     let order = shared.lease.begin(NOW, END).unwrap();
     // Every atomic is made before the threads begin.
@@ -115,7 +115,7 @@ fn begun(lock: Option<Mutex<()>>) -> (Arc<Shared>, Order) {
 }
 
 fn locked() -> (Arc<Shared>, Order) {
-    begun(Some(Mutex::new(())))
+    started(Some(Mutex::new(())))
 }
 
 /// One link renews its call and ends it; the call of another one takes the lease over and ends.
@@ -140,7 +140,7 @@ fn nothing_lives_when_both_orders_have_ended() {
 #[test]
 #[should_panic(expected = "the lease lives, and no order has it")]
 fn without_the_lock_a_renewal_revives_what_another_link_has_ended() {
-    model(|| both_end(begun(None)));
+    model(|| both_end(started(None)));
 }
 
 /// Two calls begin side by side.
@@ -162,7 +162,7 @@ fn two_that_begin_at_once_are_two_orders() {
 #[test]
 #[should_panic(expected = "two calls have one order")]
 fn without_the_lock_they_are_one() {
-    model(|| both_begin(begun(None)));
+    model(|| both_begin(started(None)));
 }
 
 /// The application looks at an order while its link renews it and another one takes the lease over.

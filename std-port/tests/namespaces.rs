@@ -40,7 +40,7 @@ fn agv() -> (Unit, Receiver<UnitEvent>) {
 }
 
 /// Waits until it is told which interfaces are up.
-fn told(events: &Receiver<UnitEvent>) -> Vec<String> {
+fn reported(events: &Receiver<UnitEvent>) -> Vec<String> {
     let end = Instant::now() + PATIENCE;
     loop {
         let left = end.saturating_duration_since(Instant::now());
@@ -70,7 +70,7 @@ fn without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one() {
     let (manager, of_manager) = manager();
     let (agv, of_agv) = agv();
     for events in [&of_manager, &of_agv] {
-        assert_eq!(told(events), Vec::<String>::new());
+        assert_eq!(reported(events), Vec::<String>::new());
     }
     // It goes on searching, and says nothing more.
     until("the AGV has tried several times", || {
@@ -86,7 +86,7 @@ fn without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one() {
     // Both are on one host here, so loopback is what they meet over. Found or not, it is told that there is no other.
     ip("link set lo up");
     for events in [&of_manager, &of_agv] {
-        assert_eq!(told(events), ["lo"]);
+        assert_eq!(reported(events), ["lo"]);
     }
     until("the two meet", || ping(&manager) == Ok(()));
 }
@@ -99,17 +99,17 @@ fn an_interface_goes_and_comes() {
     ip("link set lo up");
     let (manager, of_manager) = manager();
     let (agv, _of_agv) = agv();
-    assert_eq!(told(&of_manager), ["lo"], "no other host can be reached");
+    assert_eq!(reported(&of_manager), ["lo"], "no other host can be reached");
     until("the two meet over loopback", || ping(&manager) == Ok(()));
     agv.stop();
     until("it has left", || manager.number_of_s_units() == 0);
 
     plug_in();
-    assert_eq!(told(&of_manager), ["eth7", "lo"]);
+    assert_eq!(reported(&of_manager), ["eth7", "lo"]);
     ip("link set eth7 down");
-    assert_eq!(told(&of_manager), ["lo"]);
+    assert_eq!(reported(&of_manager), ["lo"]);
     ip("link set eth7 up");
-    assert_eq!(told(&of_manager), ["eth7", "lo"]);
+    assert_eq!(reported(&of_manager), ["eth7", "lo"]);
     let (_second, _events) = self::agv();
     until("the two meet again", || ping(&manager) == Ok(()));
 }

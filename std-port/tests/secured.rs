@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::keys::{FleetKeys, Store, place};
+use cara_std::keys::{FleetKeys, Store, location};
 use cara_std::{
     BuildError, Builder, CloseReason, CommunicationSystem, Definition, Fleet, Identity, Interfaces, MUnit, Parameters,
     ParametersView, Refusal, SUnit, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
@@ -238,7 +238,7 @@ fn a_running_manager_follows_its_key_file() {
     let folder = tempfile::tempdir().unwrap();
     let mut store = Store::create(folder.path(), keys(fleet, &[7])).unwrap();
     store.save().unwrap();
-    let file = |node: &Identity| folder.path().join(place::file_name(node, fleet));
+    let file = |node: &Identity| folder.path().join(location::file_name(node, fleet));
     let manager = started_manager(manager(fleet).key_file(file(&depot())));
     let events = manager.events();
     let start = |id| started_vehicle(vehicle(fleet, id).key_file(file(&agv(id))));

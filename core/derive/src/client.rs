@@ -30,7 +30,7 @@ fn request(interface: &Interface, function: &Function, root: &TokenStream) -> To
         ["ARGUMENTS", "RESULTS", "SIGNATURE"].map(|constant| function.constant(constant));
     let (writes, read, returned) = (writes(function, root), read(interface, function, root), function.returned());
     let (progress, fails) =
-        function.told().map_or((quote!(()), quote!(())), |(told, fails)| (quote!(#told), quote!(#fails)));
+        function.reported().map_or((quote!(()), quote!(())), |(reported, fails)| (quote!(#reported), quote!(#fails)));
     let bytes = quote!(#typed::parameters_bytes(#holder::#arguments, #holder::#results) + #typed::ROOM);
     let room = quote!(::core::ops::DerefMut<Target = #parts::ParametersView> + ::core::marker::Unpin);
     let result = |ok: TokenStream| quote!(::core::result::Result<#ok, #parts::Error>);

@@ -55,7 +55,7 @@ pub(crate) struct Call {
     /// The traits behind `impl`, for a state of the type `T`.
     pub(crate) bounds: TokenStream,
     /// The first and the second type of `TypedCall<Left, Blocked>`: the progress, and the values of failures.
-    told: Vec<Type>,
+    reported: Vec<Type>,
 }
 
 /// What a function gives back.
@@ -161,8 +161,8 @@ impl Function {
             }
         }
         let span = signature.ident.span();
-        let tells = |input: &&Input| matches!(input, Input::Call(call) if !call.is_state);
-        if inputs.iter().filter(tells).count() > 1 {
+        let reports = |input: &&Input| matches!(input, Input::Call(call) if !call.is_state);
+        if inputs.iter().filter(reports).count() > 1 {
             return Err(Error::new(
                 span,
                 "a function has one argument that tells about its call: join the bounds with `+`",
@@ -233,8 +233,8 @@ impl Function {
             Results::Struct(rust) => Some(rust.clone()),
             Results::Named(_) => None,
         };
-        let told = self.told().map(|(progress, fails)| [progress, fails]);
-        arguments.chain(results).chain(told.into_iter().flatten()).collect()
+        let reported = self.reported().map(|(progress, fails)| [progress, fails]);
+        arguments.chain(results).chain(reported.into_iter().flatten()).collect()
     }
 
     /// What the argument says that tells about the call.
@@ -246,10 +246,10 @@ impl Function {
     }
 
     /// What its calls tell while they run and, second, when they fail; `None` where it says neither.
-    pub(crate) fn told(&self) -> Option<(Type, Type)> {
-        let told = &self.call()?.told;
-        let second = || told.get(1).cloned().unwrap_or_else(|| syn::parse_quote!(()));
-        Some((told.first()?.clone(), second()))
+    pub(crate) fn reported(&self) -> Option<(Type, Type)> {
+        let reported = &self.call()?.reported;
+        let second = || reported.get(1).cloned().unwrap_or_else(|| syn::parse_quote!(()));
+        Some((reported.first()?.clone(), second()))
     }
 
     /// A constant of this function.
@@ -281,9 +281,9 @@ impl Input {
             && let Type::ImplTrait(call) = &*reference.elem
         {
             let is_state = call.bounds.iter().any(lends_state);
-            let told = call.bounds.iter().flat_map(types_of).collect();
+            let reported = call.bounds.iter().flat_map(types_of).collect();
             let bounds = call.bounds.to_token_stream().into_iter().map(of_state).collect();
-            return Ok(Self::Call(Call { is_state, bounds, told }));
+            return Ok(Self::Call(Call { is_state, bounds, reported }));
         }
         let is_struct = extract(attributes, &["variables"]);
         let mut said = OfVariable::take(attributes)?;
@@ -455,7 +455,7 @@ fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
                 quote!(&[#(#specs),*])
             }
         };
-        let (progress, fails) = match function.told() {
+        let (progress, fails) = match function.reported() {
             Some((progress, fails)) => {
                 let specs = |rust: Type| quote_spanned! { rust.span() => <#rust as #typed::Variables>::SPECS };
                 (specs(progress), specs(fails))

@@ -181,7 +181,7 @@ fn a_mismatch_tells_the_way_to_the_difference() {
         let found = Mismatch::check(ours.signature(), theirs.signature());
         found.map_err(|found| found.to_string().replace("the peer's f is of another version: its ", "")).err()
     };
-    let told = |text: &str| Some(format!("{text}: update one of the two"));
+    let reported = |text: &str| Some(format!("{text}: update one of the two"));
     for (ours, theirs, way) in [
         ("f(a: {x: int}[..2])", "f(a: {x: float}[..2])", "argument a[].x is float there and int here"),
         ("f(a: {x: int, y: int})", "f(a: {x: int})", "argument a.y is missing there and int here"),
@@ -201,11 +201,11 @@ fn a_mismatch_tells_the_way_to_the_difference() {
             "result a.x is string[3] there and string[2] here",
         ),
     ] {
-        assert_eq!(check(ours, theirs), told(way), "{ours} and {theirs}");
+        assert_eq!(check(ours, theirs), reported(way), "{ours} and {theirs}");
     }
     assert_eq!(check("f(a: int[..3]) -> (b: int[..3])", "f(a: int[..2]) -> (b: int[..2])"), None);
     // A longer way ends at the last name that has room, also where a shorter one is behind it.
     let long = |kind: &str| format!("f({0}: {{a: {{b{0}: {{c: {kind}}}}}[..2]}})", "n".repeat(31));
     let way = format!("argument {}.a[] is bool there and int here", "n".repeat(31));
-    assert_eq!(check(&long("int"), &long("bool")), told(&way));
+    assert_eq!(check(&long("int"), &long("bool")), reported(&way));
 }

@@ -180,9 +180,9 @@ impl Winch for Vehicle {
 }
 
 /// What a call tells here, and what it is told.
-struct Told(Identity, Option<Ended>, RefCell<Parameters>, RefCell<Option<Failure>>);
+struct Report(Identity, Option<Ended>, RefCell<Parameters>, RefCell<Option<Failure>>);
 
-impl AnyCall for Told {
+impl AnyCall for Report {
     type Order = u32;
 
     fn order(&self) -> Option<u32> {
@@ -208,14 +208,14 @@ impl AnyCall for Told {
         *self.3.borrow_mut() = Some(failure);
         error
     }
-    fn tell(&self, progress: &ParametersView) -> Result<(), Error> {
+    fn notify(&self, progress: &ParametersView) -> Result<(), Error> {
         self.2.borrow_mut().copy_from(progress)
     }
 }
 
 enum Run {
-    Method(&'static Method<Vehicle, Told>),
-    Free(&'static Free<Told>),
+    Method(&'static Method<Vehicle, Report>),
+    Free(&'static Free<Report>),
 }
 
 struct Listed {
@@ -235,12 +235,12 @@ struct Unit {
     ended: Option<Ended>,
     sent: RefCell<Vec<RequestOptions>>,
     /// What the newest call has told, and why it has failed.
-    told: RefCell<Parameters>,
+    reported: RefCell<Parameters>,
     failure: RefCell<Option<Failure>>,
 }
 
 impl Functions<Vehicle> for Unit {
-    type Call = Told;
+    type Call = Report;
     type Actuator = &'static str;
 
     fn add_method(
@@ -248,7 +248,7 @@ impl Functions<Vehicle> for Unit {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&&'static str>,
-        run: &'static Method<Vehicle, Told>,
+        run: &'static Method<Vehicle, Report>,
     ) -> Result<(), Error> {
         let (actuator, run) = (actuator.copied(), Run::Method(run));
         self.listed.borrow_mut().push(Listed { signature, attributes, actuator, run });
@@ -260,7 +260,7 @@ impl Functions<Vehicle> for Unit {
         signature: Signature<'static>,
         attributes: Attributes,
         actuator: Option<&&'static str>,
-        run: &'static Free<Told>,
+        run: &'static Free<Report>,
     ) -> Result<(), Error> {
         let (actuator, run) = (actuator.copied(), Run::Free(run));
         self.listed.borrow_mut().push(Listed { signature, attributes, actuator, run });
@@ -299,12 +299,12 @@ impl Unit {
         let mut served = Parameters::<1024>::sized();
         block::read_arguments(arguments, &bytes, &mut served)?;
         block::prepare_results(results, &mut served)?;
-        let call = Told(Identity::m_unit("manager", 1)?, self.ended, RefCell::default(), RefCell::default());
+        let call = Report(Identity::m_unit("manager", 1)?, self.ended, RefCell::default(), RefCell::default());
         let outcome = match listed.run {
             Run::Method(run) => run(&mut self.vehicle.borrow_mut(), &call, &mut served),
             Run::Free(run) => run(&call, &mut served),
         };
-        *self.told.borrow_mut() = call.2.take();
+        *self.reported.borrow_mut() = call.2.take();
         *self.failure.borrow_mut() = call.3.take();
         outcome?;
         let mut bytes = vec![0; block::measure(results, &served)?];
@@ -353,7 +353,7 @@ impl Caller for Unit {
 impl BlockingCaller for Unit {
     fn wait(&self, outgoing: Outgoing<'_, ()>) -> Result<(), CallError<(), Option<Detail>>> {
         let outcome = self.ask(outgoing.callee, outgoing.parameters, outgoing.options);
-        match outgoing.progress.map(|hear| hear(&self.told.borrow())) {
+        match outgoing.progress.map(|hear| hear(&self.reported.borrow())) {
             Some(ControlFlow::Break(())) => Err(Error::Cancelled.into()),
             _ => outcome,
         }
@@ -434,10 +434,10 @@ fn a_client_gets_what_the_service_gives() {
 fn progress_and_failures_are_typed() {
     let unit = unit();
     let agv = AgvClient::at(&unit);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let mut dock = |gate| {
         let on_progress = |left| {
-            told.push(left);
+            reported.push(left);
             ControlFlow::Continue(())
         };
         agv.dock(gate).watch(on_progress).wait().unwrap_err()
@@ -450,7 +450,7 @@ fn progress_and_failures_are_typed() {
     // Longer than it is declared: the rest is told.
     let failed = dock(9);
     assert_eq!((failed.values(), failed.text()), (None, "the way is blocked"));
-    assert_eq!(told, [Left { left: 2.5 }; 2]);
+    assert_eq!(reported, [Left { left: 2.5 }; 2]);
     assert_eq!(agv.dock(1).wait(), Err(error.into()), "without what it tells");
     let cancelled = agv
         .undock()
@@ -494,7 +494,7 @@ fn a_task_awaits_the_same() {
 #[test]
 fn another_version_at_the_peer_is_told_before_anything_is_sent() {
     let mut unit = unit();
-    for (theirs, told) in [
+    for (theirs, reported) in [
         ("add(a: int, b: float) -> (sum: int)", Some("argument b is float there and int here")),
         ("add(a: int, c: int) -> (sum: int)", Some("argument c is int there and missing here")),
         ("add(a: int, b: int) -> (sum: float)", Some("result sum is float there and int here")),
@@ -503,10 +503,10 @@ fn another_version_at_the_peer_is_told_before_anything_is_sent() {
     ] {
         unit.other = Some(Definition::parse(theirs).unwrap());
         unit.sent.borrow_mut().clear();
-        match (AgvClient::at(&unit).add(1, 2).wait(), told) {
-            (Err(failed), Some(told)) => {
+        match (AgvClient::at(&unit).add(1, 2).wait(), reported) {
+            (Err(failed), Some(reported)) => {
                 let mismatch = failed.mismatch().expect("it is of another version");
-                assert!(mismatch.to_string().contains(told), "{mismatch}");
+                assert!(mismatch.to_string().contains(reported), "{mismatch}");
                 assert_eq!(mismatch.function, "add");
                 assert_eq!(unit.sent.borrow().len(), 0);
             }

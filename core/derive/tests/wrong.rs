@@ -43,13 +43,13 @@ fn lists_that_the_core_is_built_without_are_a_readable_error() {
         .args(["check", "--offline", "--color=never", "--target-dir=target"])
         .current_dir(&package)
         .output();
-    let told = String::from_utf8(checked.unwrap().stderr).unwrap();
+    let reported = String::from_utf8(checked.unwrap().stderr).unwrap();
     for wrong in [
         "error: lists and `Option` need the feature `nested` of the core\n  --> src/lib.rs:11:",
         "error[E0277]: `Place` cannot be a variable\n  --> src/lib.rs:12:",
         "where the core has the feature `nested`, also structs that `#[derive(Variables)]`",
     ] {
-        assert!(told.contains(wrong), "{told}");
+        assert!(reported.contains(wrong), "{reported}");
     }
-    assert!(!told.contains("E0599"), "{told}");
+    assert!(!reported.contains("E0599"), "{reported}");
 }

@@ -109,10 +109,10 @@ impl Initiator {
         prologue: &[u8; 32],
         ephemeral: &[u8; 32],
     ) -> Result<(Self, [u8; MESSAGE_BYTES]), HandshakeError> {
-        let begun =
+        let started =
             Self { key: key.clone(), prologue: *prologue, ephemeral: Sensitive::<[u8; 32]>::from_slice(ephemeral) };
-        let (_, message) = begun.state()?;
-        Ok((begun, message))
+        let (_, message) = started.state()?;
+        Ok((started, message))
     }
 
     /// As it is when the message has been made.

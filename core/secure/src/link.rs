@@ -87,8 +87,8 @@ impl Proving {
         if !begins {
             return Ok((Self::Responding(prologue, credentials), None));
         }
-        let begun = Initiator::begin(&credentials.key, &prologue, &credentials.fresh.ephemeral(&prologue));
-        let (initiator, message) = begun.map_err(|_| CloseReason::BadProof)?;
+        let started = Initiator::begin(&credentials.key, &prologue, &credentials.fresh.ephemeral(&prologue));
+        let (initiator, message) = started.map_err(|_| CloseReason::BadProof)?;
         Ok((Self::Initiating(initiator, credentials.fresh.clone()), Some(message)))
     }
 
@@ -172,7 +172,7 @@ impl Sealing {
     }
 
     /// The generation and the key of this end's datagrams that the peer is told.
-    const fn told(&self) -> (u8, &DatagramKey) {
+    const fn reported(&self) -> (u8, &DatagramKey) {
         match &self.renewing {
             Renewing::Turning(turning) => (self.next_generation(), &turning.own),
             Renewing::No | Renewing::Proving(_) => (self.sealer.generation(), self.sealer.key()),
@@ -322,9 +322,9 @@ impl Secure for Noise {
 
     fn confirmation(&self) -> [u8; CONFIRMATION_BYTES] {
         let mut confirmation = [0; CONFIRMATION_BYTES];
-        if let Some((generation, key)) = self.sealed().map(Sealing::told) {
-            let told = core::iter::once(&generation).chain(key.expose());
-            confirmation.iter_mut().zip(told).for_each(|(to, from)| *to = *from);
+        if let Some((generation, key)) = self.sealed().map(Sealing::reported) {
+            let reported = core::iter::once(&generation).chain(key.expose());
+            confirmation.iter_mut().zip(reported).for_each(|(to, from)| *to = *from);
         }
         confirmation
     }
@@ -646,10 +646,10 @@ mod tests {
         assert!(confirm(&mut other, &mut dialler).is_err(), "not before its turn");
         turn(&mut other, &mut dialler);
         assert_eq!((other.turn(), dialler.turned()), (wrong, wrong), "once each");
-        let told = other.confirmation();
-        assert!(dialler.confirmed(&[&[2], &told[1..]].concat()).is_err(), "the next generation only");
-        assert_eq!(dialler.confirmed(&told), Ok(()));
-        assert!(dialler.confirmed(&told).is_err(), "once");
+        let reported = other.confirmation();
+        assert!(dialler.confirmed(&[&[2], &reported[1..]].concat()).is_err(), "the next generation only");
+        assert_eq!(dialler.confirmed(&reported), Ok(()));
+        assert!(dialler.confirmed(&reported).is_err(), "once");
         assert_eq!(dialler.acknowledged(), wrong, "not before it has turned itself");
     }
 

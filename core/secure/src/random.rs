@@ -160,12 +160,12 @@ mod tests {
         let mut counter = Kept { value: 5, step: 0 };
         let alike: HashSet<_> = (0..BOOTS).flat_map(|_| drawn(&mut life(&mut counter))).collect();
         assert_eq!(alike.len(), 4, "this is what the counter is for");
-        let told_apart = (0..BOOTS).flat_map(|peer| {
+        let distinguished = (0..BOOTS).flat_map(|peer| {
             let mut random = life(&mut counter);
             random.stir(&peer.to_le_bytes());
             drawn(&mut random)
         });
-        assert_eq!(told_apart.collect::<HashSet<_>>().len() as u64, BOOTS * 4);
+        assert_eq!(distinguished.collect::<HashSet<_>>().len() as u64, BOOTS * 4);
     }
 
     /// The keys of a link are new if one end's draw is: whatever is sealed under the same number differs.

@@ -232,7 +232,7 @@ pub enum OrderOutcome {
     /// It began, and ended so.
     Ended(LeaseEnd),
     /// It has not begun, and does not any more, because its link has ended.
-    NotBegun,
+    NotStarted,
     /// The node cannot tell, and it may have run: it was started since, or has done something for another caller, or by an earlier link.
     Unknown,
 }
@@ -242,7 +242,7 @@ impl ActuatorState {
     pub fn outcome_of(&self, link: u32, call: u32) -> OrderOutcome {
         match self.last {
             Some(last) if last.link != link || last.call == 0 => OrderOutcome::Unknown,
-            Some(LastOrder { call: begun, .. }) if begun < call => OrderOutcome::NotBegun,
+            Some(LastOrder { call: started, .. }) if started < call => OrderOutcome::NotStarted,
             Some(LastOrder { end: None, .. }) => OrderOutcome::Runs,
             Some(LastOrder { end: Some(end), .. }) => OrderOutcome::Ended(end),
             None => OrderOutcome::Unknown,
@@ -427,14 +427,14 @@ mod tests {
     #[test]
     fn only_what_is_certain_of_an_order_is_told() {
         let last = LastOrder { holder: 1, link: 9, call: 7, claim: Claim::NONE, end: Some(LeaseEnd::Finished) };
-        let told = |last| ActuatorState { latch: None, last }.outcome_of(9, 7);
-        assert_eq!(told(None), OrderOutcome::Unknown, "the node was started since");
-        assert_eq!(told(Some(last)), OrderOutcome::Ended(LeaseEnd::Finished));
-        assert_eq!(told(Some(LastOrder { end: None, ..last })), OrderOutcome::Runs);
-        assert_eq!(told(Some(LastOrder { call: 6, ..last })), OrderOutcome::NotBegun);
-        assert_eq!(told(Some(LastOrder { link: 8, ..last })), OrderOutcome::Unknown, "of another link");
+        let reported = |last| ActuatorState { latch: None, last }.outcome_of(9, 7);
+        assert_eq!(reported(None), OrderOutcome::Unknown, "the node was started since");
+        assert_eq!(reported(Some(last)), OrderOutcome::Ended(LeaseEnd::Finished));
+        assert_eq!(reported(Some(LastOrder { end: None, ..last })), OrderOutcome::Runs);
+        assert_eq!(reported(Some(LastOrder { call: 6, ..last })), OrderOutcome::NotStarted);
+        assert_eq!(reported(Some(LastOrder { link: 8, ..last })), OrderOutcome::Unknown, "of another link");
         let others = LastOrder { holder: 2, ..last.of_another() };
-        assert_eq!(told(Some(others)), OrderOutcome::Unknown);
+        assert_eq!(reported(Some(others)), OrderOutcome::Unknown);
     }
 
     #[test]

@@ -479,7 +479,7 @@ impl Builder {
     pub(super) fn declare(&mut self, section: Section, spec: VariableSpec<'_>) -> Result<(), Error> {
         self.begin_results()?;
         let at = match self.section {
-            Some((begun, at)) if begun == section => at,
+            Some((started, at)) if started == section => at,
             _ => {
                 self.push(&[section as u8, 0])?;
                 self.bytes.len().saturating_sub(1)

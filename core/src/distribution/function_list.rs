@@ -221,7 +221,7 @@ impl<S: Storage> TheirFunctionList<S> {
     /// A stream of which the peer has not been told what this unit wants: its place, its generation and the interval.
     #[cfg(feature = "streams")]
     pub(crate) fn untold_wish(&self) -> Option<(Slot, Generation, u32)> {
-        let untold = |entry: &&Entry| entry.function.is_some() && entry.wish.interval != entry.wish.told;
+        let untold = |entry: &&Entry| entry.function.is_some() && entry.wish.interval != entry.wish.advertised;
         let entry = self.table.entries.iter().find(untold)?;
         let function = self.table.of(entry)?;
         Some((function.slot, function.generation, entry.wish.interval))

@@ -57,10 +57,10 @@ impl Definition {
         let signature = self.signature();
         let has = |specs: VariableSpecs<'_>| specs.named(variable).is_some();
         #[cfg(feature = "details")]
-        let is_told = has(signature.progress()) || has(signature.failure());
+        let is_reported = has(signature.progress()) || has(signature.failure());
         #[cfg(not(feature = "details"))]
-        let is_told = false;
-        if !is_told && !has(signature.arguments()) && !has(signature.results()) {
+        let is_reported = false;
+        if !is_reported && !has(signature.arguments()) && !has(signature.results()) {
             return Err(Error::UnknownVariable);
         }
         if signature.unit_of(variable).is_some() {

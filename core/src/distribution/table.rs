@@ -72,12 +72,12 @@ pub struct Entry<H = ()> {
 pub(crate) struct Wish {
     pub(crate) interval: u32,
     /// As the peer was told.
-    pub(crate) told: u32,
+    pub(crate) advertised: u32,
 }
 
 #[cfg(feature = "streams")]
 impl Wish {
-    const NONE: Self = Self { interval: super::control::NO_SUBSCRIPTION, told: super::control::NO_SUBSCRIPTION };
+    const NONE: Self = Self { interval: super::control::NO_SUBSCRIPTION, advertised: super::control::NO_SUBSCRIPTION };
 }
 
 pub(super) struct Stored<H> {

@@ -180,10 +180,11 @@ pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     #[cfg(feature = "help")]
     let stream = {
         // What there is no room for is the help.
-        let told = if V::HELP.is_empty() { Ok(stream.clone()) } else { stream.clone().help(V::HELP) };
+        let reported = if V::HELP.is_empty() { Ok(stream.clone()) } else { stream.clone().help(V::HELP) };
         let mut units = V::UNITS.iter();
-        let told = told.and_then(|told| units.try_fold(told, |told, (variable, unit)| told.unit(variable, unit)));
-        told.unwrap_or(stream)
+        let reported = reported
+            .and_then(|reported| units.try_fold(reported, |reported, (variable, unit)| reported.unit(variable, unit)));
+        reported.unwrap_or(stream)
     };
     Ok(stream)
 }

@@ -268,8 +268,8 @@ impl Writer<'_> {
     #[inline]
     fn put(&mut self, bytes: &[u8]) {
         let end = self.position.saturating_add(bytes.len());
-        if let Some(place) = self.out.get_mut(self.position..end) {
-            copy(bytes, place);
+        if let Some(span) = self.out.get_mut(self.position..end) {
+            copy(bytes, span);
             self.position = end;
         }
     }

@@ -73,7 +73,7 @@ pub enum Cancelled {
     /// It has been, and the port does not know.
     Untold,
     /// The port knows.
-    Told,
+    Report,
 }
 
 /// A call that was accepted, without its arguments.
@@ -334,7 +334,7 @@ impl<S: Storage> Calls<S> {
         let is_untold = |head: &CallHead| head.cancelled == Cancelled::Untold;
         let index = self.running.iter().position(|head| head.as_ref().is_some_and(is_untold))?;
         let head = self.running.get_mut(index)?.as_mut()?;
-        head.cancelled = Cancelled::Told;
+        head.cancelled = Cancelled::Report;
         Some(Ticket { index: index as u16, id: head.id })
     }
 

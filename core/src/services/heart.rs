@@ -150,9 +150,9 @@ mod tests {
         for beaten in [1, 2, 1_001, wrap - 1, wrap, wrap + 1, 3 * wrap + 500] {
             heart.beat(at(beaten));
             for later in [0, 1, 399, 400, 1_000_000] {
-                let told = age(heart, beaten + later);
-                assert!(told >= Some(later), "{beaten} {later}: {told:?}");
-                assert!(told <= Some(later + 2), "{beaten} {later}: {told:?}");
+                let reported = age(heart, beaten + later);
+                assert!(reported >= Some(later), "{beaten} {later}: {reported:?}");
+                assert!(reported <= Some(later + 2), "{beaten} {later}: {reported:?}");
             }
         }
     }

@@ -188,10 +188,10 @@ impl Lease {
         self.is_on_ramp(now, self.stopped.load(Ordering::Acquire))
     }
 
-    fn is_on_ramp(&self, now: Instant, begun: u32) -> bool {
+    fn is_on_ramp(&self, now: Instant, started: u32) -> bool {
         // A reader may have looked at the clock a little before the unit did.
-        let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(begun).wrapping_add(NEWER);
-        begun != 0 && self.has_ramp() && since < u32::from(self.ramp.load(Ordering::Acquire)).saturating_add(NEWER)
+        let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(started).wrapping_add(NEWER);
+        started != 0 && self.has_ramp() && since < u32::from(self.ramp.load(Ordering::Acquire)).saturating_add(NEWER)
     }
 
     /// The same for one order: once it is dead it stays so, also when another order holds the lease.
@@ -352,8 +352,8 @@ impl Lease {
     /// The ramp begins, unless it has: at `now`, or when the order's time was over.
     fn stop_at(&self, now: Instant, end: u32) {
         if self.stopped.load(Ordering::Acquire) == 0 {
-            let begun = if is_before(now, end) { odd_millis(now) as u32 } else { end };
-            self.stopped.store(begun, Ordering::Release);
+            let started = if is_before(now, end) { odd_millis(now) as u32 } else { end };
+            self.stopped.store(started, Ordering::Release);
         }
     }
 
@@ -385,8 +385,8 @@ impl Lease {
     pub fn state(&self) -> ActuatorState {
         let how = LeaseEnd::of(self.how.load(Ordering::Acquire).into());
         let end = if self.has_order() { None } else { Some(how) };
-        let has_begun = self.order.load(Ordering::Acquire) != 0;
-        let last = has_begun.then(|| LastOrder {
+        let has_started = self.order.load(Ordering::Acquire) != 0;
+        let last = has_started.then(|| LastOrder {
             holder: self.holder.load(Ordering::Acquire),
             link: self.link.load(Ordering::Acquire),
             call: self.call.load(Ordering::Acquire),

@@ -12,7 +12,7 @@
 //! | the unit starts | `Node::new`, and [`Hub`](hub::Hub) around it |
 //! | at `node.next_deadline()`, and after anything else was done to the hub | `node.poll` until `None` |
 //! | … it returns `Command::Dial` | open a stream, `Session::new` with `dialed: true`, `node.dialing`; or `node.dial_failed` |
-//! | … it returns `Command::Tell(link, directive)` | `session.direct`, with nothing of the hub locked |
+//! | … it returns `Command::Notify(link, directive)` | `session.direct`, with nothing of the hub locked |
 //! | a stream that was dialled is open, or one was accepted | `session.connected` |
 //! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.poll` and `session.next_call`, each until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
 //! | the stream takes bytes again, and `session.wants_to_write()` | `session.writable` |

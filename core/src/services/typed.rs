@@ -79,7 +79,7 @@ pub trait AnyCall {
     /// Tells the caller how far the call is, if it wants to know and the signature says `progress (…)`. Nothing on a port whose
     /// services have run to their end before anything can be sent, as on boards. An error where the values do not fit the signature.
     #[cfg(feature = "details")]
-    fn tell(&self, _progress: &ParametersView) -> Result<(), Error> {
+    fn notify(&self, _progress: &ParametersView) -> Result<(), Error> {
         Ok(())
     }
     /// Whether the caller has given the call up, waits no longer, or is gone; never on a port as above.
@@ -93,9 +93,9 @@ pub trait AnyCall {
 /// declares both for its signature, as `progress (…)` and `fails (…)`. `()` stands for nothing. Every [`AnyCall`] is one.
 #[cfg(feature = "details")]
 pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
-    /// Tells the caller how far the call is, as [`tell`](AnyCall::tell) does.
+    /// Tells the caller how far the call is, as [`notify`](AnyCall::tell) does.
     fn progress(&self, values: &P) -> Result<(), Error> {
-        values.with_parameters(|values| self.tell(values))?
+        values.with_parameters(|values| self.notify(values))?
     }
 
     /// What the service returns for a failure with this code, whose text and values go to the caller. Text and bytes that are longer

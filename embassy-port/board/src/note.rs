@@ -34,7 +34,7 @@ pub enum Reason {
 
 impl Reason {
     /// Those that are noted, as opposed to what registers tell.
-    const NOTED: [Self; 4] = [Self::Watchdog, Self::Panic, Self::Fault, Self::StackOverflow];
+    const RECORDED: [Self; 4] = [Self::Watchdog, Self::Panic, Self::Fault, Self::StackOverflow];
 
     /// How it is noted: words that memory hardly holds when power comes.
     const fn word(self) -> u32 {
@@ -63,8 +63,8 @@ impl<'f> Place<'f> {
     /// Of a panic, in images with log lines. Those without do not tell it: files and lines of all panics that could come took
     /// a tenth of such an image.
     pub fn of(panic: &'f PanicInfo<'_>) -> Self {
-        let told = if cfg!(feature = "defmt") { panic.location() } else { None };
-        told.map_or(Self::NOWHERE, |location| Self { file: location.file(), at: location.line() })
+        let reported = if cfg!(feature = "defmt") { panic.location() } else { None };
+        reported.map_or(Self::NOWHERE, |location| Self { file: location.file(), at: location.line() })
     }
 }
 
@@ -87,7 +87,7 @@ pub(crate) fn take() -> Option<(Reason, u32)> {
     let [word, place] = &NOTE;
     let found = word.load(Ordering::Relaxed);
     word.store(0, Ordering::Relaxed);
-    let reason = Reason::NOTED.into_iter().find(|reason| reason.word() == found)?;
+    let reason = Reason::RECORDED.into_iter().find(|reason| reason.word() == found)?;
     Some((reason, place.load(Ordering::Relaxed)))
 }
 
@@ -121,7 +121,7 @@ mod tests {
     #[test]
     fn a_note_is_read_once_and_noise_is_none() {
         assert_eq!(take(), None);
-        for reason in Reason::NOTED {
+        for reason in Reason::RECORDED {
             leave(reason, 7);
             assert_eq!(take(), Some((reason, 7)));
             assert_eq!(take(), None);

@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn each_mistake_is_told() {
+    fn each_mistake_is_reported() {
         assert_eq!(error("name=a id=1 colour=red"), TextError::Word(3));
         assert_eq!(error("name=a id"), TextError::Word(2));
         assert_eq!(error("name=a id=1 id=2"), TextError::Twice(Field::Id));

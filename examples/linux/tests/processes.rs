@@ -159,19 +159,19 @@ fn the_bumper_stops_the_motion_until_a_reset() {
         manager.send("").unwrap();
     }
     agv.seen("arrived at", STEP).unwrap();
-    let mut tell = |command: &str, answer: &str| {
+    let mut notify = |command: &str, answer: &str| {
         manager.send(command).unwrap();
         manager.expect(answer, STEP).unwrap();
     };
-    tell("go_to 0 100 100", "= accepted");
+    notify("go_to 0 100 100", "= accepted");
     agv.expect("driving to [100", STEP).unwrap();
     agv.send("press").unwrap();
     agv.seen("the order has ended", STEP).unwrap();
-    tell("reset 0", "! the service failed with code 2");
-    tell("go_to 0 70 70", "request to agv-1/11 failed: what it moves was stopped");
+    notify("reset 0", "! the service failed with code 2");
+    notify("go_to 0 70 70", "request to agv-1/11 failed: what it moves was stopped");
     agv.send("release").unwrap();
     agv.expect("the bumper is free", STEP).unwrap();
-    tell("go_to 0 70 70", "request to agv-1/11 failed: what it moves was stopped");
+    notify("go_to 0 70 70", "request to agv-1/11 failed: what it moves was stopped");
     resets(&mut manager);
     // The first one may be told Busy: the link looks at the order that the bumper ended when another one comes, or its lease is over.
     let end = Instant::now() + STEP;

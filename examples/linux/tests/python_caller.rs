@@ -32,7 +32,7 @@ fn manager(fleet: u32) -> Option<(Process, KeyFolder)> {
 }
 
 /// Sends a command and waits for what it leads to.
-fn tell(manager: &mut Process, command: &str, outcome: &str) {
+fn command(manager: &mut Process, command: &str, outcome: &str) {
     manager.send(command).unwrap();
     manager.expect(outcome, PATIENCE).unwrap();
 }
@@ -53,32 +53,32 @@ fn a_manager_written_from_the_document_calls_the_agv() {
     agv.seen("call_mechanic: one comes in 5 minutes", PATIENCE).unwrap();
 
     // A way of a second, under a lease of 400 ms.
-    tell(&mut manager, "pos_info 9 9", "pos_info {'position': [0, 0]}");
-    tell(&mut manager, "go_to 2 0", "go_to {}");
+    command(&mut manager, "pos_info 9 9", "pos_info {'position': [0, 0]}");
+    command(&mut manager, "go_to 2 0", "go_to {}");
     agv.expect("driving to [2.000, 0.000]", PATIENCE).unwrap();
     agv.expect("arrived at [2.000, 0.000]", PATIENCE).unwrap();
     manager.expect("lease of go_to ended: finished", PATIENCE).unwrap();
-    tell(&mut manager, "pos_info 9 9", "pos_info {'position': [2, 0]}");
+    command(&mut manager, "pos_info 9 9", "pos_info {'position': [2, 0]}");
 
     // A later call takes the place of an earlier one, and is released.
-    tell(&mut manager, "go_to 2 100", "go_to {}");
-    tell(&mut manager, "go_to 2 -100", "lease of go_to ended: replaced");
+    command(&mut manager, "go_to 2 100", "go_to {}");
+    command(&mut manager, "go_to 2 -100", "lease of go_to ended: replaced");
     agv.expect("driving to [2.000, -100.000]", PATIENCE).unwrap();
     manager.send("release").unwrap();
     agv.expect("the order has ended", PATIENCE).unwrap();
 
     // One that is renewed no more ends by itself.
-    tell(&mut manager, "go_to 100 0", "go_to {}");
-    tell(&mut manager, "lapse", "lease of go_to ended: expired");
+    command(&mut manager, "go_to 100 0", "go_to {}");
+    command(&mut manager, "lapse", "lease of go_to ended: expired");
     agv.seen("lease of go_to expired, held by AGV_manager/1", PATIENCE).unwrap();
 
     // An emergency, as a datagram and in the stream.
-    tell(&mut manager, "go_to 100 0", "go_to {}");
+    command(&mut manager, "go_to 100 0", "go_to {}");
     agv.expect("driving to", PATIENCE).unwrap();
-    tell(&mut manager, "stop", "stop {}");
+    command(&mut manager, "stop", "stop {}");
     agv.expect("AGV_manager/1 said so", PATIENCE).unwrap();
     manager.send("release").unwrap();
-    tell(&mut manager, "pos_info 9 9", "pos_info {'position': [");
+    command(&mut manager, "pos_info 9 9", "pos_info {'position': [");
     assert!(!manager.has("failed"), "{:?}", manager.lines());
 
     manager.end_input();
@@ -107,9 +107,9 @@ fn a_manager_written_from_the_document_follows_new_keys() {
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();
     manager.expect("functions stop(), hold()", PATIENCE).unwrap();
-    tell(&mut manager, "hold", "hold {}");
+    command(&mut manager, "hold", "hold {}");
     for _ in 0..3 {
-        tell(&mut manager, "stop", "stop {}");
+        command(&mut manager, "stop", "stop {}");
         manager.expect("new keys", PATIENCE).unwrap();
     }
     manager.send("release").unwrap();

@@ -37,7 +37,7 @@ impl SUnit {
             match command {
                 Command::Dial { to, identity } => self.dial(now, to, identity.as_ref()),
                 // With one link there is never a second one of which it could be told.
-                Command::Tell(..) => {}
+                Command::Notify(..) => {}
             }
         }
     }

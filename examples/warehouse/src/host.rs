@@ -76,7 +76,7 @@ pub fn run(options: &Options) -> Result<()> {
     let mut host = Host::new(options, &map)?;
     let (sender, commands) = channel();
     std::thread::spawn(move || hear(&sender));
-    let (mut last, mut told) = (Instant::now(), Instant::now());
+    let (mut last, mut reported) = (Instant::now(), Instant::now());
     loop {
         match commands.try_recv() {
             Ok(line) => host.command(&line)?,
@@ -92,10 +92,10 @@ pub fn run(options: &Options) -> Result<()> {
         }
         host.turn(now, now.saturating_duration_since(last))?;
         last = now;
-        let is_told = now.saturating_duration_since(told) >= Duration::from_secs(1);
-        host.write(is_told)?;
-        if is_told {
-            told = now;
+        let is_reported = now.saturating_duration_since(reported) >= Duration::from_secs(1);
+        host.write(is_reported)?;
+        if is_reported {
+            reported = now;
         }
     }
 }

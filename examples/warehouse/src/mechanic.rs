@@ -69,8 +69,8 @@ pub fn run(options: &Options) -> Result<()> {
         let Some((vehicle, _)) = jobs.with(|jobs| jobs.front().filter(|(_, due)| *due <= now).cloned()) else {
             continue;
         };
-        let told = unit.m_unit(MANAGER.0).map(|manager| FloorClient::at(&manager).mended(&vehicle).wait());
-        if matches!(told, Ok(Ok(()))) {
+        let reported = unit.m_unit(MANAGER.0).map(|manager| FloorClient::at(&manager).mended(&vehicle).wait());
+        if matches!(reported, Ok(Ok(()))) {
             jobs.with(VecDeque::pop_front);
             println!("mended {vehicle}");
         }

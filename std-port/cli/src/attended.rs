@@ -40,9 +40,9 @@ impl Attended {
     /// Starts to watch; `release` is called at the end, in a thread of its own.
     pub(crate) fn watch(release: impl FnOnce() + Send + 'static) -> io::Result<Self> {
         let end = Arc::<OnceLock<&'static str>>::default();
-        let noted = end.clone();
+        let recorded = end.clone();
         std::thread::Builder::new().name("attended".into()).spawn(move || {
-            let _ = noted.set(await_end());
+            let _ = recorded.set(await_end());
             release();
         })?;
         Ok(Self { end })

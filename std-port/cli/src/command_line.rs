@@ -59,7 +59,7 @@ pub(crate) fn parse() -> Result<CommandLine, ExitCode> {
     parsed.map_err(|error| {
         let json = std::env::args_os().any(|argument| argument == "--json");
         if json && error.use_stderr() {
-            return exit::tell(&Ended::usage(error.to_string().trim()), json);
+            return exit::report(&Ended::usage(error.to_string().trim()), json);
         }
         // A closed pipe is no error.
         let _ = error.print();

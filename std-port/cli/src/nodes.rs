@@ -234,8 +234,11 @@ mod tests {
     #[test]
     fn who_is_not_there_is_told_with_who_is() {
         let nodes = [node("agv-1", 11, true), node("lift", 2, true)];
-        let told = not_there(&nodes, "agv1/11", "");
-        assert!(told.contains("there are agv-1/11, lift/2.") && told.contains("`cara doctor agv1/11`"), "{told}");
+        let reported = not_there(&nodes, "agv1/11", "");
+        assert!(
+            reported.contains("there are agv-1/11, lift/2.") && reported.contains("`cara doctor agv1/11`"),
+            "{reported}"
+        );
         assert!(
             not_there(&nodes[1..], "#19", "").ends_with("there is lift/2. `cara doctor '#19'` looks for the reason")
         );

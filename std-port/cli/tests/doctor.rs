@@ -23,10 +23,13 @@ fn a_program_that_does_not_share_the_port_is_named_with_its_process() {
     let clinic = Clinic::new();
     let _other = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, clinic.port)).unwrap();
     for arguments in [&["agv"][..], &[]] {
-        let told = clinic.doctor(arguments);
-        told.is(&["port-in-use"], 4);
+        let reported = clinic.doctor(arguments);
+        reported.is(&["port-in-use"], 4);
         let process = format!("process {}", std::process::id());
-        assert!(told.found(0).contains(&process) && told.found(0).contains(&clinic.port.to_string()), "{told:?}");
+        assert!(
+            reported.found(0).contains(&process) && reported.found(0).contains(&clinic.port.to_string()),
+            "{reported:?}"
+        );
     }
 }
 
@@ -36,10 +39,10 @@ fn a_node_of_another_fleet_is_told_with_both_fleets() {
     let _manager = clinic.manager("boss", 64);
     let other = clinic.fleet.wrapping_add(1);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").fleet(other));
-    let told = clinic.doctor(&["agv"]);
-    told.is(&["other-fleet"], 4);
+    let reported = clinic.doctor(&["agv"]);
+    reported.is(&["other-fleet"], 4);
     let both = [clinic.fleet, other].map(|fleet| format!("fleet {fleet}"));
-    assert!(both.iter().all(|fleet| told.found(0).contains(fleet)), "{told:?}");
+    assert!(both.iter().all(|fleet| reported.found(0).contains(fleet)), "{reported:?}");
 }
 
 #[test]
@@ -48,9 +51,9 @@ fn a_manager_of_another_fleet_is_why_its_node_waits() {
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
     let far = clinic.system("boss").fleet(clinic.fleet.wrapping_add(1)).build().unwrap();
     far.start().unwrap();
-    let told = clinic.doctor(&["agv"]);
-    told.is(&["other-fleet"], 4);
-    assert!(told.found(0).starts_with("boss/1 "), "{told:?}");
+    let reported = clinic.doctor(&["agv"]);
+    reported.is(&["other-fleet"], 4);
+    assert!(reported.found(0).starts_with("boss/1 "), "{reported:?}");
 }
 
 #[test]
@@ -58,9 +61,9 @@ fn a_node_of_another_manager_is_told_with_both_names() {
     let clinic = Clinic::new();
     let _manager = clinic.manager("boss", 64);
     let _agv = clinic.started(clinic.unit("agv", 7, "chief"));
-    let told = clinic.doctor(&["agv/7"]);
-    told.is(&["wrong-manager"], 4);
-    assert!(["chief/1", "boss/1"].iter().all(|name| told.found(0).contains(name)), "{told:?}");
+    let reported = clinic.doctor(&["agv/7"]);
+    reported.is(&["wrong-manager"], 4);
+    assert!(["chief/1", "boss/1"].iter().all(|name| reported.found(0).contains(name)), "{reported:?}");
 }
 
 #[test]
@@ -78,9 +81,9 @@ fn a_node_of_another_version_is_told_with_its_version() {
     while_running(
         || search.send(),
         || {
-            let told = clinic.doctor(&["agv"]);
-            told.is(&["other-version"], 4);
-            assert!(told.found(0).contains("version 9"), "{told:?}");
+            let reported = clinic.doctor(&["agv"]);
+            reported.is(&["other-version"], 4);
+            assert!(reported.found(0).contains("version 9"), "{reported:?}");
         },
     );
 }
@@ -116,13 +119,13 @@ fn a_full_manager_is_told_by_itself_and_by_what_it_says_on_the_network() {
     until("the second was refused", || !manager.findings().is_empty());
     clinic.doctor(&["second"]).is(&["full"], 4);
     // As from another host: the manager cannot be asked.
-    let told = clinic.doctor_elsewhere(&["second"]);
+    let reported = clinic.doctor_elsewhere(&["second"]);
     // If it kept silent for so long, it could be connected as well.
-    assert!(matches!(told.ids()[..], ["full"] | ["full", "ask-its-manager"]), "{told:?}");
+    assert!(matches!(reported.ids()[..], ["full"] | ["full", "ask-its-manager"]), "{reported:?}");
     clinic.doctor(&["first"]).is(&["connected"], 0);
-    let told = clinic.doctor(&["--listen", "3s"]);
-    told.is(&["full"], 4);
-    assert!(told.found(0).contains("boss/1") && told.found(0).contains("second/2"), "{told:?}");
+    let reported = clinic.doctor(&["--listen", "3s"]);
+    reported.is(&["full"], 4);
+    assert!(reported.found(0).contains("boss/1") && reported.found(0).contains("second/2"), "{reported:?}");
 }
 
 /// `agv/9` has no link, and looks for its manager where all hear it.
@@ -172,9 +175,9 @@ fn of_two_managers_that_hear_each_other_one_is_left() {
         events.try_iter().any(|event| matches!(event, cara_std::UnitEvent::Fenced { .. }))
     };
     until("one has stepped down", || is_fenced(&of_first) || is_fenced(&of_second));
-    let told = clinic.doctor(&["--listen", "3s"]);
-    let is_live = |at: usize| told.ids()[at] == "fenced" || told.found(at).starts_with("two live nodes ");
-    assert!(!(0..told.ids().len()).any(is_live), "{told:?}");
+    let reported = clinic.doctor(&["--listen", "3s"]);
+    let is_live = |at: usize| reported.ids()[at] == "fenced" || reported.found(at).starts_with("two live nodes ");
+    assert!(!(0..reported.ids().len()).any(is_live), "{reported:?}");
 }
 
 #[test]
@@ -185,9 +188,9 @@ fn a_manager_that_stands_still_is_told_and_nobody_is_to_start_a_second_one() {
     manager.stand_still();
     let of_unit = ["--unit", "boss/1", "--listen", "3s"];
     for arguments in [&["agv", "--listen", "3s"][..], &["boss"], &["--listen", "3s"], &of_unit] {
-        let told = clinic.doctor(arguments);
-        told.is(&["unit-hangs"], 4);
-        assert!(told.found(0).starts_with("boss/1 "), "{told:?}");
+        let reported = clinic.doctor(arguments);
+        reported.is(&["unit-hangs"], 4);
+        assert!(reported.found(0).starts_with("boss/1 "), "{reported:?}");
     }
 }
 
@@ -199,9 +202,9 @@ fn a_node_that_was_lost_is_told_with_time_and_reason() {
     until("it has come", || manager.number_of_s_units() == 1);
     agv.stop();
     until("it has left", || manager.number_of_s_units() == 0);
-    let told = clinic.doctor(&["agv", "--listen", "3s"]);
-    told.is(&["lost"], 4);
-    assert!(told.found(0).starts_with("agv/7 left boss/1 "), "{told:?}");
+    let reported = clinic.doctor(&["agv", "--listen", "3s"]);
+    reported.is(&["lost"], 4);
+    assert!(reported.found(0).starts_with("agv/7 left boss/1 "), "{reported:?}");
     // Without a named node it is no error: its operator stopped it.
     clinic.doctor(&["--listen", "3s"]).is(&["lost"], 0);
 }
@@ -211,9 +214,9 @@ fn a_node_that_is_not_there_at_all_is_not_heard() {
     let clinic = Clinic::new();
     let _manager = clinic.manager("boss", 64);
     let _other = clinic.started(clinic.unit("agv-8", 8, "boss"));
-    let told = clinic.doctor(&["agv-7", "--listen", "3s"]);
-    told.is(&["not-heard"], 4);
-    assert!(told.found(0).contains("there is agv-8/8"), "{told:?}");
+    let reported = clinic.doctor(&["agv-7", "--listen", "3s"]);
+    reported.is(&["not-heard"], 4);
+    assert!(reported.found(0).contains("there is agv-8/8"), "{reported:?}");
     // Another host cannot know.
     clinic.doctor_elsewhere(&["agv-7", "--listen", "3s"]).is(&["ask-its-manager"], 4);
 }
@@ -226,9 +229,9 @@ fn a_node_that_is_connected_is_told_with_its_address() {
     until("it has come", || manager.number_of_s_units() == 1);
     let address = manager.s_unit("agv").unwrap().address().unwrap().to_string();
     for name in ["agv", "agv/7", "#7"] {
-        let told = clinic.doctor(&[name]);
-        told.is(&["connected"], 0);
-        assert!(told.found(0).contains(&address) && told.found(0).contains("boss/1"), "{told:?}");
+        let reported = clinic.doctor(&[name]);
+        reported.is(&["connected"], 0);
+        assert!(reported.found(0).contains(&address) && reported.found(0).contains("boss/1"), "{reported:?}");
     }
     clinic.doctor(&["boss"]).is(&["answers"], 0);
     clinic.doctor_elsewhere(&["boss"]).is(&["answers"], 0);
@@ -246,10 +249,10 @@ fn a_node_that_starts_again_and_again_is_restarting() {
         agv.stop();
     };
     while_running(life, || {
-        let told = clinic.doctor(&["agv"]);
-        assert_eq!(told.ids()[0], "restarting", "{told:?}");
-        assert!(told.ids()[1..].iter().all(|id| *id == "connected"), "{told:?}");
-        assert_eq!(told.code, 4);
+        let reported = clinic.doctor(&["agv"]);
+        assert_eq!(reported.ids()[0], "restarting", "{reported:?}");
+        assert!(reported.ids()[1..].iter().all(|id| *id == "connected"), "{reported:?}");
+        assert_eq!(reported.code, 4);
     });
     assert_eq!(manager.number_of_m_units(), 0);
 }
@@ -260,9 +263,9 @@ fn a_manager_that_may_open_too_few_files_is_told_with_its_limit() {
     let _manager = clinic.manager_of_few_files(120);
     // It is up once it has a socket.
     until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
-    let told = clinic.doctor(&["--listen", "3s"]);
-    told.is(&["few-descriptors"], 4);
-    assert!(told.found(0).contains("may have 120 files open"), "{told:?}");
+    let reported = clinic.doctor(&["--listen", "3s"]);
+    reported.is(&["few-descriptors"], 4);
+    assert!(reported.found(0).contains("may have 120 files open"), "{reported:?}");
 }
 
 #[test]
@@ -324,9 +327,9 @@ fn an_interface_that_is_down_is_told_by_its_name() {
         ip("link add v0 type veth peer name v1");
         ip("address add 10.77.0.1/24 dev v0");
         let clinic = Clinic::on_all_interfaces();
-        let told = clinic.doctor(&["agv", "--listen", "3s"]);
-        told.is(&["interface-down"], 4);
-        assert!(told.found(0).contains("v0"), "{told:?}");
+        let reported = clinic.doctor(&["agv", "--listen", "3s"]);
+        reported.is(&["interface-down"], 4);
+        assert!(reported.found(0).contains("v0"), "{reported:?}");
     });
 }
 
@@ -338,9 +341,9 @@ fn a_firewall_that_drops_the_tcp_port_is_told_with_the_port() {
         let manager = clinic.manager("boss", 64);
         filter("inet cara", "input", &format!("tcp dport {} drop", manager.tcp_port())).unwrap();
         let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
-        let told = clinic.doctor(&["agv"]);
-        told.is(&["tcp-blocked"], 4);
-        assert!(told.found(0).contains(&format!("TCP port {}", manager.tcp_port())), "{told:?}");
+        let reported = clinic.doctor(&["agv"]);
+        reported.is(&["tcp-blocked"], 4);
+        assert!(reported.found(0).contains(&format!("TCP port {}", manager.tcp_port())), "{reported:?}");
     });
 }
 
@@ -390,8 +393,8 @@ fn a_link_on_which_signs_of_life_get_lost_is_told() {
         filter("inet cara", "input", &format!("udp dport != {} numgen random mod 2 0 drop", clinic.port)).unwrap();
         let count = |name| agv.counters().iter().find(|(known, _)| *known == name).map_or(0, |(_, count)| *count);
         until("signs of life are missed", || count("KeepAlivesMissed") >= 3);
-        let told = clinic.doctor(&["agv"]);
-        assert_eq!((told.ids()[0], told.code), ("lossy-link", 4), "{told:?}");
+        let reported = clinic.doctor(&["agv"]);
+        assert_eq!((reported.ids()[0], reported.code), ("lossy-link", 4), "{reported:?}");
     });
 }
 
@@ -421,9 +424,9 @@ fn broadcasts_that_do_not_reach_the_other_host_are_told() {
         let broadcasts = "meta pkttype broadcast udp dport 0-65535 drop";
         there.within(|| filter("inet cara", "input", broadcasts)).unwrap();
         far.go();
-        let told = clinic.doctor(&["boss"]);
-        told.is(&["broadcast-one-way"], 4);
-        assert!(told.found(0).contains("10.77.0.2:"), "{told:?}");
+        let reported = clinic.doctor(&["boss"]);
+        reported.is(&["broadcast-one-way"], 4);
+        assert!(reported.found(0).contains("10.77.0.2:"), "{reported:?}");
         // Without what keeps them away it answers.
         there.run("nft flush ruleset").unwrap();
         clinic.doctor(&["boss"]).is(&["answers"], 0);

@@ -7,7 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use cara_std::keys::{KeyRing, RootKey, parse_node, place};
+use cara_std::keys::{KeyRing, RootKey, location, parse_node};
 use cara_std::{Fleet, Identity, Role};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -70,7 +70,7 @@ impl Home {
     }
 
     fn file(&self, node: &str) -> PathBuf {
-        self.folder().join(place::file_name(&named(node), Fleet(7)))
+        self.folder().join(location::file_name(&named(node), Fleet(7)))
     }
 
     fn ring(&self, node: &str) -> KeyRing {
@@ -143,11 +143,11 @@ fn managers_know_each_other_and_their_own_vehicles() {
 fn who_is_revoked_is_in_nobody_s_file() {
     let home = Home::with_fleet();
     let stolen = home.ring("agv/1");
-    let told = home.json(&["revoke", "agv/1"]);
+    let reported = home.json(&["revoke", "agv/1"]);
     let changes: Vec<_> =
-        told["written"].as_array().unwrap().iter().map(|one| [&one["node"], &one["change"]]).collect();
+        reported["written"].as_array().unwrap().iter().map(|one| [&one["node"], &one["change"]]).collect();
     assert_eq!(changes, [["agv/1", "removed"], ["depot/1@m_unit", "replaced"], ["agv/2", "replaced"]]);
-    assert_eq!((&told["generations"], told["next"].as_array().unwrap().len()), (&serde_json::json!([1, 2]), 2));
+    assert_eq!((&reported["generations"], reported["next"].as_array().unwrap().len()), (&serde_json::json!([1, 2]), 2));
     let depot = home.ring("depot/1@m_unit");
     assert!(generations(&depot, "agv/1").is_empty() && !home.file("agv/1").exists());
     assert_eq!(generations(&depot, "agv/2"), [1, 2]);
@@ -254,7 +254,7 @@ fn no_key_is_printed() {
 }
 
 #[test]
-fn every_mistake_is_told() {
+fn every_mistake_is_reported() {
     let home = Home::new();
     home.refused(&[], 2, "cara keys");
     home.refused(&["derive", "agv/1"], 1, "`cara keys new-fleet --fleet 0`");
@@ -567,7 +567,7 @@ fn what_the_guide_says_about_files_is_enough_to_make_them() {
             return cara_processes::skip("python3 is not installed");
         };
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        let file = fs::read_to_string(home.folder().join(place::file_name(&node, Fleet(7)))).unwrap();
+        let file = fs::read_to_string(home.folder().join(location::file_name(&node, Fleet(7)))).unwrap();
         assert_eq!(String::from_utf8(made.stdout).unwrap(), file);
     }
 }
@@ -590,10 +590,14 @@ fn the_reference_has_every_key_of_the_json() {
     let words: Vec<_> = section.split(|c: char| !c.is_ascii_alphanumeric()).collect();
     let home = Home::with_fleet();
     let file = home.file("depot/1@m_unit");
-    let told = [home.json(&["revoke", "agv/1"]), home.json(&["show"]), home.json(&["show", file.to_str().unwrap()])];
-    for told in told.map(|told| told.to_string()) {
-        let keys: Vec<_> =
-            told.split("\":").filter_map(|before| before.rsplit('"').next()).filter(|key| !key.contains('}')).collect();
+    let reported =
+        [home.json(&["revoke", "agv/1"]), home.json(&["show"]), home.json(&["show", file.to_str().unwrap()])];
+    for reported in reported.map(|reported| reported.to_string()) {
+        let keys: Vec<_> = reported
+            .split("\":")
+            .filter_map(|before| before.rsplit('"').next())
+            .filter(|key| !key.contains('}'))
+            .collect();
         assert!(keys.len() > 3);
         keys.iter().for_each(|key| assert!(words.contains(key), "{key} is not in docs/cara.md"));
     }

@@ -119,15 +119,15 @@ fn each_mistake_is_told_with_its_line_and_column() {
     for (file, place, part) in MISTAKES {
         std::fs::write(folder.path().join("bad.toml"), file).unwrap();
         let checked = outcome(folder.path(), &["--check", "bad.toml"]);
-        let told = text(&checked.stderr);
-        assert_eq!(checked.status.code(), Some(2), "{file}\n{told}");
+        let reported = text(&checked.stderr);
+        assert_eq!(checked.status.code(), Some(2), "{file}\n{reported}");
         let start = format!("error: bad.toml:{place}: ");
-        assert!(told.starts_with(&start), "{file}\nexpected at {place}:\n{told}");
-        assert!(told.contains(part), "{file}\nexpected `{part}`:\n{told}");
+        assert!(reported.starts_with(&start), "{file}\nexpected at {place}:\n{reported}");
+        assert!(reported.contains(part), "{file}\nexpected `{part}`:\n{reported}");
         let line = file.lines().nth(place.split(':').next().unwrap().parse::<usize>().unwrap() - 1).unwrap();
-        assert!(told.contains(&format!(" | {line}\n")) && told.contains('^'), "{told}");
+        assert!(reported.contains(&format!(" | {line}\n")) && reported.contains('^'), "{reported}");
         // A node does not start with it either.
-        assert_eq!(text(&outcome(folder.path(), &["bad.toml"]).stderr), told);
+        assert_eq!(text(&outcome(folder.path(), &["bad.toml"]).stderr), reported);
     }
 }
 
@@ -136,9 +136,9 @@ fn all_mistakes_of_meaning_are_told_at_once() {
     let folder = TempDir::new().unwrap();
     let file = "name = \"\"\nid = 1\ndiscovery_port = 0\n[constraints]\nchunk_size = 1\n";
     std::fs::write(folder.path().join("bad.toml"), file).unwrap();
-    let told = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
+    let reported = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
     for place in ["bad.toml:1:8: ", "bad.toml:3:18: ", "bad.toml:5:14: "] {
-        assert!(told.contains(place), "{told}");
+        assert!(reported.contains(place), "{reported}");
     }
 }
 
@@ -148,15 +148,15 @@ fn all_mistakes_of_form_are_told_at_once() {
     let file = "nam = \"ä\"\nid = \"1\"\ntcp_port = 65536\n[constraint]\nkeep_alive = 5\n[log]\nlevl = \"info\"\n\
                 [[functions]]\nanswer = \"ehco\"\nsignature = \"f()\"\n";
     std::fs::write(folder.path().join("bad.toml"), file).unwrap();
-    let told = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
+    let reported = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
     for place in ["1:1: ", "2:6: ", "3:12: ", "4:2: ", "7:1: ", "9:10: "] {
-        assert!(told.contains(&format!("bad.toml:{place}")), "{place}\n{told}");
+        assert!(reported.contains(&format!("bad.toml:{place}")), "{place}\n{reported}");
     }
-    assert_eq!(told.matches("bad.toml:").count(), 6, "{told}");
+    assert_eq!(reported.matches("bad.toml:").count(), 6, "{reported}");
     // What is no TOML hides the rest.
     std::fs::write(folder.path().join("bad.toml"), format!("{file}id = \n")).unwrap();
-    let told = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
-    assert_eq!(told.matches("bad.toml:").count(), 1, "{told}");
+    let reported = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
+    assert_eq!(reported.matches("bad.toml:").count(), 1, "{reported}");
 }
 
 #[test]
@@ -204,9 +204,9 @@ fn a_port_in_use_of_the_command_line_is_told_with_what_to_do() {
     let (address, fleet) = (taken.local_addr().unwrap().to_string(), random_fleet().to_string());
     let arguments = ["--name", "a", "--id", "1", "--loopback", "--fleet", &fleet, "--metrics", &address, "--insecure"];
     let refused = outcome(folder.path(), &arguments);
-    let told = text(&refused.stderr);
-    assert_eq!(refused.status.code(), Some(1), "{told}");
-    assert!(told.contains("in use") && told.contains("with a free port"), "{told}");
+    let reported = text(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(1), "{reported}");
+    assert!(reported.contains("in use") && reported.contains("with a free port"), "{reported}");
 }
 
 #[test]
@@ -224,10 +224,13 @@ fn a_port_in_use_is_told_where_the_file_says_it() {
     ] {
         std::fs::write(folder.path().join("bad.toml"), format!("{start}{line}\n")).unwrap();
         let refused = outcome(folder.path(), &["bad.toml"]);
-        let told = text(&refused.stderr);
+        let reported = text(&refused.stderr);
         // Not only a mistake in the file: a restart of the node may succeed.
-        assert_eq!(refused.status.code(), Some(1), "{told}");
-        assert!(told.starts_with(&format!("error: bad.toml:{place}: ")) && told.contains("in use"), "{told}");
+        assert_eq!(refused.status.code(), Some(1), "{reported}");
+        assert!(
+            reported.starts_with(&format!("error: bad.toml:{place}: ")) && reported.contains("in use"),
+            "{reported}"
+        );
     }
 }
 
@@ -396,8 +399,8 @@ fn programs_that_misbehave_are_errors_of_their_own_calls() {
     // Nothing of what they started is left.
     until("no program is left", || children_of(&node).is_empty());
     let log = node.log();
-    for told in ["its time was up", "exit status: 7", "SIGSEGV", "no JSON", "m: expected int", "more than"] {
-        assert!(log.contains(told), "`{told}` in\n{log}");
+    for reported in ["its time was up", "exit status: 7", "SIGSEGV", "no JSON", "m: expected int", "more than"] {
+        assert!(log.contains(reported), "`{reported}` in\n{log}");
     }
 }
 

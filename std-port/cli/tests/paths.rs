@@ -183,8 +183,8 @@ impl Fleet {
 
     /// The ids of what the doctor finds about the vehicle, and the first text.
     fn doctor(&self) -> (Vec<String>, String) {
-        let told = self.json(&["doctor", "agv-17", "--fleet", &self.fleet, "--listen", "2s", "--json"]);
-        let findings = told["findings"].as_array().unwrap_or_else(|| panic!("{told}"));
+        let reported = self.json(&["doctor", "agv-17", "--fleet", &self.fleet, "--listen", "2s", "--json"]);
+        let findings = reported["findings"].as_array().unwrap_or_else(|| panic!("{reported}"));
         let text = |finding: &Value, part: &str| finding[part].as_str().unwrap_or_default().to_owned();
         (findings.iter().map(|finding| text(finding, "id")).collect(), text(&findings[0], "found"))
     }

@@ -49,7 +49,7 @@ fn refused(folder: &Path, arguments: &[&str], code: i32, text: &str) {
     assert!(said.contains(text), "{arguments:?}: {said}");
 }
 
-fn told<'a>(board: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+fn reported<'a>(board: &'a str, more: &[&'a str]) -> Vec<&'a str> {
     [&[board], &WHO[..], more].concat()
 }
 
@@ -71,7 +71,7 @@ fn with_probe() -> TempDir {
 fn a_file_has_what_the_command_line_says() {
     let folder = folder();
     let more = ["--fleet", "7", "--address", "10.0.0.17/24", "--gateway", "10.0.0.1", "--output", "page.bin"];
-    let said = done(folder.path(), &told("nucleo-f767zi", &more));
+    let said = done(folder.path(), &reported("nucleo-f767zi", &more));
     assert!(said.contains("0x8180000, generation 1") && said.contains("0x81c0000 would count as newer"), "{said}");
     let page = fs::read(folder.path().join("page.bin")).unwrap();
     let expected: Settings =
@@ -84,10 +84,10 @@ fn a_file_has_what_the_command_line_says() {
 #[test]
 fn the_older_copy_is_replaced() {
     let folder = folder();
-    done(folder.path(), &told("rp2040", &["--output", "1.bin"]));
+    done(folder.path(), &reported("rp2040", &["--output", "1.bin"]));
     fs::write(folder.path().join("0.bin"), [0xFF; BYTES]).unwrap();
     let next = |name: &str, first: &str, second: &str| {
-        done(folder.path(), &told("rp2040", &["--output", name, "--json", "--previous", first, second]))
+        done(folder.path(), &reported("rp2040", &["--output", name, "--json", "--previous", first, second]))
     };
     let second = next("2.bin", "1.bin", "0.bin");
     assert!(second.contains(r#""address":270528512"#) && second.contains(r#""generation":2"#), "{second}");
@@ -99,7 +99,7 @@ fn the_older_copy_is_replaced() {
 fn a_uf2_file_holds_both_copies() {
     let folder = folder();
     for (name, family) in [("rp2040", 0xE48B_FF56_u32), ("rp2350", 0xE48B_FF57)] {
-        done(folder.path(), &told(name, &["--uf2", "--output", "settings.uf2"]));
+        done(folder.path(), &reported(name, &["--uf2", "--output", "settings.uf2"]));
         let file = fs::read(folder.path().join("settings.uf2")).unwrap();
         let word = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().unwrap());
         let pages = board::find(name).unwrap().pages;
@@ -107,7 +107,7 @@ fn a_uf2_file_holds_both_copies() {
         assert_eq!(decode(&file[32..288]).unwrap().1 + 1, decode(&file[544..800]).unwrap().1);
         assert_eq!(done(folder.path(), &["--read", "settings.uf2"]).lines().count(), 2);
     }
-    refused(folder.path(), &told("nucleo-h743zi", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
+    refused(folder.path(), &reported("nucleo-h743zi", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
 }
 
 #[test]
@@ -115,42 +115,42 @@ fn a_board_on_wifi_is_told_its_access_point() {
     let folder = folder();
     fs::write(folder.path().join("password"), "open sesame\n").unwrap();
     let access = ["--wifi", "hall 3", "--wifi-password-file", "password", "--output", "page.bin"];
-    done(folder.path(), &told("pico2w", &access));
+    done(folder.path(), &reported("pico2w", &access));
     let page = fs::read(folder.path().join("page.bin")).unwrap();
     let wifi = decode(&page).unwrap().0.wifi.unwrap();
     assert_eq!((wifi.name(), wifi.password()), ("hall 3", "open sesame"));
     let shown = done(folder.path(), &["--read", "page.bin"]);
     assert!(shown.contains("Wi-Fi hall 3") && !shown.contains("sesame"), "{shown}");
-    refused(folder.path(), &told("pico2w", &[]), 2, "name its access point with --wifi");
-    refused(folder.path(), &told("rp2040", &["--wifi", "hall"]), 2, "has no Wi-Fi");
+    refused(folder.path(), &reported("pico2w", &[]), 2, "name its access point with --wifi");
+    refused(folder.path(), &reported("rp2040", &["--wifi", "hall"]), 2, "has no Wi-Fi");
     fs::write(folder.path().join("password"), "short").unwrap();
-    refused(folder.path(), &told("pico2w", &access), 2, "8 to 63 bytes");
+    refused(folder.path(), &reported("pico2w", &access), 2, "8 to 63 bytes");
     for empty in ["", "\nopen sesame\n"] {
         fs::write(folder.path().join("password"), empty).unwrap();
-        refused(folder.path(), &told("pico2w", &access), 2, "leave --wifi-password-file away");
+        refused(folder.path(), &reported("pico2w", &access), 2, "leave --wifi-password-file away");
     }
-    done(folder.path(), &told("pico2w", &["--wifi", "hall 3", "--output", "page.bin"]));
+    done(folder.path(), &reported("pico2w", &["--wifi", "hall 3", "--output", "page.bin"]));
 }
 
 #[test]
-fn every_mistake_is_told() {
+fn every_mistake_is_reported() {
     let folder = folder();
     let output = ["--output", "page.bin"];
     let long = "n".repeat(33);
     let boards = board::BOARDS.map(|board| board.name);
     refused(folder.path(), &[], 2, "BOARD");
-    refused(folder.path(), &told("toaster", &output), 2, &format!("there are: {}", boards.join(", ")));
-    refused(folder.path(), &told("lm3s6965evb", &[]), 2, "a file of this computer");
+    refused(folder.path(), &reported("toaster", &output), 2, &format!("there are: {}", boards.join(", ")));
+    refused(folder.path(), &reported("lm3s6965evb", &[]), 2, "a file of this computer");
     refused(folder.path(), &["rp2040", "--output", "page.bin"], 2, "--name and an --id");
     refused(folder.path(), &["rp2040", "--name", "a"], 2, "--id");
     refused(folder.path(), &["rp2040", "--name", &long, "--id", "1", "--output", "x"], 2, "--name");
-    refused(folder.path(), &told("rp2040", &["--address", "10.0.0.1"]), 2, "10.0.0.17/24");
-    refused(folder.path(), &told("rp2040", &["--gateway", "10.0.0.1", "--output", "x"]), 2, "the server tells");
+    refused(folder.path(), &reported("rp2040", &["--address", "10.0.0.1"]), 2, "10.0.0.17/24");
+    refused(folder.path(), &reported("rp2040", &["--gateway", "10.0.0.1", "--output", "x"]), 2, "the server tells");
     let address = ["--address", "10.0.0.1/24", "--gateway", "255.255.255.255", "--output", "page.bin"];
-    refused(folder.path(), &told("rp2040", &address), 2, "no host's address");
-    refused(folder.path(), &told("rp2040", &["--address", "255.255.255.255/24"]), 2, "no address of a host");
-    refused(folder.path(), &told("rp2040", &["--uf2"]), 2, "--output");
-    refused(folder.path(), &told("rp2040", &["--output", "absent/page.bin"]), 1, "cannot write absent/page.bin");
+    refused(folder.path(), &reported("rp2040", &address), 2, "no host's address");
+    refused(folder.path(), &reported("rp2040", &["--address", "255.255.255.255/24"]), 2, "no address of a host");
+    refused(folder.path(), &reported("rp2040", &["--uf2"]), 2, "--output");
+    refused(folder.path(), &reported("rp2040", &["--output", "absent/page.bin"]), 1, "cannot write absent/page.bin");
     refused(folder.path(), &["--read", "absent.bin"], 1, "cannot read absent.bin");
     fs::write(folder.path().join("empty.bin"), [0xFF; BYTES]).unwrap();
     refused(folder.path(), &["--read", "empty.bin"], 1, "holds no settings");
@@ -174,7 +174,7 @@ fn boards_are_listed() {
 
 #[test]
 fn without_a_probe_it_says_what_to_do() {
-    refused(folder().path(), &told("nucleo-f767zi", &[]), 1, "cargo install probe-rs-tools");
+    refused(folder().path(), &reported("nucleo-f767zi", &[]), 1, "cargo install probe-rs-tools");
 }
 
 #[test]
@@ -185,7 +185,7 @@ fn the_board_on_the_probe_is_told_and_started_again() {
     pages.iter().for_each(|page| fs::write(page, [0xFF; BYTES]).unwrap());
     let fleets = ["1", "2", "3"];
     for fleet in fleets {
-        done(path, &told("nucleo-f767zi", &["--fleet", fleet]));
+        done(path, &reported("nucleo-f767zi", &["--fleet", fleet]));
     }
     let held = pages.map(|page| decode(&fs::read(page).unwrap()).unwrap());
     assert_eq!(held.each_ref().map(|(settings, _)| settings.fleet), [Fleet(3), Fleet(2)]);
@@ -200,7 +200,7 @@ fn the_board_on_the_probe_is_told_and_started_again() {
 #[test]
 fn a_page_that_cannot_be_read_is_written_again_with_the_other_one() {
     let folder = with_probe();
-    let said = done(folder.path(), &told("nucleo-h743zi", &[]));
+    let said = done(folder.path(), &reported("nucleo-h743zi", &[]));
     assert!(said.contains("generation 1") && said.contains("generation 2"), "{said}");
     assert!(folder.path().join("page-0x81c0000").exists() && folder.path().join("page-0x81e0000").exists());
 }
@@ -209,7 +209,7 @@ fn a_page_that_cannot_be_read_is_written_again_with_the_other_one() {
 fn a_probe_that_fails_is_told() {
     let folder = with_probe();
     fs::write(folder.path().join("broken"), "").unwrap();
-    refused(folder.path(), &told("nucleo-h743zi", &[]), 1, "Is the board connected");
+    refused(folder.path(), &reported("nucleo-h743zi", &[]), 1, "Is the board connected");
 }
 
 fn depot() -> Identity {
@@ -300,12 +300,12 @@ fn keys_stay_on_the_board_as_long_as_it_is_the_same_unit() {
     pages.iter().for_each(|page| fs::write(page, [0xFF; BYTES]).unwrap());
     done(path, &["nucleo-f767zi", "--keys", &keys]);
     let first = held(&pages[0]).1;
-    let said = done(path, &told("nucleo-f767zi", &["--fleet", "7", "--address", "10.0.0.17/24"]));
+    let said = done(path, &reported("nucleo-f767zi", &["--fleet", "7", "--address", "10.0.0.17/24"]));
     assert!(said.contains("settings and keys"), "{said}");
     let (settings, kept) = held(&pages[1]);
     assert!(settings.to_string().contains("10.0.0.17/24"), "{settings}");
     assert_eq!(kept.secret().expose(), first.secret().expose());
-    let said = done(path, &told("nucleo-f767zi", &["--fleet", "8"]));
+    let said = done(path, &reported("nucleo-f767zi", &["--fleet", "8"]));
     assert!(said.contains("settings without keys"), "{said}");
     assert_eq!(newest::<1>(&fs::read(&pages[0]).unwrap(), &[]).map(drop), Err(KeysError::Absent));
 }
@@ -345,10 +345,10 @@ fn the_emulated_board_is_told_by_text() {
     let ring = KeyRing::load(Path::new(&keys)).unwrap();
     assert_eq!(held.pair(&depot()).unwrap().expose(), ring.pair(&depot()).unwrap().expose());
     assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
-    done(folder.path(), &told("lm3s6965evb", &["--output", "plain"]));
+    done(folder.path(), &reported("lm3s6965evb", &["--output", "plain"]));
     let plain = fs::read_to_string(folder.path().join("plain")).unwrap();
     assert_eq!(plain, "name=agv-17 id=17 manager=depot/1 fleet=0 address=dhcp");
-    refused(folder.path(), &told("lm3s6965evb", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
+    refused(folder.path(), &reported("lm3s6965evb", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
     let shown = done(folder.path(), &["--read", "argument"]);
     let expected =
         "lm3s6965evb: name=agv-17 id=17 manager=depot/1 fleet=7 address=dhcp, keys of generation 1 with depot/1";
@@ -384,7 +384,7 @@ fn what_is_no_file_is_neither_replaced_nor_waited_for() {
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     for board in ["rp2040", "lm3s6965evb"] {
         for output in ["pipe", "keys"] {
-            refused(folder.path(), &told(board, &["--output", output]), 2, "is no file");
+            refused(folder.path(), &reported(board, &["--output", output]), 2, "is no file");
             refused(folder.path(), &[board, "--keys", &keys, "--output", output], 2, "is no file");
         }
     }
@@ -399,9 +399,9 @@ fn keys_that_are_left_behind_are_told() {
     done(folder.path(), &["rp2040", "--keys", &keys, "--output", "1.bin"]);
     fs::write(folder.path().join("0.bin"), [0xFF; BYTES]).unwrap();
     let previous = ["--output", "2.bin", "--previous", "1.bin", "0.bin"];
-    let said = done(folder.path(), &told("rp2040", &previous));
+    let said = done(folder.path(), &reported("rp2040", &previous));
     assert!(said.contains("the keys of agv-17/17 in fleet 7 that the board had are not kept"), "{said}");
-    let said = done(folder.path(), &told("rp2040", &[&["--fleet", "7"], &previous[..]].concat()));
+    let said = done(folder.path(), &reported("rp2040", &[&["--fleet", "7"], &previous[..]].concat()));
     assert!(said.contains("settings and keys") && !said.contains("not kept"), "{said}");
 }
 

@@ -47,7 +47,7 @@ impl User {
 
     /// The command that a unit without keys says.
     #[track_caller]
-    fn told(&self, unit: &str) -> String {
+    fn reported(&self, unit: &str) -> String {
         let refused = self.types(&self.node(unit));
         let text = String::from_utf8(refused.stderr).unwrap();
         assert_eq!(refused.status.code(), Some(1), "{text}");
@@ -89,10 +89,10 @@ fn meet(user: &User) {
 #[test]
 fn the_command_that_a_manager_says_is_enough_and_then_its_vehicle_s() {
     let user = User::new();
-    let command = user.told(MANAGER);
+    let command = user.reported(MANAGER);
     assert_eq!(command, format!("cara keys new-fleet --fleet {} yard/3@m_unit", user.fleet));
     user.succeeds(&command);
-    let command = user.told(VEHICLE);
+    let command = user.reported(VEHICLE);
     assert_eq!(command, format!("cara keys derive --fleet {} --manager yard/3 'agv 7/7'", user.fleet));
     user.succeeds(&command);
     meet(&user);
@@ -101,7 +101,7 @@ fn the_command_that_a_manager_says_is_enough_and_then_its_vehicle_s() {
 #[test]
 fn the_command_that_a_vehicle_says_is_enough_for_both() {
     let user = User::new();
-    let command = user.told(VEHICLE);
+    let command = user.reported(VEHICLE);
     assert_eq!(command, format!("cara keys new-fleet --fleet {} yard/3@m_unit 'agv 7/7'", user.fleet));
     user.succeeds(&command);
     meet(&user);
@@ -126,7 +126,7 @@ fn a_vehicle_that_was_revoked_is_told_so() {
 fn a_vehicle_of_a_manager_without_keys_says_a_command_that_makes_both() {
     let user = User::new();
     user.succeeds(&format!("cara keys new-fleet --fleet {} other/1@m_unit", user.fleet));
-    let command = user.told(VEHICLE);
+    let command = user.reported(VEHICLE);
     user.succeeds(&command);
     meet(&user);
 }
@@ -164,8 +164,8 @@ fn plain_mode_is_asked_for_and_warns_once() {
     drop((vehicle, manager));
 
     let command = format!("cara scan --as own/9 --insecure --wait 1ms --fleet {}", user.fleet);
-    let told = String::from_utf8(user.types(&command).stderr).unwrap();
-    assert!(told.starts_with("warning: own/9 is in plain mode, on port 21970: "), "{told}");
+    let reported = String::from_utf8(user.types(&command).stderr).unwrap();
+    assert!(reported.starts_with("warning: own/9 is in plain mode, on port 21970: "), "{reported}");
     let both = user.types("cara node --name a --id 1 --insecure --key-file x");
     assert_eq!(both.status.code(), Some(2));
 }

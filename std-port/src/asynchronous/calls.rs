@@ -17,8 +17,8 @@ impl<T: Send + 'static> Peer<T> {
     /// As [`publish_my_function_list`](Self::publish_my_function_list), and ends when the node has read the list;
     /// [`Error::TimedOut`] otherwise. Dropped before it has ended, the list is published all the same.
     pub async fn publish_and_wait_async(&self, timeout: impl Into<Duration>) -> Result<(), Error> {
-        let told = self.engine.publish(Some(&self.cell.identity))?;
-        match self.engine.acknowledgements(told, timeout.into()).await.is_empty() {
+        let reported = self.engine.publish(Some(&self.cell.identity))?;
+        match self.engine.acknowledgements(reported, timeout.into()).await.is_empty() {
             true => Ok(()),
             false => Err(Error::TimedOut),
         }

@@ -33,9 +33,9 @@ struct Shared<A> {
 }
 
 /// Tells the task, also where the thread panics.
-struct Teller<A>(Arc<Mutex<Shared<A>>>);
+struct Notifier<A>(Arc<Mutex<Shared<A>>>);
 
-impl<A> Drop for Teller<A> {
+impl<A> Drop for Notifier<A> {
     fn drop(&mut self) {
         let mut shared = lock(&self.0);
         shared.outcome.get_or_insert(Err(Error::NotRunning));
@@ -47,7 +47,7 @@ impl<A> Drop for Teller<A> {
 
 async fn on_a_thread<A: Send + 'static>(run: impl FnOnce() -> A + Send + 'static) -> Result<A, Error> {
     let shared = Arc::new(Mutex::new(Shared { outcome: None, task: None }));
-    let teller = Teller(shared.clone());
+    let teller = Notifier(shared.clone());
     let work = move || {
         let outcome = run();
         lock(&teller.0).outcome = Some(Ok(outcome));

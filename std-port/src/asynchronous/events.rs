@@ -11,7 +11,7 @@ use std::task::{Context, Poll, Waker};
 use futures_core::Stream;
 use futures_core::stream::FusedStream;
 
-use crate::engine::Told;
+use crate::engine::Delivered;
 use crate::event::UnitEvent;
 use crate::locks::lock;
 
@@ -42,18 +42,18 @@ impl EventQueue {
     }
 
     /// Keeps an event, or counts it as lost, at its place. The task is woken by [`wake`](Self::wake).
-    pub(crate) fn put(&self, event: &UnitEvent) -> Told {
+    pub(crate) fn put(&self, event: &UnitEvent) -> Delivered {
         let waiting = &mut lock(&self.state).waiting;
         if waiting.len() < self.room {
             waiting.push_back(Ok(event.clone()));
-            return Told::Kept;
+            return Delivered::Kept;
         }
         match waiting.back_mut() {
             Some(Err(EventsLost(count))) => *count += 1,
             _ => waiting.push_back(Err(EventsLost(1))),
         }
         self.lost.fetch_add(1, Ordering::Relaxed);
-        Told::Lost
+        Delivered::Lost
     }
 
     /// Wakes the task that waits, if there is something for it.
@@ -150,7 +150,7 @@ mod tests {
             queue.put(&event(name));
         }
         assert_eq!(next(), Poll::Ready(Some(Ok(event("a")))));
-        assert!(matches!(queue.put(&event("e")), Told::Lost), "the mark of what is lost takes a place");
+        assert!(matches!(queue.put(&event("e")), Delivered::Lost), "the mark of what is lost takes a place");
         assert_eq!(next(), Poll::Ready(Some(Ok(event("b")))));
         queue.put(&event("f"));
         assert_eq!(next(), Poll::Ready(Some(Err(EventsLost(3)))));

@@ -65,8 +65,8 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// As [`publish_and_wait`](Self::publish_and_wait): ends when every connected node has read the list, or after `timeout`
     /// with the nodes that have not. Dropped before it has ended, the list is published all the same.
     pub async fn publish_and_wait_async(&self, timeout: impl Into<Duration>) -> Result<Vec<Identity>, Error> {
-        let told = self.engine().publish(None)?;
-        let missing = self.engine().acknowledgements(told, timeout.into()).await;
+        let reported = self.engine().publish(None)?;
+        let missing = self.engine().acknowledgements(reported, timeout.into()).await;
         Ok(missing.iter().filter_map(|link| link.peer.get()).map(|peer| peer.identity.clone()).collect())
     }
 }

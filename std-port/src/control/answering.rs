@@ -293,13 +293,13 @@ fn watch<T: Send + 'static>(
     wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
     let (events, lost) = system.events_with_losses(EVENTS);
-    let tell = |event: &str, text: String| Answer::Event {
+    let notify = |event: &str, text: String| Answer::Event {
         at_ms: system.uptime().as_millis(),
         event: event.to_owned(),
         node: None,
         text,
     };
-    send(sink, tell("watching", "events from here on".to_owned()))?;
+    send(sink, notify("watching", "events from here on".to_owned()))?;
     loop {
         match events.recv_timeout(LOOK) {
             Ok(event) => send(sink, describe::event(&event, system.uptime()))?,
@@ -310,7 +310,7 @@ fn watch<T: Send + 'static>(
         }
         let missed = lost.swap(0, std::sync::atomic::Ordering::Relaxed);
         if missed > 0 {
-            send(sink, tell("lost", format!("{missed} events came faster than they were read")))?;
+            send(sink, notify("lost", format!("{missed} events came faster than they were read")))?;
         }
     }
 }

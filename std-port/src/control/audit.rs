@@ -110,7 +110,7 @@ impl Audit {
         }
     }
 
-    fn tell(&self, origin: &str, who: &Who, line: &Line<'_>) {
+    fn append(&self, origin: &str, who: &Who, line: &Line<'_>) {
         self.write(&entry(origin, who, line));
     }
 }
@@ -172,7 +172,7 @@ pub(crate) struct ProgramCall {
     function: String,
     take_over: bool,
     node: String,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl ProgramCall {
@@ -192,27 +192,27 @@ impl ProgramCall {
             _ => return None,
         };
         let (audit, function) = (audit.clone(), function.to_owned());
-        Some(Self { audit, ask, function, take_over, node: node(), is_told: false })
+        Some(Self { audit, ask, function, take_over, node: node(), is_reported: false })
     }
 
     /// Notes how it has ended.
     pub(crate) fn ended(mut self, outcome: Result<(), Error>) {
         let name = outcome.map_or_else(|error| name_of(&error), |()| "ok".to_owned());
-        self.tell(&name);
+        self.append(&name);
     }
 
-    fn tell(&mut self, outcome: &str) {
-        self.is_told = true;
+    fn append(&mut self, outcome: &str) {
+        self.is_reported = true;
         let Self { ask, ref function, take_over, ref node, .. } = *self;
         let line = Line { ask, function: Some(function), take_over, node: Some(node), outcome };
-        self.audit.tell("program", &self.audit.own, &line);
+        self.audit.append("program", &self.audit.own, &line);
     }
 }
 
 impl Drop for ProgramCall {
     fn drop(&mut self) {
-        if !self.is_told {
-            self.tell("gone");
+        if !self.is_reported {
+            self.append("gone");
         }
     }
 }
@@ -262,11 +262,11 @@ pub(super) struct Entry<'a> {
     audit: &'a Audit,
     who: &'a Who,
     asked: Asked<'a>,
-    told: Told,
+    reported: Report,
 }
 
 /// How much of an entry has been told.
-enum Told {
+enum Report {
     Nothing,
     /// That the node is held, whose end is to be told as well.
     Held(String),
@@ -276,7 +276,7 @@ enum Told {
 impl<'a> Entry<'a> {
     /// `None` for a question that only looks.
     pub(super) fn of(audit: &'a Audit, who: &'a Who, question: &'a Question) -> Option<Self> {
-        Some(Self { audit, who, asked: Asked::of(question)?, told: Told::Nothing })
+        Some(Self { audit, who, asked: Asked::of(question)?, reported: Report::Nothing })
     }
 
     /// An answer on its way to the operator.
@@ -286,13 +286,13 @@ impl<'a> Entry<'a> {
                 let node = format!("{node}/{id}");
                 let outcome = error.as_ref().map_or("ok", |failure| failure.error.as_str());
                 let functions = (!functions.is_empty()).then(|| functions.join(","));
-                self.tell(Some(&node), functions.as_deref(), outcome);
-                self.told = if self.asked.holds && error.is_none() { Told::Held(node) } else { Told::All };
+                self.append(Some(&node), functions.as_deref(), outcome);
+                self.reported = if self.asked.holds && error.is_none() { Report::Held(node) } else { Report::All };
             }
             Answer::Ended { expired } => self.end(if *expired { "expired" } else { "ended" }),
             Answer::Failed(failure) => self.end(&failure.error),
             Answer::Done => {
-                if let Told::Nothing = self.told {
+                if let Report::Nothing = self.reported {
                     self.end("ok");
                 }
             }
@@ -302,26 +302,26 @@ impl<'a> Entry<'a> {
 
     /// No more answers come: the client has gone, or the unit stops.
     pub(super) fn give_up(&mut self, unit_stops: bool) {
-        match self.told {
-            Told::All => {}
+        match self.reported {
+            Report::All => {}
             _ if unit_stops => self.end("stopped"),
-            Told::Nothing => self.end("gone"),
-            Told::Held(_) => self.end("released"),
+            Report::Nothing => self.end("gone"),
+            Report::Held(_) => self.end("released"),
         }
     }
 
     fn end(&mut self, outcome: &str) {
-        match std::mem::replace(&mut self.told, Told::All) {
-            Told::Held(node) => self.tell(Some(&node), None, outcome),
-            Told::Nothing | Told::All => self.tell(None, None, outcome),
+        match std::mem::replace(&mut self.reported, Report::All) {
+            Report::Held(node) => self.append(Some(&node), None, outcome),
+            Report::Nothing | Report::All => self.append(None, None, outcome),
         }
     }
 
-    fn tell(&self, node: Option<&str>, functions: Option<&str>, outcome: &str) {
+    fn append(&self, node: Option<&str>, functions: Option<&str>, outcome: &str) {
         let Asked { ask, call, node: asked_of, .. } = self.asked;
         let function = functions.or_else(|| Some(call?.function.as_str()));
         let (node, take_over) = (node.or(asked_of.map(String::as_str)), call.is_some_and(|call| call.take_over));
-        self.audit.tell("operator", self.who, &Line { ask, function, take_over, node, outcome });
+        self.audit.append("operator", self.who, &Line { ask, function, take_over, node, outcome });
     }
 }
 
@@ -368,10 +368,11 @@ mod tests {
         drop(Entry::of(&audit, &who, &stop));
         audit.flush(LONG);
         assert!(Entry::of(&audit, &who, &Question::Watch).is_none(), "it only looks");
-        let told: Vec<_> = lines(&path).iter().map(|line| [line["node"].clone(), line["outcome"].clone()]).collect();
+        let reported: Vec<_> =
+            lines(&path).iter().map(|line| [line["node"].clone(), line["outcome"].clone()]).collect();
         let expected = [("agv/1", "ok"), ("agv/2", "NoStop")].map(|(node, outcome)| [json!(node), json!(outcome)]);
-        assert_eq!(told[..2], expected);
-        assert_eq!(told[2..], [[Value::Null, json!("gone")]]);
+        assert_eq!(reported[..2], expected);
+        assert_eq!(reported[2..], [[Value::Null, json!("gone")]]);
         let first = &lines(&path)[0];
         assert_eq!((&first["ask"], &first["uid"], &first["origin"]), (&json!("stop"), &json!(7), &json!("operator")));
         assert_eq!(first["function"], "halt,brake");
@@ -406,9 +407,9 @@ mod tests {
             entry.note(&Answer::Done);
         }
         audit.flush(LONG);
-        let told = lines(&path);
-        assert!(told.iter().all(|line| line["node"] == "agv/1" && line["function"] == "go"), "{told:?}");
-        let outcomes: Vec<_> = told.iter().map(|line| line["outcome"].as_str().unwrap()).collect();
+        let reported = lines(&path);
+        assert!(reported.iter().all(|line| line["node"] == "agv/1" && line["function"] == "go"), "{reported:?}");
+        let outcomes: Vec<_> = reported.iter().map(|line| line["outcome"].as_str().unwrap()).collect();
         let expected = ["ended", "expired", "TakenOver", "stopped", "released"].map(|end| ["ok", end]);
         assert_eq!(outcomes, expected.concat());
     }

@@ -37,7 +37,7 @@ pub(super) fn call<T: Send + 'static>(
     let Some(node) = &question.node else { return call_all(system, question, &options, sink, wanted) };
     let peer = select::node(system, node)?;
     if question.asynchronous {
-        return tell(&peer, question, &options, sink);
+        return notify(&peer, question, &options, sink);
     }
     let started = Instant::now();
     let outcome = await_one(&peer, question, &options, sink, wanted)?.map(|(outcome, _)| outcome);
@@ -45,7 +45,7 @@ pub(super) fn call<T: Send + 'static>(
 }
 
 /// Makes a call of one node that is not waited for.
-fn tell<T: Send + 'static>(
+fn notify<T: Send + 'static>(
     peer: &Peer<T>,
     question: &CallQuestion,
     options: &RequestOptions,
@@ -231,7 +231,7 @@ fn call_all<T: Send + 'static>(
             News::Answer(answer) => send(sink, *answer),
         });
     }
-    peers.iter().try_for_each(|peer| tell(peer, question, options, sink))
+    peers.iter().try_for_each(|peer| notify(peer, question, options, sink))
 }
 
 /// What [`block_all`] tells of a call.
@@ -241,13 +241,13 @@ pub(super) enum News {
     Answer(Box<Answer>),
 }
 
-/// All at the same time, as far as the memory for their parameters reaches; `tell` gets the answers in the order of the replies,
+/// All at the same time, as far as the memory for their parameters reaches; `notify` gets the answers in the order of the replies,
 /// each with the index of its call.
 pub(super) fn block_all<T: Send + 'static>(
     calls: &[(&Peer<T>, &CallQuestion)],
     options: &RequestOptions,
     wanted: &dyn Fn() -> bool,
-    tell: &mut dyn FnMut(usize, News) -> Result<(), End>,
+    notify: &mut dyn FnMut(usize, News) -> Result<(), End>,
 ) -> Result<(), End> {
     let mut calls = calls.iter().enumerate();
     let mut under_way = Vec::new();
@@ -265,8 +265,8 @@ pub(super) fn block_all<T: Send + 'static>(
                     under_way.push((number, peer, started, prepared, None, false));
                 }
                 Err(failure) => {
-                    tell(number, News::Late)?;
-                    tell(number, News::Answer(Box::new(called(peer, Err(failure), started))))?;
+                    notify(number, News::Late)?;
+                    notify(number, News::Answer(Box::new(called(peer, Err(failure), started))))?;
                 }
             }
         }
@@ -284,14 +284,14 @@ pub(super) fn block_all<T: Send + 'static>(
                 let (number, answer) = (*number, called(peer, outcome, *started));
                 drop(under_way.swap_remove(index));
                 if is_unsent {
-                    tell(number, News::Late)?;
+                    notify(number, News::Late)?;
                 }
-                tell(number, News::Answer(Box::new(answer)))?;
+                notify(number, News::Answer(Box::new(answer)))?;
             } else {
                 let is_sent = pending.as_ref().is_some_and(Pending::was_sent);
                 if !*is_late && (!is_sent || started.elapsed() >= LATE) {
                     *is_late = true;
-                    tell(*number, News::Late)?;
+                    notify(*number, News::Late)?;
                 }
                 index += 1;
             }

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use rustix::net::SendFlags;
 
 use super::lines::{Line, Lines};
-use super::place::{self, PlaceError, directories, own_uid, peer_uid};
+use super::location::{self, LocationError, directories, own_uid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
 use super::server::{FULL, full};
 use crate::sys::epoll::wait_readable;
@@ -64,7 +64,7 @@ impl RunningUnit {
 
     /// What can be told of a unit that does not introduce itself.
     fn unasked(path: &Path, state: UnitState) -> Self {
-        let (unit, fleet) = place::told_by_name(path);
+        let (unit, fleet) = location::reported_by_name(path);
         Self { unit, fleet, path: path.to_owned(), state }
     }
 
@@ -143,13 +143,13 @@ fn paths(paths: &[PathBuf]) -> String {
     paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
-impl From<PlaceError> for ControlError {
-    fn from(error: PlaceError) -> Self {
+impl From<LocationError> for ControlError {
+    fn from(error: LocationError) -> Self {
         match error {
-            PlaceError::Foreign { ref path, .. } | PlaceError::Open { ref path, .. } => {
+            LocationError::Foreign { ref path, .. } | LocationError::Open { ref path, .. } => {
                 Self::NotAllowed { path: path.clone(), reason: error.to_string() }
             }
-            PlaceError::System { path, error } if error.kind() == io::ErrorKind::PermissionDenied => {
+            LocationError::System { path, error } if error.kind() == io::ErrorKind::PermissionDenied => {
                 Self::NotAllowed { path, reason: error.to_string() }
             }
             error => Self::Broken(io::Error::other(error.to_string())),
@@ -181,14 +181,15 @@ pub fn first_of(
 
 /// The units with a socket in a directory: those that answer, and those that run and cannot be asked now.
 pub fn running_in(directory: &Path) -> Result<Vec<RunningUnit>, ControlError> {
-    Ok(look_at(&place::sockets(directory)?))
+    Ok(look_at(&location::sockets(directory)?))
 }
 
 /// As [`running_in`], of the units of this `NAME/ID` or `NAME` alone: one that hangs does not delay a question to
 /// another one.
 pub fn running_called(directory: &Path, wanted: &str) -> Result<Vec<RunningUnit>, ControlError> {
-    let sockets = place::sockets(directory)?;
-    let may_be = |path: &&PathBuf| !place::tells_name(path) || RunningUnit::unasked(path, UnitState::Silent).is(wanted);
+    let sockets = location::sockets(directory)?;
+    let may_be =
+        |path: &&PathBuf| !location::reports_name(path) || RunningUnit::unasked(path, UnitState::Silent).is(wanted);
     let found = look_at(&sockets.iter().filter(may_be).cloned().collect::<Vec<_>>());
     Ok(found.into_iter().filter(|unit| unit.is(wanted)).collect())
 }
@@ -386,7 +387,7 @@ fn none(running: Vec<RunningUnit>, directories: &[PathBuf], wanted: Option<&str>
 fn dial(path: &Path) -> Result<UnixStream, ControlError> {
     let start = Instant::now();
     loop {
-        let error = match place::dial(path) {
+        let error = match location::dial(path) {
             Ok(stream) => return Ok(stream),
             Err(error) => error,
         };
@@ -408,7 +409,7 @@ fn dial(path: &Path) -> Result<UnixStream, ControlError> {
 
 /// What it means that a unit did not introduce itself.
 fn refused(path: &Path, error: ControlError) -> ControlError {
-    let unit = place::told_by_name(path).0;
+    let unit = location::reported_by_name(path).0;
     match error {
         ControlError::Failed(failure) if failure.error == FULL => ControlError::Full { unit, text: failure.text },
         ControlError::Broken(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {

@@ -3,7 +3,7 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::place;
+use super::location;
 
 /// The system's list of local sockets, which every user may read.
 const SOCKETS: &str = "/proc/net/unix";
@@ -29,16 +29,16 @@ pub fn elsewhere() -> Vec<Elsewhere> {
     let own = super::directories();
     let listed = std::fs::read_to_string(SOCKETS).unwrap_or_default();
     let is_own = |path: &Path| own.iter().any(|own| path.parent() == Some(own));
-    let paths = listening(&listed).filter(|path| !is_own(path) && place::tells_name(path));
+    let paths = listening(&listed).filter(|path| !is_own(path) && location::reports_name(path));
     let this_user = rustix::process::getuid().as_raw();
-    let all_users = !place::is_directory_set();
+    let all_users = !location::is_directory_set();
     paths.map(unit).filter(|unit| all_users || unit.owner != Some(this_user)).collect()
 }
 
 /// The directories of what listens and is named as a control socket.
 pub(super) fn listening_in() -> Vec<PathBuf> {
     let listed = std::fs::read_to_string(SOCKETS).unwrap_or_default();
-    let paths = listening(&listed).filter(|path| place::tells_name(path));
+    let paths = listening(&listed).filter(|path| location::reports_name(path));
     paths.filter_map(Path::parent).map(Path::to_owned).collect()
 }
 
@@ -53,7 +53,7 @@ fn listening(listed: &str) -> impl Iterator<Item = &Path> {
 }
 
 fn unit(path: &Path) -> Elsewhere {
-    let (unit, fleet) = place::told_by_name(path);
+    let (unit, fleet) = location::reported_by_name(path);
     // The first that this user can see, from the socket upwards: a directory of the user's stands above it.
     let owner = path.ancestors().find_map(|above| std::fs::symlink_metadata(above).ok()).map(|seen| seen.uid());
     Elsewhere { unit, fleet, path: path.to_owned(), owner }
@@ -72,7 +72,7 @@ mod tests {
                       000: 00000002 00000000 00010000 0001 01 24 /srv/with blank/x.sock\n";
         let found: Vec<_> = listening(listed).map(|path| path.to_str().unwrap()).collect();
         assert_eq!(found, ["/run/user/1000/cara/depot-1-7.sock", "/srv/with blank/x.sock"]);
-        let told = unit(Path::new(found[0]));
-        assert_eq!((told.unit.as_str(), told.fleet), ("depot/1", 7));
+        let reported = unit(Path::new(found[0]));
+        assert_eq!((reported.unit.as_str(), reported.fleet), ("depot/1", 7));
     }
 }

@@ -15,15 +15,15 @@ pub(super) fn call<T: Send + 'static>(
     sink: Sink<'_>,
     call: impl FnOnce(Sink<'_>) -> Result<(), End>,
 ) -> Result<(), End> {
-    let mut told = HashSet::new();
+    let mut reported = HashSet::new();
     let outcome = call(&mut |answer: Answer| -> ControlFlow<()> {
         if let Answer::Called { node, id, .. } = &answer {
-            told.insert((node.clone(), *id));
+            reported.insert((node.clone(), *id));
         }
         sink(answer)
     });
     let asked = system.asked_with_all(function);
-    let missed = asked.iter().filter(|peer| !told.contains(&(peer.name().to_owned(), peer.id())));
+    let missed = asked.iter().filter(|peer| !reported.contains(&(peer.name().to_owned(), peer.id())));
     match outcome {
         Ok(()) => {}
         // No node offers it: each of the roster is told of instead.

@@ -234,11 +234,11 @@ mod tests {
     fn what_does_not_fit_is_told_with_its_path() {
         let definition = Definition::parse(ORDER).unwrap();
         let spec = definition.signature().arguments().named("nodes").unwrap();
-        let told = |json: Json| check(spec, &json).map_err(|bad| bad.to_string()).unwrap_err();
+        let reported = |json: Json| check(spec, &json).map_err(|bad| bad.to_string()).unwrap_err();
         let with = |field: &str, json: Json| {
             let mut last = node();
             last[field] = json;
-            told(json!([node(), node(), node(), last]))
+            reported(json!([node(), node(), node(), last]))
         };
         assert_eq!(with("x", json!("one")), "nodes[3].x: expected float, got string");
         assert_eq!(with("id", json!("12345")), "nodes[3].id: expected string[4], got 5 bytes");
@@ -247,7 +247,7 @@ mod tests {
         assert_eq!(with("parts", json!(["01", "0"])), "nodes[3].parts[1]: expected bytes[2], got string");
         assert_eq!(with("parts", json!(["", "", ""])), "nodes[3].parts: expected bytes[2][..2], got a list of 3");
         assert_eq!(with("y", json!(null)), "nodes[3].y: expected no such field, got null");
-        assert_eq!(told(json!([{ "id": "a" }])), "nodes[0].x: expected float, got nothing");
-        assert!(told(json!({})).ends_with("got a record"));
+        assert_eq!(reported(json!([{ "id": "a" }])), "nodes[0].x: expected float, got nothing");
+        assert!(reported(json!({})).ends_with("got a record"));
     }
 }

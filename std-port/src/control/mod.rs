@@ -22,7 +22,7 @@ mod forgetting;
 mod hold;
 pub mod json;
 mod lines;
-mod place;
+mod location;
 pub mod protocol;
 mod select;
 mod server;
@@ -40,7 +40,7 @@ pub use client::{
 };
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use forgetting::{ForgetError, Forgotten, forget_claims, state_folder};
-pub use place::{directories, directory};
+pub use location::{directories, directory};
 pub(crate) use server::Server;
 
 use cara_core::distribution::identity::{Fleet, Identity};
@@ -69,8 +69,8 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
     let (path, is_its_own) = match control {
         Control::Off => return None,
         Control::Default => {
-            let name = place::file_name(identity, fleet);
-            let path = directories().iter().map(|directory| directory.join(&name)).find(|path| place::is_held(path));
+            let name = location::file_name(identity, fleet);
+            let path = directories().iter().map(|directory| directory.join(&name)).find(|path| location::is_held(path));
             (path.clone().unwrap_or_default(), path.is_some())
         }
         // Any unit may have been told this path.
@@ -97,8 +97,8 @@ pub(crate) fn open<T: Send + 'static>(
         Control::Off => return None,
         Control::Path(path) => vec![path.clone()],
         Control::Default => {
-            let name = place::file_name(&guest.identity(), guest.fleet());
-            place::defaults().iter().map(|directory| directory.join(&name)).collect()
+            let name = location::file_name(&guest.identity(), guest.fleet());
+            location::defaults().iter().map(|directory| directory.join(&name)).collect()
         }
     };
     match Server::open(paths, audit, guest) {

@@ -18,7 +18,7 @@ use rustix::net::{SendFlags, send};
 use super::answering::execute_for;
 use super::audit::{Audit, Entry, Who};
 use super::lines::{Line, Lines};
-use super::place::{Place, PlaceError, own_uid, peer_uid};
+use super::location::{Location, LocationError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
 use crate::CommunicationSystem;
 use crate::executor::OwnThread;
@@ -74,7 +74,7 @@ struct Shared {
 /// Where clients find the unit.
 #[derive(Default)]
 struct Socket {
-    place: Option<Place>,
+    location: Option<Location>,
     /// One that was made again, for the thread that accepts.
     fresh: Option<UnixListener>,
 }
@@ -109,32 +109,32 @@ impl Server {
         paths: Vec<PathBuf>,
         audit: Option<Arc<Audit>>,
         system: CommunicationSystem<T>,
-    ) -> Result<Self, PlaceError> {
+    ) -> Result<Self, LocationError> {
         let path = paths.first().cloned().unwrap_or_default();
-        let (place, listener) = Place::open(&path)?;
+        let (location, listener) = Location::open(&path)?;
         let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| {
-            lock(&shared.socket).place = Some(place.clone());
+            lock(&shared.socket).location = Some(location.clone());
             shared.keep_socket(paths)?;
             shared.accept_with(listener, system)
         });
         match started {
             Ok(shared) => Ok(Self { shared }),
             Err(error) => {
-                place.remove();
-                Err(PlaceError::System { path, error })
+                location.remove();
+                Err(LocationError::System { path, error })
             }
         }
     }
 
     pub(crate) fn path(&self) -> Option<PathBuf> {
-        Some(lock(&self.shared.socket).place.as_ref()?.path().to_owned())
+        Some(lock(&self.shared.socket).location.as_ref()?.path().to_owned())
     }
 
     /// Ends all connections and threads except the calling one; waits only for a bounded time for a stuck one.
     pub(crate) fn stop(&self) {
         self.shared.stopping.store(true, Ordering::Release);
-        let place = lock(&self.shared.socket).place.take();
-        place.inspect(Place::remove);
+        let location = lock(&self.shared.socket).location.take();
+        location.inspect(Location::remove);
         self.shared.stopped.notify_all();
         self.shared.waker.wake();
         let threads = {
@@ -164,22 +164,22 @@ impl Shared {
     }
 
     fn look_after(&self, paths: &[PathBuf]) {
-        let mut is_told = false;
-        while let Some(place) = self.await_next_look() {
-            if place.is_there() {
+        let mut is_reported = false;
+        while let Some(location) = self.await_next_look() {
+            if location.is_there() {
                 continue;
             }
             // What stands above a folder of the system's is not ours to make.
             let is_below = |path: &PathBuf| path.ancestors().nth(2).is_some_and(Path::is_dir);
             let usable = paths.iter().enumerate().filter(|(number, path)| *number == 0 || is_below(path));
-            let opened = usable.map(|(_, path)| Place::open(path)).reduce(Result::or);
+            let opened = usable.map(|(_, path)| Location::open(path)).reduce(Result::or);
             match opened {
-                Some(Ok((place, listener))) => {
-                    is_told = false;
-                    self.moved_to(place, listener);
+                Some(Ok((location, listener))) => {
+                    is_reported = false;
+                    self.moved_to(location, listener);
                 }
-                Some(Err(error)) if !is_told => {
-                    is_told = true;
+                Some(Err(error)) if !is_reported => {
+                    is_reported = true;
                     tracing::warn!(%error, "the control socket has vanished and cannot be made again yet: `cara` does not find this unit");
                 }
                 _ => {}
@@ -188,19 +188,19 @@ impl Shared {
     }
 
     /// The place after the next pause; `None` once the unit stops.
-    fn await_next_look(&self) -> Option<Place> {
+    fn await_next_look(&self) -> Option<Location> {
         let socket = lock(&self.socket);
         let waited = self.stopped.wait_timeout_while(socket, BETWEEN_LOOKS, |_| !self.is_stopping());
-        waited.unwrap_or_else(PoisonError::into_inner).0.place.clone()
+        waited.unwrap_or_else(PoisonError::into_inner).0.location.clone()
     }
 
-    fn moved_to(&self, place: Place, listener: UnixListener) {
+    fn moved_to(&self, location: Location, listener: UnixListener) {
         let mut socket = lock(&self.socket);
         if self.is_stopping() {
-            return place.remove();
+            return location.remove();
         }
-        tracing::warn!(path = %place.path().display(), "the control socket had vanished and was made again");
-        *socket = Socket { place: Some(place), fresh: Some(listener) };
+        tracing::warn!(path = %location.path().display(), "the control socket had vanished and was made again");
+        *socket = Socket { location: Some(location), fresh: Some(listener) };
         self.waker.wake();
     }
 
@@ -538,20 +538,20 @@ mod tests {
             r#"{"ask":"nodes","offering":null}"#,
             r#"{"ask":"stop","node":"agv/2"}"#,
         ];
-        let noted = |from: usize| {
+        let recorded = |from: usize| {
             written(&shared);
             let text = std::fs::read_to_string(&path).unwrap();
             let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
             let word = |value: &serde_json::Value| value.as_str().unwrap_or("-").to_owned();
-            let told = lines[from..].iter().map(|line| ["ask", "node", "outcome"].map(|key| word(&line[key])));
-            told.map(|words| words.join(" ")).collect::<Vec<_>>()
+            let reported = lines[from..].iter().map(|line| ["ask", "node", "outcome"].map(|key| word(&line[key])));
+            reported.map(|words| words.join(" ")).collect::<Vec<_>>()
         };
         // It has gone before it was greeted.
         let (mut client, served) = UnixStream::pair().unwrap();
         client.write_all(format!("{}\n", asked.join("\n")).as_bytes()).unwrap();
         drop(client);
         assert!(shared.serve(served, &Mutex::default(), false, &system).is_err());
-        assert_eq!(noted(0), ["stop - gone", "reset agv/1 gone", "stop agv/2 gone"]);
+        assert_eq!(recorded(0), ["stop - gone", "reset agv/1 gone", "stop agv/2 gone"]);
         // It goes behind what it asked, which is looked at all the same: a stop is carried out.
         let (mut client, served) = UnixStream::pair().unwrap();
         client.write_all(format!("{{\"ask\":\"watch\"}}\n{}\n{}\n", asked[1], asked[3]).as_bytes()).unwrap();
@@ -564,7 +564,7 @@ mod tests {
             drop(client);
             let _ = serving.join().unwrap();
         });
-        assert_eq!(noted(3), ["reset agv/1 gone", "stop agv/2 UnknownNode"]);
+        assert_eq!(recorded(3), ["reset agv/1 gone", "stop agv/2 UnknownNode"]);
     }
 
     #[test]
@@ -611,11 +611,11 @@ mod tests {
             assert!(matches!(next(&mut watching), Answer::Hello { .. }));
             assert!(matches!(next(&mut watching), Answer::Event { .. }));
             for (asks, answers) in [(&b""[..], 1), (b"{\"ask\":\"search\"}\n", 2)] {
-                let mut told = String::new();
-                client(asks).read_to_string(&mut told).unwrap();
-                assert_eq!(told.lines().count(), answers, "{told}");
+                let mut reported = String::new();
+                client(asks).read_to_string(&mut reported).unwrap();
+                assert_eq!(reported.lines().count(), answers, "{reported}");
             }
-            system.engine().tell(UnitEvent::NetworkChanged { up: Vec::new() });
+            system.engine().notify(UnitEvent::NetworkChanged { up: Vec::new() });
             assert!(matches!(next(&mut watching), Answer::Event { .. }));
         });
     }

@@ -92,9 +92,9 @@ pub(super) fn call<T: Send + 'static>(
     let options = RequestOptions { priority: Some(Priority::Emergency), operator: true, ..RequestOptions::default() };
     let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
     let is_stop = which == Which::Stop;
-    let mut tell = |outcome: &Outcome<'_, T>| match told(outcome, started, sink) {
+    let mut notify = |outcome: &Outcome<'_, T>| match reported(outcome, started, sink) {
         Err(_) if is_stop => Ok(()),
-        told => told,
+        reported => reported,
     };
     block_all(&calls, &options, &|| is_stop || wanted(), &mut |number, news| {
         let Some((of, question)) = questions.get(number) else { return Ok(()) };
@@ -107,13 +107,13 @@ pub(super) fn call<T: Send + 'static>(
                 outcome.open -= 1;
                 outcome.error = outcome.error.take().or(error);
                 if outcome.open == 0 {
-                    return tell(outcome);
+                    return notify(outcome);
                 }
             }
         }
         Ok(())
     })?;
-    missed.iter().try_for_each(tell)
+    missed.iter().try_for_each(notify)
 }
 
 /// Whether it has left, one way or the other: nothing acknowledges it.
@@ -146,7 +146,7 @@ fn functions<T: Send + 'static>(peer: &Peer<T>, which: Which) -> Result<Vec<Stri
     if names.is_empty() { Err(which.missing()) } else { Ok(names) }
 }
 
-fn told<T: Send + 'static>(outcome: &Outcome<'_, T>, started: Instant, sink: Sink<'_>) -> Result<(), End> {
+fn reported<T: Send + 'static>(outcome: &Outcome<'_, T>, started: Instant, sink: Sink<'_>) -> Result<(), End> {
     let sent = "it was sent one way as well, which nothing acknowledges: look whether the node stands";
     let error = outcome.error.clone().map(|error| if outcome.is_one_way { error.and(sent) } else { error });
     let mut answer = called(outcome.peer, error.map_or_else(|| Ok(Default::default()), Err), started);

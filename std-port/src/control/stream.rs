@@ -47,7 +47,7 @@ pub(super) fn values<T: Send + 'static>(
 const JOINED: std::time::Duration = std::time::Duration::from_millis(500);
 
 /// A stream that is told, with its subscription.
-struct Told<T: Send + 'static> {
+struct Report<T: Send + 'static> {
     peer: Peer<T>,
     definition: Definition,
     subscription: Subscription<T>,
@@ -60,14 +60,14 @@ pub(super) fn all<T: Send + 'static>(
     sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
-    let mut told: HashMap<(Identity, String), Told<T>> = HashMap::new();
+    let mut reported: HashMap<(Identity, String), Report<T>> = HashMap::new();
     let mut looked: Option<Instant> = None;
     while !system.is_stopped() {
         if looked.is_none_or(|looked| looked.elapsed() >= JOINED) {
             looked = Some(Instant::now());
-            subscribe(system, interval, &mut told);
+            subscribe(system, interval, &mut reported);
         }
-        for Told { peer, definition, subscription } in told.values_mut() {
+        for Report { peer, definition, subscription } in reported.values_mut() {
             // One that the node does not grant has no values; it is told when it is granted.
             if let Ok(sample) = subscription.next(Duration::ZERO) {
                 send(sink, answer(peer, definition, Ok(&sample)))?;
@@ -85,17 +85,17 @@ pub(super) fn all<T: Send + 'static>(
 fn subscribe<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     interval: Duration,
-    told: &mut HashMap<(Identity, String), Told<T>>,
+    reported: &mut HashMap<(Identity, String), Report<T>>,
 ) {
     for peer in select::nodes(system).into_iter().filter(Peer::is_connected) {
         let streams = peer.streams();
         let has = |name: &str| streams.iter().any(|stream| stream.definition().name() == name);
-        told.retain(|(identity, name), _| identity != peer.identity() || has(name));
+        reported.retain(|(identity, name), _| identity != peer.identity() || has(name));
         for stream in &streams {
             let key = (peer.identity().clone(), stream.definition().name().to_owned());
-            if !told.contains_key(&key) && permit(system, &key.1, Verb::Call).is_ok() {
+            if !reported.contains_key(&key) && permit(system, &key.1, Verb::Call).is_ok() {
                 let (peer, definition) = (peer.clone(), stream.definition().clone());
-                told.insert(key, Told { peer, definition, subscription: stream.subscribe(interval) });
+                reported.insert(key, Report { peer, definition, subscription: stream.subscribe(interval) });
             }
         }
     }

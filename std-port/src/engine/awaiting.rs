@@ -16,7 +16,7 @@ use super::alarms::Alarm;
 use super::calling::{PAUSE, worth_waiting};
 use super::details::Canceller;
 use super::link::{LinkCell, Wake};
-use super::noting::Noted;
+use super::noting::Recorded;
 use super::reader::Cause;
 use super::state_gate::Mark;
 use crate::error::CallError;
@@ -53,7 +53,7 @@ pub struct Pending<T: Send + 'static> {
     alarm: Alarm<T>,
     mark: Option<Mark>,
     /// For the audit log; dropped before the call has ended, it notes that.
-    noted: Option<Noted>,
+    recorded: Option<Recorded>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -88,7 +88,7 @@ impl<T: Send + 'static> Pending<T> {
             made,
             alarm: Alarm::new(engine.clone()),
             mark: None,
-            noted: engine.noted(&link, callee.name(), options),
+            recorded: engine.recorded(&link, callee.name(), options),
             link,
         }
     }
@@ -180,8 +180,8 @@ impl<T: Send + 'static> Pending<T> {
         let stage = self.stage;
         self.stage = Stage::Over { was_sent: stage != Stage::Unsent };
         self.unmark();
-        if let Some(noted) = self.noted.take() {
-            noted.ended(ended.as_ref().map_or_else(|failed| Err(failed.error), |()| Ok(())));
+        if let Some(recorded) = self.recorded.take() {
+            recorded.ended(ended.as_ref().map_or_else(|failed| Err(failed.error), |()| Ok(())));
         }
         let answered = match stage {
             Stage::Sent(id) => ended.map(|()| Answered { link: self.link.clone(), id }).inspect_err(|_| {

@@ -32,7 +32,7 @@ thread_local! {
 }
 
 /// A call whose request has gone out.
-struct Begun<'l> {
+struct Started<'l> {
     state: Locked<'l, LinkState>,
     token: Option<Token>,
     id: CallId,
@@ -49,13 +49,13 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, CallError> {
-        let noted = self.noted(link, callee.name(), options);
+        let recorded = self.recorded(link, callee.name(), options);
         let now = self.now();
         let mut state = link.lock();
         let result = self.request_on(now, link, &mut state, callee, parameters, options, false);
         self.settle_at(now, link, state);
-        if let Some(noted) = noted {
-            noted.ended(outline(&result));
+        if let Some(recorded) = recorded {
+            recorded.ended(outline(&result));
         }
         result
     }
@@ -66,15 +66,15 @@ impl<T: Send + 'static> Engine<T> {
         link: &Arc<LinkCell>,
         mut outgoing: Outgoing<'_, Canceller>,
     ) -> Result<CallId, CallError> {
-        let noted = self.noted(link, outgoing.callee.name(), outgoing.options);
+        let recorded = self.recorded(link, outgoing.callee.name(), outgoing.options);
         let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
-            let begun = self.begin_call(link, &outgoing)?;
-            let id = begun.id;
-            self.await_reply(link, begun, &mut outgoing).map(|()| id)
+            let started = self.begin_call(link, &outgoing)?;
+            let id = started.id;
+            self.await_reply(link, started, &mut outgoing).map(|()| id)
         });
-        if let Some(noted) = noted {
-            noted.ended(outline(&result));
+        if let Some(recorded) = recorded {
+            recorded.ended(outline(&result));
         }
         result
     }
@@ -84,7 +84,7 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &'l Arc<LinkCell>,
         outgoing: &Outgoing<'_, Canceller>,
-    ) -> Result<Begun<'l>, CallError> {
+    ) -> Result<Started<'l>, CallError> {
         let Outgoing { callee, parameters, options, canceller, .. } = outgoing;
         let mut now = self.now();
         let mut state = link.lock();
@@ -103,7 +103,7 @@ impl<T: Send + 'static> Engine<T> {
             let (error, wait) = match sent {
                 Ok(id) => {
                     state.await_reply(id, Wake::Thread(thread::current()));
-                    return Ok(Begun { state, token, id, now, deadline });
+                    return Ok(Started { state, token, id, now, deadline });
                 }
                 Err(error) => {
                     let wait = worth_waiting(&error.error, PAUSE).unwrap_or(Duration::MAX);
@@ -130,10 +130,10 @@ impl<T: Send + 'static> Engine<T> {
     fn await_reply(
         &self,
         link: &Arc<LinkCell>,
-        begun: Begun<'_>,
+        started: Started<'_>,
         outgoing: &mut Outgoing<'_, Canceller>,
     ) -> Result<(), CallError> {
-        let Begun { mut state, mut token, id, now: asked, deadline } = begun;
+        let Started { mut state, mut token, id, now: asked, deadline } = started;
         let Outgoing { parameters, progress, canceller, .. } = outgoing;
         let mut now = asked;
         loop {

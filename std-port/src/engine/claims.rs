@@ -169,7 +169,7 @@ impl<T: Send + 'static> Engine<T> {
                 Some(ClaimEvent::Raise(above)) => self.leave_to_writer(Job::Raise(above)),
                 Some(ClaimEvent::Unkept(peer, claim)) => {
                     tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored");
-                    self.tell(UnitEvent::ClaimNotKept { peer, claim });
+                    self.notify(UnitEvent::ClaimNotKept { peer, claim });
                 }
                 Some(ClaimEvent::StepDown(by)) => self.step_down(by.claim),
                 Some(event) => tracing::debug!(?event, "not understood"),
@@ -268,7 +268,7 @@ impl<T: Send + 'static> Engine<T> {
         tracing::warn!(%claim, "no other manager of this identity answers: its claim is raised above the one that vehicles obeyed");
         lock(&self.claims.writer).kept = kept;
         self.announce_claim(claim);
-        self.tell(UnitEvent::Raised { claim });
+        self.notify(UnitEvent::Raised { claim });
         self.broadcast();
     }
 
@@ -301,7 +301,7 @@ impl<T: Send + 'static> Engine<T> {
             while lock(&me.claims.writer).runs && Instant::now() < until {
                 std::thread::sleep(LOOK);
             }
-            me.tell(UnitEvent::Fenced { claim });
+            me.notify(UnitEvent::Fenced { claim });
         };
         if let Err(error) = std::thread::Builder::new().name("cara-fenced".into()).spawn(stop) {
             tracing::error!(%error, "no thread is left to step down with: tries again when the other one is heard again");

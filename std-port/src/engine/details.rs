@@ -54,7 +54,7 @@ pub(super) fn answer(
 /// A call of a peer, for its handler.
 #[derive(Clone)]
 pub(crate) struct Serving {
-    engine: Weak<dyn Tells>,
+    engine: Weak<dyn Reports>,
     link: Weak<LinkCell>,
     ticket: Ticket,
 }
@@ -66,16 +66,16 @@ impl fmt::Debug for Serving {
 }
 
 /// The engine, whatever the application's state is.
-trait Tells: Send + Sync {
-    fn tell(&self, link: &Arc<LinkCell>, ticket: Ticket, values: &ParametersView) -> Result<(), Error>;
+trait Reports: Send + Sync {
+    fn notify(&self, link: &Arc<LinkCell>, ticket: Ticket, values: &ParametersView) -> Result<(), Error>;
 }
 
-impl<T: Send + 'static> Tells for Engine<T> {
-    fn tell(&self, link: &Arc<LinkCell>, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
+impl<T: Send + 'static> Reports for Engine<T> {
+    fn notify(&self, link: &Arc<LinkCell>, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
         let mut state = link.lock();
-        let told = self.send_progress(self.now(), link, &mut state, ticket, values);
+        let reported = self.send_progress(self.now(), link, &mut state, ticket, values);
         self.settle(link, state);
-        told
+        reported
     }
 }
 
@@ -92,9 +92,9 @@ impl<T: Send + 'static> Engine<T> {
         ticket: Ticket,
         values: &ParametersView,
     ) -> Result<(), Error> {
-        let told = self.with_at(now, link, state, |session, cx| session.progress(cx, ticket, values));
+        let reported = self.with_at(now, link, state, |session, cx| session.progress(cx, ticket, values));
         let waiting = state.details.progress.iter_mut().find(|(known, _)| *known == ticket);
-        match (told, waiting) {
+        match (reported, waiting) {
             (Err(Error::Full(_)), Some((_, kept))) => kept.copy_from(values),
             (Err(Error::Full(_)), None) => {
                 let mut kept = arena(size_of_val(values));
@@ -112,7 +112,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Sends the progress that there was no room for, as far as there is now.
-    pub(super) fn tell_again(&self, now: Instant, link: &LinkCell, state: &mut LinkState) {
+    pub(super) fn notify_again(&self, now: Instant, link: &LinkCell, state: &mut LinkState) {
         for (ticket, values) in std::mem::take(&mut state.details.progress) {
             // What is wrong with it was told when it was new.
             let _ = self.send_progress(now, link, state, ticket, &values);
@@ -131,9 +131,9 @@ impl Serving {
         }
     }
 
-    pub(crate) fn tell(&self, values: &ParametersView) -> Result<(), Error> {
+    pub(crate) fn notify(&self, values: &ParametersView) -> Result<(), Error> {
         match (self.engine.upgrade(), self.link.upgrade()) {
-            (Some(engine), Some(link)) => engine.tell(&link, self.ticket, values),
+            (Some(engine), Some(link)) => engine.notify(&link, self.ticket, values),
             _ => Ok(()),
         }
     }

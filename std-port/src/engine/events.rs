@@ -29,7 +29,7 @@ enum Subscriber {
 }
 
 /// What became of an event at a subscriber.
-pub(crate) enum Told {
+pub(crate) enum Delivered {
     Kept,
     Lost,
     Gone,
@@ -37,16 +37,16 @@ pub(crate) enum Told {
 
 impl Events {
     /// A subscriber that does not keep up loses the event, and one that is gone is forgotten.
-    pub(super) fn tell(&self, event: &UnitEvent) {
+    pub(super) fn notify(&self, event: &UnitEvent) {
         tracing::debug!(?event);
         let mut subscribers = Rank::Leaf.lock(&self.subscribers);
-        subscribers.retain(|subscriber| match subscriber.tell(event) {
-            Told::Kept => true,
-            Told::Lost => {
+        subscribers.retain(|subscriber| match subscriber.notify(event) {
+            Delivered::Kept => true,
+            Delivered::Lost => {
                 self.lost.fetch_add(1, Ordering::Relaxed);
                 true
             }
-            Told::Gone => false,
+            Delivered::Gone => false,
         });
         #[cfg(feature = "async")]
         {
@@ -84,18 +84,18 @@ impl Events {
 }
 
 impl Subscriber {
-    fn tell(&self, event: &UnitEvent) -> Told {
+    fn notify(&self, event: &UnitEvent) -> Delivered {
         match self {
             Self::Channel { sender, lost } => match sender.try_send(event.clone()) {
-                Ok(()) => Told::Kept,
+                Ok(()) => Delivered::Kept,
                 Err(TrySendError::Full(_)) => {
                     lost.fetch_add(1, Ordering::Relaxed);
-                    Told::Lost
+                    Delivered::Lost
                 }
-                Err(TrySendError::Disconnected(_)) => Told::Gone,
+                Err(TrySendError::Disconnected(_)) => Delivered::Gone,
             },
             #[cfg(feature = "async")]
-            Self::Queue(queue) => queue.upgrade().map_or(Told::Gone, |queue| queue.put(event)),
+            Self::Queue(queue) => queue.upgrade().map_or(Delivered::Gone, |queue| queue.put(event)),
         }
     }
 

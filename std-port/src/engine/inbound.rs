@@ -12,7 +12,7 @@ use cara_core::time::Instant;
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
-use super::serving::{self, Begun};
+use super::serving::{self, Started};
 use super::worker::arena;
 use crate::handler::Handler;
 use crate::storage::Boxed;
@@ -31,7 +31,7 @@ struct Step {
     /// Something was consumed or came out: there may be more.
     progress: bool,
     joined: bool,
-    call: Option<Begun>,
+    call: Option<Started>,
 }
 
 impl Step {
@@ -49,7 +49,7 @@ impl<T: Send + 'static> Engine<T> {
         bytes: &mut [u8],
         mut arguments: Option<&mut ParametersView>,
         mut own: Option<&mut OwnCall<'_>>,
-    ) -> Option<Begun> {
+    ) -> Option<Started> {
         let (was_paused, stalled) = (state.is_paused(), state.backlog.is_stalled(now));
         let (mut earlier, mut position) = state.backlog.take();
         let bytes = if was_paused {
@@ -117,10 +117,10 @@ impl<T: Send + 'static> Engine<T> {
             None => {}
             Some(Event::Joined) => step.joined = true,
             Some(Event::Incoming(call)) => {
-                let begun = self.begun(&functions, link, call);
+                let started = self.started(&functions, link, call);
                 match arguments.filter(|_| serving::is_emergency(&call)) {
-                    None => step.call = Some(begun),
-                    Some(arguments) => self.copy_emergency(&functions, link, begun, arguments),
+                    None => step.call = Some(started),
+                    Some(arguments) => self.copy_emergency(&functions, link, started, arguments),
                 }
             }
             Some(Event::Progress(id, values)) => {
@@ -177,12 +177,12 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         functions: &FunctionList<Boxed, Handler<T>>,
         link: &Arc<LinkCell>,
-        begun: Begun,
+        started: Started,
         arguments: &ParametersView,
     ) {
         let mut copy = arena(self.call_bytes());
         if copy.copy_from(arguments).is_ok() {
-            self.run_emergency(functions, link, begun, copy);
+            self.run_emergency(functions, link, started, copy);
         }
     }
 }

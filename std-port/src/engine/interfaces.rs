@@ -51,7 +51,7 @@ impl<T: Send + 'static> Engine<T> {
             self.wake_clock();
         }
         if !first || !reaches {
-            self.tell(UnitEvent::NetworkChanged { up });
+            self.notify(UnitEvent::NetworkChanged { up });
         }
         due
     }

@@ -122,12 +122,12 @@ impl<T: Send + 'static> Engine<T> {
     /// As [`await_acknowledgements`](Self::await_acknowledgements), without a thread that waits.
     pub(crate) async fn acknowledgements(
         self: &Arc<Self>,
-        told: Vec<(Arc<LinkCell>, u32)>,
+        reported: Vec<(Arc<LinkCell>, u32)>,
         timeout: Duration,
     ) -> Vec<Arc<LinkCell>> {
         let deadline = self.now() + timeout;
         let mut missing = Vec::new();
-        for (link, serial) in told {
+        for (link, serial) in reported {
             let look = |state: &mut LinkState| match state.session.is_acknowledged(serial) {
                 true => Some(Ok(())),
                 false => (!state.session.is_live()).then_some(Err(Error::NotConnected)),

@@ -55,7 +55,7 @@ impl HubCell {
     fn serial_of(&self, command: &Command<SocketAddr>) -> Option<u32> {
         match command {
             Command::Dial { .. } => None,
-            Command::Tell(link, _) => self.serials.get(link).copied(),
+            Command::Notify(link, _) => self.serials.get(link).copied(),
         }
     }
 
@@ -174,7 +174,7 @@ impl<T: Send + 'static> Engine<T> {
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
             self.hub().hub.node.dial_failed(self.now(), identity);
             let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
-            self.tell(UnitEvent::NotJoined { address: to, peer, reason });
+            self.notify(UnitEvent::NotJoined { address: to, peer, reason });
         }
         self.wake_clock();
     }
@@ -184,7 +184,7 @@ impl<T: Send + 'static> Engine<T> {
         let refusal = Refusal::DuplicateIdentity;
         let own = self.hub().hub.node.identity().clone();
         warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");
-        self.tell(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
+        self.notify(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
     }
 
     /// The connection that this unit opened is there, or could not be opened.
@@ -228,7 +228,7 @@ impl<T: Send + 'static> Engine<T> {
             return self.link_ended(link, reason);
         }
         if let Event::Actuator { slot, state } = event {
-            return self.actuator_told(link, slot, state);
+            return self.actuator_reported(link, slot, state);
         }
         match event {
             Event::Sample(_) => return self.pass_on_samples(link),
@@ -236,14 +236,14 @@ impl<T: Send + 'static> Engine<T> {
             Event::ListChanged => self.subscribe_again(link),
             _ => {}
         }
-        self.tell_of(link, event);
+        self.notify_of(link, event);
         if let Event::Answered | Event::Acknowledged { .. } = event {
             link.notify();
         }
     }
 
     /// The peer has told the state of what a function moves. Subscribers hear of its latch alone.
-    fn actuator_told(&self, link: &LinkCell, slot: Slot, state: ActuatorState) {
+    fn actuator_reported(&self, link: &LinkCell, slot: Slot, state: ActuatorState) {
         let mut held = link.lock();
         let before = held.actuators.insert(slot, state).unwrap_or_default();
         let name = held.session.their_function_list().function(slot).map(|function| function.name().to_owned());
@@ -251,14 +251,14 @@ impl<T: Send + 'static> Engine<T> {
         link.notify();
         let Some(peer) = link.peer.get().filter(|_| before.latch != state.latch) else { return };
         if let Some(function) = name {
-            self.tell(UnitEvent::Inhibited { peer: peer.identity.clone(), function, latch: state.latch });
+            self.notify(UnitEvent::Inhibited { peer: peer.identity.clone(), function, latch: state.latch });
         }
     }
 
     /// Tells subscribers of an event on a link.
-    fn tell_of(&self, link: &LinkCell, event: Event) {
-        let told = UnitEvent::of(event, &link.lock().session, &*self.functions(), str::to_owned);
-        told.into_iter().for_each(|event| self.tell(event));
+    fn notify_of(&self, link: &LinkCell, event: Event) {
+        let reported = UnitEvent::of(event, &link.lock().session, &*self.functions(), str::to_owned);
+        reported.into_iter().for_each(|event| self.notify(event));
     }
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
@@ -275,7 +275,7 @@ impl<T: Send + 'static> Engine<T> {
             peer.leave(link, reason);
             self.run_lost_hook();
         }
-        self.tell_of(link, Event::Closed(reason));
+        self.notify_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
         self.hub().hub.node.left(self.now(), link.id, reason);
         self.links.remove(link);
@@ -307,7 +307,7 @@ impl<T: Send + 'static> Engine<T> {
     fn carry_out(&self, command: Command<SocketAddr>, serial: Option<u32>) {
         match command {
             Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
-            Command::Tell(id, directive) => {
+            Command::Notify(id, directive) => {
                 let Some(link) = self.link_of(id, serial) else { return };
                 let mut state = link.lock();
                 let event = self.with(&link, &mut state, |session, cx| session.direct(cx, directive));
@@ -376,11 +376,11 @@ impl<T: Send + 'static> Engine<T> {
     /// Waits until each peer has read what it was told, at most until `timeout`; returns those that have not.
     pub(crate) fn await_acknowledgements(
         &self,
-        told: &[(Arc<LinkCell>, u32)],
+        reported: &[(Arc<LinkCell>, u32)],
         timeout: Duration,
     ) -> Vec<Arc<LinkCell>> {
         let deadline = self.now() + timeout;
-        let missing = told.iter().filter(|(link, serial)| !self.await_acknowledgement(link, *serial, deadline));
+        let missing = reported.iter().filter(|(link, serial)| !self.await_acknowledgement(link, *serial, deadline));
         missing.map(|(link, _)| link.clone()).collect()
     }
 

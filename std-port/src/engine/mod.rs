@@ -70,7 +70,7 @@ pub(crate) use accounts::{Group, Reading};
 pub(crate) use alarms::Alarm;
 pub(crate) use awaiting::{Answered, CallsToAll, Pending};
 #[cfg(feature = "async")]
-pub(crate) use events::Told;
+pub(crate) use events::Delivered;
 pub(crate) use keys::Keys;
 pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
@@ -305,8 +305,8 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Tells subscribers.
-    pub(crate) fn tell(&self, event: UnitEvent) {
-        self.events.tell(&event);
+    pub(crate) fn notify(&self, event: UnitEvent) {
+        self.events.notify(&event);
         self.news.add();
     }
 

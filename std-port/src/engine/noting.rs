@@ -2,7 +2,7 @@
 //! where they are asked for.
 
 #[cfg(feature = "control")]
-pub(super) use crate::control::ProgramCall as Noted;
+pub(super) use crate::control::ProgramCall as Recorded;
 
 use cara_core::services::session::RequestOptions;
 
@@ -12,10 +12,10 @@ use super::link::LinkCell;
 /// Without operators there is no audit log.
 #[cfg(not(feature = "control"))]
 #[derive(Debug)]
-pub(super) enum Noted {}
+pub(super) enum Recorded {}
 
 #[cfg(not(feature = "control"))]
-impl Noted {
+impl Recorded {
     pub(super) fn ended(self, _: Result<(), cara_core::error::Error>) {
         match self {}
     }
@@ -24,15 +24,15 @@ impl Noted {
 impl<T: Send + 'static> Engine<T> {
     /// What is to be noted of a call that is about to be made.
     #[cfg(feature = "control")]
-    pub(super) fn noted(&self, link: &LinkCell, function: &str, options: &RequestOptions) -> Option<Noted> {
+    pub(super) fn recorded(&self, link: &LinkCell, function: &str, options: &RequestOptions) -> Option<Recorded> {
         let audit = self.audit.as_ref().filter(|_| !options.operator)?;
         let attributes = link.lock().session.their_function_list().named(function).map(|known| *known.attributes);
         let node = || link.peer.get().map(|peer| peer.identity.to_string()).unwrap_or_default();
-        Noted::of(audit, function, attributes, options.take_over, node)
+        Recorded::of(audit, function, attributes, options.take_over, node)
     }
 
     #[cfg(not(feature = "control"))]
-    pub(super) fn noted(&self, _: &LinkCell, _: &str, _: &RequestOptions) -> Option<Noted> {
+    pub(super) fn recorded(&self, _: &LinkCell, _: &str, _: &RequestOptions) -> Option<Recorded> {
         None
     }
 

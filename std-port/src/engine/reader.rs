@@ -153,7 +153,7 @@ impl ReadPolicy {
             }
             // The pace is noted wherever the token is.
             (_, Cause::Stays { served, may }) => {
-                let stays = self.pace.goes_on(now, served) && may && before == Reader::Pool;
+                let stays = self.pace.continues(now, served) && may && before == Reader::Pool;
                 duties.token = stays.then(|| self.grant(Role::Worker));
             }
             (Reader::Led { token, .. }, Cause::Begins(holder)) if token == holder => {
@@ -276,7 +276,7 @@ impl ReadPolicy {
 
 impl Pace {
     /// A call of the peer has been served: whether the next one is expected at once, and quick.
-    fn goes_on(&mut self, now: Instant, served: usize) -> bool {
+    fn continues(&mut self, now: Instant, served: usize) -> bool {
         let others = served.wrapping_sub(std::mem::replace(&mut self.served, served));
         let before = self.served_at.replace(now);
         self.is_quick && others <= FEW && before.is_some_and(|before| now < before + AT_ONCE)
@@ -486,19 +486,19 @@ mod tests {
         let armed = Registration { readable: true, writable: false, is_out: false };
         let out = OUT;
         let mut policy = busy();
-        let told = |policy: &ReadPolicy, before| policy.registration(before, false, false);
-        assert_eq!(told(&policy, out), armed);
+        let reported = |policy: &ReadPolicy, before| policy.registration(before, false, false);
+        assert_eq!(reported(&policy, out), armed);
         assert_eq!(policy.registration(armed, true, false), Registration { is_out: false, ..out }, "it is paused");
         let token = wants(&mut policy).unwrap();
-        assert_eq!(told(&policy, armed), Registration { is_out: false, ..out }, "a call alone disarms it");
-        assert_eq!(told(&policy, out), out, "it is not put back from call to call");
+        assert_eq!(reported(&policy, armed), Registration { is_out: false, ..out }, "a call alone disarms it");
+        assert_eq!(reported(&policy, out), out, "it is not put back from call to call");
         assert_eq!(
             policy.registration(out, false, true),
             Registration { readable: false, writable: true, is_out: false }
         );
         leaves(&mut policy, Some(token), None);
         stays(&mut policy).unwrap();
-        assert_eq!(told(&policy, armed), out);
+        assert_eq!(reported(&policy, armed), out);
         let opening = ReadPolicy::new(true).registration(armed, false, false);
         assert_eq!(opening, Registration { readable: true, writable: true, is_out: false });
     }

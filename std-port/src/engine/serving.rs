@@ -25,7 +25,7 @@ const PAUSE: Duration = Duration::from_millis(20);
 
 /// A call that has begun.
 #[derive(Clone, Copy)]
-pub(super) struct Begun {
+pub(super) struct Started {
     pub(super) call: Incoming,
     /// Its turn, where it takes the application's state.
     turn: Option<Turn>,
@@ -49,16 +49,21 @@ enum Ran {
 
 impl<T: Send + 'static> Engine<T> {
     /// A call has begun, under its link's lock: it takes its turn.
-    pub(super) fn begun(&self, functions: &FunctionList<Boxed, Handler<T>>, link: &LinkCell, call: Incoming) -> Begun {
+    pub(super) fn started(
+        &self,
+        functions: &FunctionList<Boxed, Handler<T>>,
+        link: &LinkCell,
+        call: Incoming,
+    ) -> Started {
         let takes_state = functions.function(call.slot).is_some_and(|function| function.handler.run.takes_state());
-        Begun { call, turn: takes_state.then(|| self.services.state.take_turn(Some(link.id))) }
+        Started { call, turn: takes_state.then(|| self.services.state.take_turn(Some(link.id))) }
     }
 
     /// Runs a call and those that waited behind it.
-    pub(super) fn serve(&self, link: &Arc<LinkCell>, begun: Begun, worker: &mut Worker) {
-        let mut next = Some(begun);
-        while let Some(begun) = next {
-            let served = self.serve_one(self.now(), link, begun, worker);
+    pub(super) fn serve(&self, link: &Arc<LinkCell>, started: Started, worker: &mut Worker) {
+        let mut next = Some(started);
+        while let Some(started) = next {
+            let served = self.serve_one(self.now(), link, started, worker);
             next = self.next_call(link, served.map_or_else(|| link.lock(), |(state, _)| state), worker);
         }
     }
@@ -69,11 +74,11 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         began: Instant,
         link: &'l Arc<LinkCell>,
-        begun: Begun,
+        started: Started,
         worker: &mut Worker,
     ) -> Option<(Locked<'l, LinkState>, Instant)> {
         let occupied = self.thread_pool().occupancy.enter();
-        let ran = self.run(link, begun, &mut worker.arguments);
+        let ran = self.run(link, started, &mut worker.arguments);
         drop(occupied);
         let result = match ran {
             Ran::Over(result) => result,
@@ -81,15 +86,15 @@ impl<T: Send + 'static> Engine<T> {
                 link.lock().reading.ran(Duration::MAX);
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
-                self.park(turn, Parked { link: link.clone(), call: begun.call, arguments });
+                self.park(turn, Parked { link: link.clone(), call: started.call, arguments });
                 return None;
             }
             #[cfg(feature = "async")]
-            Ran::Apart(told, begin, to_its_end) => {
+            Ran::Apart(reported, begin, to_its_end) => {
                 link.lock().reading.ran(self.now().since(began));
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
-                self.begin_task(link, begun.call, *told, (&*begin, to_its_end), arguments);
+                self.begin_task(link, started.call, *reported, (&*begin, to_its_end), arguments);
                 return None;
             }
         };
@@ -97,7 +102,7 @@ impl<T: Send + 'static> Engine<T> {
         let mut state = link.lock();
         state.reading.ran(now.since(began));
         state.backlog.moved(now);
-        Some((self.answer(now, link, state, &begun.call, result, &worker.arguments), now))
+        Some((self.answer(now, link, state, &started.call, result, &worker.arguments), now))
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.
@@ -106,7 +111,7 @@ impl<T: Send + 'static> Engine<T> {
         link: &Arc<LinkCell>,
         mut state: Locked<'_, LinkState>,
         worker: &mut Worker,
-    ) -> Option<Begun> {
+    ) -> Option<Started> {
         let mut next = None;
         self.dispatch_emergencies(link, &mut state);
         if state.is_paused() && !state.session.has_next_call() {
@@ -123,9 +128,9 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Begins the next call of a link.
-    pub(super) fn take_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Begun> {
+    pub(super) fn take_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Started> {
         let call = self.with(link, state, |session, cx| session.next_call(cx, &mut worker.arguments))?;
-        Some(self.begun(&self.functions(), link, call))
+        Some(self.started(&self.functions(), link, call))
     }
 
     /// Gives emergencies that have come to the threads of their services. No thread that reads runs them.
@@ -134,8 +139,8 @@ impl<T: Send + 'static> Engine<T> {
             let mut arguments = arena(self.call_bytes());
             let call = self.with(link, state, |session, cx| session.next_emergency(cx, &mut arguments));
             let Some(call) = call else { return };
-            let begun = self.begun(&self.functions(), link, call);
-            self.run_emergency(&self.functions(), link, begun, arguments);
+            let started = self.started(&self.functions(), link, call);
+            self.run_emergency(&self.functions(), link, started, arguments);
         }
     }
 
@@ -145,25 +150,25 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         functions: &FunctionList<Boxed, Handler<T>>,
         link: &Arc<LinkCell>,
-        begun: Begun,
+        started: Started,
         mut arguments: Box<ParametersView>,
     ) {
         let Some(engine) = self.me.upgrade() else { return };
-        let executor = functions.function(begun.call.slot).and_then(|function| function.handler.executor.clone());
+        let executor = functions.function(started.call.slot).and_then(|function| function.handler.executor.clone());
         let Some(executor) = executor.or_else(|| self.thread_pool().executor()) else { return };
         let link = link.clone();
-        executor.run(move || match engine.run(&link, begun, &mut arguments) {
+        executor.run(move || match engine.run(&link, started, &mut arguments) {
             Ran::Over(result) => {
-                let state = engine.answer(engine.now(), &link, link.lock(), &begun.call, result, &arguments);
+                let state = engine.answer(engine.now(), &link, link.lock(), &started.call, result, &arguments);
                 if state.session.has_next_call() {
                     engine.hand_over(&link);
                 }
                 engine.settle(&link, state);
             }
-            Ran::NotYet(turn) => engine.park(turn, Parked { link, call: begun.call, arguments }),
+            Ran::NotYet(turn) => engine.park(turn, Parked { link, call: started.call, arguments }),
             #[cfg(feature = "async")]
-            Ran::Apart(told, begin, to_its_end) => {
-                engine.begin_task(&link, begun.call, *told, (&*begin, to_its_end), arguments);
+            Ran::Apart(reported, begin, to_its_end) => {
+                engine.begin_task(&link, started.call, *reported, (&*begin, to_its_end), arguments);
             }
         });
     }
@@ -197,7 +202,7 @@ impl<T: Send + 'static> Engine<T> {
         let result = if is_over { Err(Error::Expired) } else { turn.map(drop) };
         let own = std::mem::replace(&mut worker.arguments, arguments);
         let state = match result {
-            Ok(()) => self.serve_one(now, &link, Begun { call, turn: turn.ok() }, worker).map(|(state, _)| state),
+            Ok(()) => self.serve_one(now, &link, Started { call, turn: turn.ok() }, worker).map(|(state, _)| state),
             Err(error) => {
                 self.give_up(turn.ok());
                 Some(self.answer(now, &link, link.lock(), &call, Err(error), &worker.arguments))
@@ -217,9 +222,9 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn run(&self, link: &Arc<LinkCell>, begun: Begun, arguments: &mut ParametersView) -> Ran {
-        let Begun { call, turn } = begun;
-        let (run, told) = match self.prepare(link, &call) {
+    fn run(&self, link: &Arc<LinkCell>, started: Started, arguments: &mut ParametersView) -> Ran {
+        let Started { call, turn } = started;
+        let (run, reported) = match self.prepare(link, &call) {
             Ok(prepared) => prepared,
             Err(error) => {
                 self.give_up(turn);
@@ -229,12 +234,12 @@ impl<T: Send + 'static> Engine<T> {
         match run {
             Run::Free(run) => {
                 self.give_up(turn);
-                Ran::Over(guarded(&told, || run(&told, arguments)))
+                Ran::Over(guarded(&reported, || run(&reported, arguments)))
             }
             Run::Method(run) => {
                 let turn = turn.unwrap_or_else(|| self.services.state.take_turn(Some(link.id)));
                 let result = match self.services.state.enter_by(turn) {
-                    Entered::Held(mut state) => guarded(&told, || run(&mut state, &told, arguments)),
+                    Entered::Held(mut state) => guarded(&reported, || run(&mut state, &reported, arguments)),
                     Entered::NotYet => return Ran::NotYet(turn),
                     Entered::Refused(error) => Err(error),
                 };
@@ -244,10 +249,10 @@ impl<T: Send + 'static> Engine<T> {
             #[cfg(feature = "async")]
             Run::Task(begin) => {
                 self.give_up(turn);
-                let told = handler::Served { given_up: Some(Arc::default()), ..told };
+                let reported = handler::Served { given_up: Some(Arc::default()), ..reported };
                 let to_its_end =
                     self.functions().function(call.slot).is_some_and(|function| function.handler.to_its_end);
-                Ran::Apart(Box::new(told), begin, to_its_end)
+                Ran::Apart(Box::new(reported), begin, to_its_end)
             }
         }
     }
@@ -270,7 +275,7 @@ impl<T: Send + 'static> Engine<T> {
             // An earlier call has given way.
             actuator.lease.wake();
         }
-        let told = handler::Served {
+        let reported = handler::Served {
             caller: peer.identity.clone(),
             priority: call.priority,
             deadline: call.deadline,
@@ -280,7 +285,7 @@ impl<T: Send + 'static> Engine<T> {
             #[cfg(feature = "async")]
             given_up: None,
         };
-        Ok((run, told))
+        Ok((run, reported))
     }
 
     /// Answers, waiting for room until the call's deadline.
@@ -325,13 +330,13 @@ impl<T: Send + 'static> Engine<T> {
 }
 
 /// Runs a handler, which may panic. Not for an order that ended while its call waited for a thread or for its turn.
-pub(super) fn guarded(told: &handler::Served, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
-    if told.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
+pub(super) fn guarded(reported: &handler::Served, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
+    if reported.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
         return Err(Error::Expired);
     }
     catch_unwind(AssertUnwindSafe(run)).map_or_else(
         |_| {
-            tracing::error!(caller = %told.caller, "a handler panicked");
+            tracing::error!(caller = %reported.caller, "a handler panicked");
             Err(Error::Service(ServiceError::Panicked))
         },
         |result| result.map_err(Error::Service),

@@ -33,7 +33,7 @@ impl<T: Send + 'static> Engine<T> {
             deadline = state.session.deadline();
         }
         if state.details.has_progress_to_send() {
-            self.tell_again(now, link, state);
+            self.notify_again(now, link, state);
             deadline = state.session.deadline();
         }
         self.set_timer(now, deadline, link, state);

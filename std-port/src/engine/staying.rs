@@ -15,7 +15,7 @@ use cara_core::time::Instant;
 use super::Engine;
 use super::link::{LinkCell, LinkState};
 use super::reader::{Cause, Token};
-use super::serving::Begun;
+use super::serving::Started;
 use super::watch::Staying;
 use super::worker::Worker;
 use crate::locks::Locked;
@@ -33,10 +33,10 @@ impl<T: Send + 'static> Engine<T> {
                 if let Some(call) = self.next_call(link, state, worker) {
                     self.serve(link, call, worker);
                 }
-                if !self.goes_on(self.now(), link, link.lock(), token) {
+                if !self.continues(self.now(), link, link.lock(), token) {
                     break;
                 }
-            } else if !self.goes_on(now, link, state, token) {
+            } else if !self.continues(now, link, state, token) {
                 break;
             }
         }
@@ -58,7 +58,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// The thread has served a call: whether it stays.
-    fn goes_on<'l>(
+    fn continues<'l>(
         &self,
         now: Instant,
         link: &'l Arc<LinkCell>,
@@ -72,7 +72,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Reads until a call is to be run; `None` when nothing comes any more, or the thread is needed elsewhere.
-    fn await_call(&self, link: &Arc<LinkCell>, token: Token, worker: &mut Worker) -> Option<(Begun, Instant)> {
+    fn await_call(&self, link: &Arc<LinkCell>, token: Token, worker: &mut Worker) -> Option<(Started, Instant)> {
         loop {
             let received = link.stream.receive(&mut worker.buffer, Wait::Slice);
             let now = self.now();
@@ -106,7 +106,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// A call that came together with others and may begin.
-    fn waiting_call(&self, link: &Arc<LinkCell>, state: &mut LinkState, worker: &mut Worker) -> Option<Begun> {
+    fn waiting_call(&self, link: &Arc<LinkCell>, state: &mut LinkState, worker: &mut Worker) -> Option<Started> {
         self.dispatch_emergencies(link, state);
         let has = state.session.has_next_call();
         has.then(|| self.take_call(link, state, worker)).flatten()

@@ -242,7 +242,7 @@ impl<T: Send + 'static> Engine<T> {
             let id = watched.want(interval);
             (watched, id)
         };
-        self.tell_subscription(peer, &watched);
+        self.notify_subscription(peer, &watched);
         (watched, id)
     }
 
@@ -254,19 +254,19 @@ impl<T: Send + 'static> Engine<T> {
                 streams.remove(&watched.name);
             }
         }
-        self.tell_subscription(peer, watched);
+        self.notify_subscription(peer, watched);
     }
 
-    fn tell_subscription(&self, peer: &PeerCell, watched: &Watched) {
+    fn notify_subscription(&self, peer: &PeerCell, watched: &Watched) {
         let Some(link) = peer.link() else { return };
-        self.tell_on(&link, peer, watched);
+        self.notify_on(&link, peer, watched);
     }
 
-    fn tell_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
+    fn notify_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
         let mut state = link.lock();
         // Read under the lock of the link: of two threads the last one tells what holds.
         let interval = peer.watched(&watched.name).and_then(|watched| watched.interval());
-        let told = self.with(link, &mut state, |session, cx| match interval {
+        let reported = self.with(link, &mut state, |session, cx| match interval {
             Some(interval) => session.subscribe(cx, &watched.name, interval).map(drop),
             None => {
                 session.unsubscribe(cx, &watched.name);
@@ -274,7 +274,7 @@ impl<T: Send + 'static> Engine<T> {
             }
         });
         self.settle(link, state);
-        if let Err(error @ Error::UnknownFunction) = told {
+        if let Err(error @ Error::UnknownFunction) = reported {
             watched.was_answered(Err(error));
         }
     }
@@ -283,7 +283,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn subscribe_again(&self, link: &Arc<LinkCell>) {
         let Some(peer) = link.peer.get() else { return };
         let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
-        all.iter().for_each(|watched| self.tell_on(link, peer, watched));
+        all.iter().for_each(|watched| self.notify_on(link, peer, watched));
     }
 
     /// Whether a value is to go on to a stream of this unit. The tasks that wait for it are put into `woken`.

@@ -67,14 +67,14 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &Arc<LinkCell>,
         call: Incoming,
-        told: handler::Served,
+        reported: handler::Served,
         (begin, to_its_end): (&Begin, bool),
         arguments: Box<ParametersView>,
     ) {
         let Some(engine) = self.me.upgrade() else { return };
-        let (lease, given_up) = (told.lease_ended(), told.given_up.clone());
-        let caller = told.caller.clone();
-        let work = catch_unwind(AssertUnwindSafe(|| begin(told, arguments)));
+        let (lease, given_up) = (reported.lease_ended(), reported.given_up.clone());
+        let caller = reported.caller.clone();
+        let work = catch_unwind(AssertUnwindSafe(|| begin(reported, arguments)));
         if work.is_err() {
             tracing::error!(%caller, "a handler panicked");
         }
@@ -150,7 +150,7 @@ impl<T: Send + 'static> Task<T> {
         let is_given_up = self.work.is_some() && self.is_given_up(cx);
         let Some(work) = &mut self.work else { return Poll::Ready(()) };
         if is_given_up {
-            self.given_up.iter().for_each(|given_up| given_up.tell());
+            self.given_up.iter().for_each(|given_up| given_up.notify());
         }
         let ended = if is_given_up && !self.to_its_end {
             Ok(Err(Error::Expired))
@@ -230,7 +230,7 @@ impl<T: Send + 'static> Drop for Task<T> {
 pub(crate) struct GivenUp(Mutex<(bool, Vec<Waker>)>);
 
 impl GivenUp {
-    fn tell(&self) {
+    fn notify(&self) {
         let mut state = lock(&self.0);
         state.0 = true;
         let tasks = std::mem::take(&mut state.1);
@@ -293,7 +293,7 @@ mod tests {
         let given_up = GivenUp::default();
         let cx = Context::from_waker(Waker::noop());
         assert!(given_up.poll(&cx).is_pending());
-        given_up.tell();
+        given_up.notify();
         assert!(given_up.poll(&cx).is_ready());
     }
 }

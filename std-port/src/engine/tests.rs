@@ -168,10 +168,10 @@ fn an_answer_that_cannot_be_kept_is_dropped_with_its_deadline() {
 /// The thread that is to run a call may come when the call's order has ended.
 #[test]
 fn no_handler_runs_for_an_order_that_has_ended() {
-    let (tell, told) = channel();
-    let tell = Mutex::new(tell);
+    let (notify, reported) = channel();
+    let notify = Mutex::new(notify);
     let go = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
-        lock(&tell).send(call.clone()).unwrap();
+        lock(&notify).send(call.clone()).unwrap();
         Ok(())
     };
     let pair = Pair::new(Constraints::M_UNIT, |agv| {
@@ -179,17 +179,17 @@ fn no_handler_runs_for_an_order_that_has_ended() {
         agv.my_function_list().add_service(&"go()".parse().unwrap(), options, go).unwrap();
     });
     pair.peer.call("go", &mut Parameters::new()).with(options(PATIENT)).wait().unwrap();
-    let told = told.recv().unwrap();
+    let reported = reported.recv().unwrap();
     let runs = AtomicUsize::new(0);
     let run = || {
-        serving::guarded(&told, || {
+        serving::guarded(&reported, || {
             runs.fetch_add(1, Ordering::Relaxed);
             Ok(())
         })
     };
     assert_eq!(run(), Ok(()), "its order lasts");
     pair.peer.release("go").unwrap();
-    until(|| !told.lease.as_ref().unwrap().is_live());
+    until(|| !reported.lease.as_ref().unwrap().is_live());
     assert_eq!((run(), runs.into_inner()), (Err(Error::Expired), 1));
 }
 
@@ -202,12 +202,12 @@ fn an_event_that_finds_no_room_is_counted_for_its_subscriber_and_the_unit() {
     let (quick, quick_events) = sync_channel(8);
     let (lost_by_slow, lost_by_quick) = (engine.subscribe(slow), engine.subscribe(quick));
     let event = UnitEvent::NetworkChanged { up: Vec::new() };
-    (0..4).for_each(|_| engine.tell(event.clone()));
+    (0..4).for_each(|_| engine.notify(event.clone()));
     let counted = [&lost_by_slow, &lost_by_quick].map(|lost| lost.load(Ordering::Relaxed));
     assert_eq!((counted, lost()), ([3, 0], 3));
     assert_eq!((slow_events.try_iter().count(), quick_events.try_iter().count()), (1, 4));
     drop(slow_events);
-    engine.tell(event);
+    engine.notify(event);
     assert_eq!((lost_by_slow.load(Ordering::Relaxed), lost()), (3, 3), "one that is gone loses nothing");
 }
 
@@ -215,10 +215,10 @@ fn an_event_that_finds_no_room_is_counted_for_its_subscriber_and_the_unit() {
 #[test]
 fn the_deadline_of_a_call_is_that_of_its_first_try() {
     const TIMEOUT: Duration = Duration::from_secs(30);
-    let (tell, told) = channel();
-    let tell = Mutex::new(tell);
+    let (notify, reported) = channel();
+    let notify = Mutex::new(notify);
     let take = move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
-        lock(&tell).send(call.deadline).unwrap();
+        lock(&notify).send(call.deadline).unwrap();
         Ok(())
     };
     let pair = Pair::new(Constraints::M_UNIT, |agv| {
@@ -242,7 +242,7 @@ fn the_deadline_of_a_call_is_that_of_its_first_try() {
             buffers.into_iter().for_each(|buffer| pool.give(buffer));
             latest
         });
-        let deadline = told.recv().unwrap();
+        let deadline = reported.recv().unwrap();
         assert!(deadline <= latest, "{} us later", deadline.since(latest).as_micros());
     }
 }

@@ -10,7 +10,7 @@ use cara_core::error::CloseReason;
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
-use super::serving::Begun;
+use super::serving::Started;
 use super::worker::{READ_BYTES, Worker};
 use crate::sys::epoll::{Interest, Ready};
 use crate::sys::stream::{Received, Wait};
@@ -74,7 +74,13 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Reads until nothing is left or the budget is used up, in which case the epoll set reports the link again.
-    fn drain(&self, link: &Arc<LinkCell>, state: &mut LinkState, hung_up: bool, worker: &mut Worker) -> Option<Begun> {
+    fn drain(
+        &self,
+        link: &Arc<LinkCell>,
+        state: &mut LinkState,
+        hung_up: bool,
+        worker: &mut Worker,
+    ) -> Option<Started> {
         let mut call = None;
         for _ in 0..READS {
             let count = match link.stream.receive(&mut worker.buffer, Wait::Not) {

@@ -229,7 +229,7 @@ pub enum FleetError {
     UnderWay(Fleet, u32),
     /// No change of keys has begun.
     #[error("only generation {} is there: `{}` begins another", .1, keys(*.0, &["rotate"]))]
-    NotBegun(Fleet, u32),
+    NotStarted(Fleet, u32),
     /// The new generation is not used yet.
     #[error("generation {} is not used yet: when all nodes have their files, `{}`", .1, keys(*.0, &["rotate", "--switch"]))]
     NotSwitched(Fleet, u32),
@@ -393,7 +393,7 @@ mod tests {
             FleetError::NoManager(fleet, node.clone()),
             FleetError::NoManager(fleet, node).of_new_fleet(),
             FleetError::UnderWay(fleet, 2),
-            FleetError::NotBegun(fleet, 1),
+            FleetError::NotStarted(fleet, 1),
             FleetError::NotSwitched(fleet, 2),
             FleetError::Switched(fleet, 2),
             FleetError::Behind(fleet),

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cara_core::distribution::identity::{Fleet, Identity};
 
 use super::file::Mark;
-use super::{KeyError, KeyRing, place};
+use super::{KeyError, KeyRing, location};
 
 /// The ring of a running node. When its file is another one than before, [`refresh`](Self::refresh) takes that: a vehicle
 /// that is added or revoked, or a new generation, restarts nothing.
@@ -29,11 +29,11 @@ struct Held {
 }
 
 impl LiveRing {
-    /// The ring of a node, from where [`place`] says; of an s_unit with the manager that it joins.
+    /// The ring of a node, from where [`location`] says; of an s_unit with the manager that it joins.
     pub fn find(identity: &Identity, manager: Option<&Identity>, fleet: Fleet) -> Result<Self, KeyError> {
         let path = match manager {
-            None => place::find(identity, fleet)?,
-            Some(manager) => place::find_joining(identity, manager, fleet)?,
+            None => location::find(identity, fleet)?,
+            Some(manager) => location::find_joining(identity, manager, fleet)?,
         };
         Self::open(&path, identity, fleet)
     }
@@ -126,7 +126,7 @@ mod tests {
         let mut store = Store::create(folder.path(), FleetKeys::draw(Fleet(7)).unwrap()).unwrap();
         store.keys_mut().add(&depot(), &[]).unwrap();
         store.save().unwrap();
-        let path = folder.path().join(place::file_name(&depot(), Fleet(7)));
+        let path = folder.path().join(location::file_name(&depot(), Fleet(7)));
         let live = LiveRing::open(&path, &depot(), Fleet(7)).unwrap();
         assert!(!live.refresh().unwrap() && live.ring().pair(&agv(1)).is_none());
         let before = live.ring();
@@ -148,7 +148,7 @@ mod tests {
         assert!(matches!(live.refresh(), Err(KeyError::Open { .. })));
         fs::remove_file(&path).unwrap();
         assert!(live.refresh().is_err() && !live.refresh().unwrap());
-        fs::rename(folder.path().join(place::file_name(&agv(1), Fleet(7))), &path).unwrap();
+        fs::rename(folder.path().join(location::file_name(&agv(1), Fleet(7))), &path).unwrap();
         assert!(matches!(live.refresh(), Err(KeyError::OtherNode { .. })));
         assert!(live.ring().pair(&agv(1)).is_some());
     }

@@ -204,7 +204,7 @@ impl Members {
     /// Uses the generation that has begun, and keeps the one before beside it.
     pub(super) fn switch(&mut self) -> Result<(), FleetError> {
         match self.beside {
-            None => Err(FleetError::NotBegun(self.fleet, self.used)),
+            None => Err(FleetError::NotStarted(self.fleet, self.used)),
             Some(beside) if beside < self.used => Err(FleetError::Switched(self.fleet, self.used)),
             Some(beside) => {
                 self.beside = Some(std::mem::replace(&mut self.used, beside));
@@ -216,7 +216,7 @@ impl Members {
     /// Ends the generation before the one in use.
     pub(super) fn finish(&mut self) -> Result<(), FleetError> {
         match self.beside {
-            None => Err(FleetError::NotBegun(self.fleet, self.used)),
+            None => Err(FleetError::NotStarted(self.fleet, self.used)),
             Some(beside) if beside > self.used => Err(FleetError::NotSwitched(self.fleet, beside)),
             Some(_) => {
                 self.beside = None;
@@ -396,7 +396,7 @@ mod tests {
         let generations = |members: &Members| members.generations().collect::<Vec<_>>();
         assert_eq!(
             (members.switch(), members.finish()),
-            (Err(FleetError::NotBegun(Fleet(7), 1)), Err(FleetError::NotBegun(Fleet(7), 1)))
+            (Err(FleetError::NotStarted(Fleet(7), 1)), Err(FleetError::NotStarted(Fleet(7), 1)))
         );
         members.rotate().unwrap();
         assert_eq!(generations(&members), [1, 2]);

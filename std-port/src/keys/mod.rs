@@ -1,7 +1,7 @@
 //! Key files: the ring of each node, and the fleet that the rings come from.
 //!
 //! A node has one [`KeyRing`]: the key for discovery, and one key for each node that it may talk to. It lies in a file
-//! that only its owner can read; [`place::find`] tells where it is looked for, and [`LiveRing`] takes a new one while
+//! that only its owner can read; [`location::find`] tells where it is looked for, and [`LiveRing`] takes a new one while
 //! the node runs. A [`FleetKeys`] has the root from which all rings come, and stays where nodes are provisioned;
 //! [`Store`] keeps it in a folder. The command `cara keys` does nothing that is not here.
 //!
@@ -26,9 +26,9 @@ mod error;
 mod file;
 mod fleet;
 mod live;
+pub mod location;
 mod members;
 mod named;
-pub mod place;
 mod ring;
 mod store;
 mod text;

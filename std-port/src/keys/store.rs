@@ -13,7 +13,7 @@ use zeroize::Zeroizing;
 use super::file::Staged;
 use super::members::Members;
 use super::text::{Checksum, FORM, FormError, Lines, checksum, push_key, push_sum};
-use super::{FleetKeys, KeyError, KeyRing, file, place};
+use super::{FleetKeys, KeyError, KeyRing, file, location};
 
 /// Bytes of the root's file at most.
 const ROOT_BYTES: usize = 512;
@@ -166,7 +166,7 @@ impl Store {
 
     /// The file of a node.
     pub fn file_of(&self, identity: &Identity) -> PathBuf {
-        self.folder.join(place::file_name(identity, self.keys.members().fleet()))
+        self.folder.join(location::file_name(identity, self.keys.members().fleet()))
     }
 
     /// The keys.

@@ -9,7 +9,7 @@ use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::mac::Authenticates;
 
 use super::Standing;
-use crate::keys::{DiscoveryKey, FleetKeys, KeyError, KeyRing, PairKey, Store, place};
+use crate::keys::{DiscoveryKey, FleetKeys, KeyError, KeyRing, PairKey, Store, location};
 
 /// Most files that are read.
 const FILES: usize = 1024;
@@ -37,11 +37,11 @@ struct Known {
 }
 
 impl SurveyKeys {
-    /// All that this user has in the places where keys are looked for ([`place`]): rings of units, and roots.
+    /// All that this user has in the places where keys are looked for ([`location`]): rings of units, and roots.
     pub fn gather() -> Self {
         let mut keys = Self::default();
-        place::rings().into_iter().take(FILES).for_each(|path| keys.add_file(&path));
-        for folder in place::folders() {
+        location::rings().into_iter().take(FILES).for_each(|path| keys.add_file(&path));
+        for folder in location::folders() {
             for fleet in Store::fleets(&folder) {
                 match Store::peek(&folder, fleet) {
                     Ok(root) => keys.add_root(&root),
@@ -129,8 +129,8 @@ impl SurveyKeys {
     /// What belongs to another user, or cannot be opened, is no mistake: a host's units have users of their own.
     fn refuse(&mut self, error: KeyError) {
         let is_mistake = !matches!(error, KeyError::Foreign { .. } | KeyError::System { .. });
-        let is_told = self.refused.iter().any(|known| known.to_string() == error.to_string());
-        if is_mistake && !is_told && self.refused.len() < REFUSED {
+        let is_reported = self.refused.iter().any(|known| known.to_string() == error.to_string());
+        if is_mistake && !is_reported && self.refused.len() < REFUSED {
             self.refused.push(error);
         }
     }

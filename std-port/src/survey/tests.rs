@@ -56,12 +56,12 @@ fn whatever_is_heard_is_told_with_fleet_version_and_wanted_manager() {
         sender.send_to(&datagram, to).unwrap();
     }
     listen_until(&mut survey, |survey| survey.heard().iter().map(|heard| heard.searches).sum::<u32>() == 4);
-    let told: Vec<_> = survey
+    let reported: Vec<_> = survey
         .heard()
         .iter()
         .map(|heard| (heard.versions.to_string(), heard.fleet.0, heard.epoch.unwrap().0, heard.searches))
         .collect();
-    assert_eq!(told, [(ours(), 7, 3, 2), ("9".to_owned(), 8, 3, 1), (ours(), 7, 4, 1)]);
+    assert_eq!(reported, [(ours(), 7, 3, 2), ("9".to_owned(), 8, 3, 1), (ours(), 7, 4, 1)]);
     let first = &survey.heard()[0];
     assert_eq!(first.wanted, Some(Manager::new("boss", 1).unwrap()));
     assert_eq!((first.source, first.by_broadcast), (sender.local_addr().unwrap(), true));

@@ -59,7 +59,7 @@ impl Audited {
     }
 
     /// The same, once there are so many.
-    fn told(&self, count: usize) -> Vec<[String; 3]> {
+    fn reported(&self, count: usize) -> Vec<[String; 3]> {
         until("it is told", || self.lines().len() >= count);
         self.all()
     }
@@ -95,7 +95,7 @@ fn the_end_of_a_hold_is_noted_whichever_end_it_takes() {
     assert!(held(client.ask(&hold()).unwrap().next()));
     drop(client);
     let mut expected = vec![line("hold", "drive", "ok"), line("hold", "drive", "released")];
-    assert_eq!(audited.told(2), expected);
+    assert_eq!(audited.reported(2), expected);
 
     // A plain call of the same function takes it over, and the holder is told.
     let mut client = audited.depot.client();
@@ -105,19 +105,19 @@ fn the_end_of_a_hold_is_noted_whichever_end_it_takes() {
     ask(&mut other, Question::Call(call(Some("agv"), "drive", vec![]))).unwrap();
     let end = holding.next().unwrap().unwrap_err();
     assert!(end.to_string().contains("took over"), "{end}");
-    let mut told = audited.told(5);
+    let mut reported = audited.reported(5);
     // The call and the end of the hold are noted by two threads.
-    told[3..].sort();
+    reported[3..].sort();
     expected.extend([line("hold", "drive", "ok"), line("call", "drive", "ok"), line("hold", "drive", "TakenOver")]);
-    assert_eq!(told, expected);
+    assert_eq!(reported, expected);
 
     // The unit itself is stopped.
     assert!(held(client.ask(&hold()).unwrap().next()));
     audited.depot.system.stop();
     expected.extend([line("hold", "drive", "ok"), line("hold", "drive", "stopped")]);
-    let mut told = audited.told(7);
-    told[3..5].sort();
-    assert_eq!(told, expected);
+    let mut reported = audited.reported(7);
+    reported[3..5].sort();
+    assert_eq!(reported, expected);
     assert!(audited.lines().iter().all(|line| line["origin"] == "operator" && line["node"] == "agv/7"));
 }
 

@@ -145,16 +145,16 @@ fn a_call_of_all_tells_who_was_not_called() {
     for asynchronous in [false, true] {
         let question = CallQuestion { asynchronous, ..call(None, "fail", vec![]) };
         let answers = ask(&mut client, Question::Call(question)).unwrap();
-        let mut told: Vec<_> = answers
+        let mut reported: Vec<_> = answers
             .iter()
             .map(|answer| match answer {
                 Answer::Called { id, error, .. } => (*id, error.as_ref().map(|failure| failure.error.clone())),
                 other => panic!("{other:?}"),
             })
             .collect();
-        told.sort();
+        reported.sort();
         let ran = (!asynchronous).then(|| "Service".to_owned());
-        assert_eq!(told, [(0, Some("NotConnected".into())), (1, Some("UnknownFunction".into())), (2, ran)]);
+        assert_eq!(reported, [(0, Some("NotConnected".into())), (1, Some("UnknownFunction".into())), (2, ran)]);
     }
     // Also where no node offers it; what is retired is not missed.
     assert!(peer(0).retire());
@@ -231,30 +231,30 @@ fn a_slow_watch_loses_events_and_is_told_how_many() {
     let (depot, _agv) = Depot::with_agv();
     let peer = depot.system.s_unit("agv").unwrap();
     let lost = || depot.system.counters().iter().find(|(name, _)| *name == "EventsLost").unwrap().1;
-    let (begun, begins) = std::sync::mpsc::channel();
+    let (started, begins) = std::sync::mpsc::channel();
     std::thread::scope(|scope| {
         let watching = scope.spawn(|| {
-            let mut told = 0;
+            let mut reported = 0;
             execute(&depot.system, &Question::Watch, &mut |answer| match answer {
                 Answer::Event { event, .. } if event == "watching" => {
-                    begun.send(()).unwrap();
+                    started.send(()).unwrap();
                     until("events are lost", || lost() > 0);
                     ControlFlow::Continue(())
                 }
                 Answer::Event { event, text, .. } if event == "lost" => {
-                    told = text.split(' ').next().unwrap().parse().unwrap();
+                    reported = text.split(' ').next().unwrap().parse().unwrap();
                     ControlFlow::Break(())
                 }
                 _ => ControlFlow::Continue(()),
             });
-            told
+            reported
         });
         begins.recv().unwrap();
         while lost() == 0 {
             // A full queue makes room by and by.
             let _ = peer.request("fail", &Parameters::new());
         }
-        let told: u64 = watching.join().unwrap();
-        assert!(told > 0 && told <= lost());
+        let reported: u64 = watching.join().unwrap();
+        assert!(reported > 0 && reported <= lost());
     });
 }

@@ -48,7 +48,7 @@ impl Raw {
     }
 
     /// The connection serves as before.
-    fn goes_on(&mut self) {
+    fn continues(&mut self) {
         self.write(b"{\"ask\":\"search\"}\n");
         assert_eq!(self.read(), Answer::Done);
     }
@@ -72,11 +72,11 @@ fn what_is_no_question_is_told_so_and_the_next_line_is_read() {
     ] {
         raw.write(garbage);
         raw.is_refused_with("BadQuestion");
-        raw.goes_on();
+        raw.continues();
     }
     // An empty line is a sign of life, and not answered.
     raw.write(b"\n\n");
-    raw.goes_on();
+    raw.continues();
 }
 
 /// What a client keeps moving takes its signs of life: `go_to` has a lease of 2 s.
@@ -94,7 +94,7 @@ fn what_a_client_holds_ends_without_its_signs_of_life() {
         }
     };
     assert_eq!(ended.error, "Unattended", "{ended}");
-    silent.goes_on();
+    silent.continues();
 }
 
 /// A hop passes on the signs of life of its own client, and makes none up.
@@ -109,8 +109,8 @@ fn what_is_held_for_another_client_takes_that_ones_signs_of_life() {
         closer.close();
     });
     let beats = std::thread::spawn(move || {
-        let (begun, mut last, mut gap) = (Instant::now(), Instant::now(), Duration::ZERO);
-        while begun.elapsed() < Duration::from_secs(3) {
+        let (started, mut last, mut gap) = (Instant::now(), Instant::now(), Duration::ZERO);
+        while started.elapsed() < Duration::from_secs(3) {
             beater.beat();
             gap = gap.max(last.elapsed());
             last = Instant::now();
@@ -135,7 +135,7 @@ fn a_line_that_is_too_long_is_passed_over() {
     long.push(b'\n');
     raw.write(&long);
     raw.is_refused_with("TooLong");
-    raw.goes_on();
+    raw.continues();
     // As long as may be is read.
     let question = b"{\"ask\":\"search\"}\n";
     let mut longest = vec![b' '; LONGEST_LINE + 1 - question.len()];

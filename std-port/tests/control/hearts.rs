@@ -80,7 +80,7 @@ fn a_thread_that_hangs_while_it_watches_a_client_renews_nothing() {
 #[test]
 fn a_gateway_that_makes_no_sign_of_life_up_lets_go() {
     let creeping = Creeping::new();
-    let (is_there, told) = (AtomicBool::new(true), Mutex::new(Vec::new()));
+    let (is_there, reported) = (AtomicBool::new(true), Mutex::new(Vec::new()));
     let last = Mutex::new(Instant::now());
     let lives = || {
         if is_there.load(Ordering::SeqCst) {
@@ -89,7 +89,7 @@ fn a_gateway_that_makes_no_sign_of_life_up_lets_go() {
         Some(*last.lock().unwrap())
     };
     let mut note = |answer| {
-        told.lock().unwrap().push(answer);
+        reported.lock().unwrap().push(answer);
         ControlFlow::Continue(())
     };
     std::thread::scope(|scope| {
@@ -98,6 +98,6 @@ fn a_gateway_that_makes_no_sign_of_life_up_lets_go() {
         is_there.store(false, Ordering::SeqCst);
         until("it stops", || creeping.made_safe() == 1);
     });
-    let told = told.into_inner().unwrap();
-    assert!(matches!(told.last(), Some(Answer::Failed(failure)) if failure.error == "Unattended"), "{told:?}");
+    let reported = reported.into_inner().unwrap();
+    assert!(matches!(reported.last(), Some(Answer::Failed(failure)) if failure.error == "Unattended"), "{reported:?}");
 }

@@ -91,7 +91,7 @@ impl Crane {
 }
 
 /// Waits until a caller is told of this end of a lease.
-fn told(events: &Receiver<UnitEvent>, word: &str) {
+fn reported(events: &Receiver<UnitEvent>, word: &str) {
     until(word, || {
         events.try_iter().any(|event| matches!(event, UnitEvent::LeaseEnded { why, .. } if why.word() == word))
     });
@@ -110,7 +110,7 @@ fn two_services_of_one_actuator_replace_each_other_without_the_hook() {
     let events = crane.callers[0].events();
     assert_eq!(crane.ask(0, "go"), Ok(()));
     assert_eq!(crane.ask(0, "dock"), Ok(()));
-    told(&events, "replaced");
+    reported(&events, "replaced");
     assert!(crane.moves() && crane.hooks() == 0);
     crane.peer(0).release("dock").unwrap();
     until("the hook ran", || crane.hooks() == 1);
@@ -179,7 +179,7 @@ fn the_vehicles_own_stop_is_told_with_its_reason_and_its_hook_waits_for_nothing(
     crane.drive.inhibit(9);
     assert!(!crane.moves());
     // At once, and not when the lease would have ended.
-    told(&events, "stopped");
+    reported(&events, "stopped");
     until("the hook ran", || crane.hooks() == 1);
     assert_eq!(crane.ask(0, "go"), Err(Error::Inhibited { by: 0, reason: 9 }));
     latched(&others, Some(Latch { by: 0, reason: 9 }));

@@ -106,8 +106,8 @@ fn a_hook_does_not_wait_for_the_method_whose_thread_runs_it() {
     crate::support::until("the callback runs", || gate.came() == 1);
     std::thread::scope(|scope| {
         scope.spawn(|| manager.stop());
-        let told = || agv.with_state(|state| state.clone()).unwrap();
-        crate::support::until("the hook has run", || told() == ["begins", "interrupted", "lost"]);
+        let reported = || agv.with_state(|state| state.clone()).unwrap();
+        crate::support::until("the hook has run", || reported() == ["begins", "interrupted", "lost"]);
         gate.open();
     });
     agv.stop();

@@ -183,14 +183,14 @@ fn a_vehicle_that_joins_tells_claim_and_trace_id_of_its_last_order() {
     let second = manager(fleet, &here, false);
     second.start().unwrap();
     assert!(second.claim() > claim);
-    let told = || second.peer("agv").ok()?.actuator_state("go")?.last;
-    until("it tells", || told().is_some_and(|last| last.end.is_some()));
-    let last = told().unwrap();
+    let reported = || second.peer("agv").ok()?.actuator_state("go")?.last;
+    until("it tells", || reported().is_some_and(|last| last.end.is_some()));
+    let last = reported().unwrap();
     assert_eq!((last.claim, last.trace(), last.end), (claim, kept, Some(LeaseEnd::Expired)));
     move_it(&second);
-    until("it tells of the next", || told().is_some_and(|last| last.claim == second.claim()));
-    assert_eq!(told().map(|last| last.trace()), second.peer("agv").unwrap().trace_of("go"));
-    assert_ne!(told().unwrap().trace(), kept);
+    until("it tells of the next", || reported().is_some_and(|last| last.claim == second.claim()));
+    assert_eq!(reported().map(|last| last.trace()), second.peer("agv").unwrap().trace_of("go"));
+    assert_ne!(reported().unwrap().trace(), kept);
     drop(agv);
 }
 
@@ -207,7 +207,7 @@ fn a_handler_that_hangs_is_cut_off_before_the_next_manager_moves_anything() {
         move || log.lock().unwrap().push(what)
     };
     let options = ServiceOptions::new().lease(std::time::Duration::from_secs(30), note("hook"));
-    let (goes_on, may_go_on) = channel::<()>();
+    let (continues, may_go_on) = channel::<()>();
     let (first_runs, next_runs, late, refused) =
         (note("first runs"), note("next runs"), note("a late commit"), note("no late commit"));
     let (runs, may_go_on) = (AtomicUsize::new(0), Mutex::new(may_go_on));
@@ -233,7 +233,7 @@ fn a_handler_that_hangs_is_cut_off_before_the_next_manager_moves_anything() {
     second.start().unwrap();
     move_it(&second);
     assert_eq!(*log.lock().unwrap(), ["first runs", "hook", "next runs"]);
-    goes_on.send(()).unwrap();
+    continues.send(()).unwrap();
     until("the handler ends", || log.lock().unwrap().len() == 4);
     assert_eq!(log.lock().unwrap()[3], "no late commit");
 }

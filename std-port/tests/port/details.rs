@@ -107,16 +107,16 @@ fn the_newest_progress_comes_and_others_need_not() {
         if is_wrong == (value(parameters) == 1) { Ok(()) } else { Err(ServiceError::Failed(3)) }
     });
     let (peer, _) = meet(&manager, &agv);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let outcome = watched(&peer, "go", |progress| {
-        told.push(progress.variable::<i64>("left").unwrap());
-        if told.last() == Some(&0) {
+        reported.push(progress.variable::<i64>("left").unwrap());
+        if reported.last() == Some(&0) {
             gate.open();
         }
         ControlFlow::Continue(())
     });
     assert_eq!(outcome.unwrap(), 1);
-    assert!(told.contains(&0) && told.len() < 1_000 && told.is_sorted_by(|a, b| a > b), "{told:?}");
+    assert!(reported.contains(&0) && reported.len() < 1_000 && reported.is_sorted_by(|a, b| a > b), "{reported:?}");
     // To a caller that does not want to know nothing is sent.
     let sent = || counter(&agv.manager().unwrap().counters(), "ProgressSent");
     let before = sent();
@@ -165,12 +165,12 @@ impl Vehicle {
     fn new() -> Self {
         let (manager, agv) = pair();
         let (hooks, orders, gate) = <(Arc<AtomicUsize>, Arc<Mutex<Vec<LeaseWatch>>>, Arc<Gate>)>::default();
-        let (ran, begun) = (hooks.clone(), orders.clone());
+        let (ran, started) = (hooks.clone(), orders.clone());
         let options = ServiceOptions::new().lease(PATIENCE.saturating_mul(4), move || {
             ran.fetch_add(1, Ordering::SeqCst);
         });
         serve(&agv, "go", options, move |call, parameters| {
-            begun.lock().unwrap().push(call.lease.clone().unwrap());
+            started.lock().unwrap().push(call.lease.clone().unwrap());
             if value(parameters) == 1 {
                 until("the call is given up", || call.is_cancelled());
             }
@@ -182,7 +182,7 @@ impl Vehicle {
         Self { manager, agv, peer, hooks, orders, gate }
     }
 
-    fn begun(&self, count: usize) {
+    fn started(&self, count: usize) {
         until("its handler runs", || self.orders.lock().unwrap().len() == count);
     }
 
@@ -199,7 +199,7 @@ fn another_thread_gives_a_call_up_and_its_order_ends() {
         let call = scope.spawn(|| {
             vehicle.peer.call("go", &mut number(1)).with(patient()).cancelled_by(&canceller).watch(passed_over).wait()
         });
-        vehicle.begun(1);
+        vehicle.started(1);
         assert!(vehicle.hooks() == 0 && vehicle.orders.lock().unwrap()[0].is_live());
         canceller.clone().cancel();
         call.join().unwrap()
@@ -248,7 +248,7 @@ fn a_call_that_is_given_up_leaves_a_newer_order_alone() {
         let call = scope.spawn(|| {
             vehicle.peer.call("go", &mut number(1)).with(patient()).cancelled_by(&canceller).watch(passed_over).wait()
         });
-        vehicle.begun(1);
+        vehicle.started(1);
         // The answer comes at once, and what it has started goes on.
         let newer = RequestOptions { renew: cara_std::Renew::Process, ..patient() };
         vehicle.peer.call("go", &mut number(2)).with(newer).wait().unwrap();
@@ -257,8 +257,8 @@ fn a_call_that_is_given_up_leaves_a_newer_order_alone() {
         canceller.cancel();
         assert_eq!(call.join().unwrap().unwrap_err().error, Error::Cancelled);
     });
-    let told = || counter(&vehicle.agv.manager().unwrap().counters(), "RunningCancelled") == 1;
-    until("its handler is told", told);
+    let reported = || counter(&vehicle.agv.manager().unwrap().counters(), "RunningCancelled") == 1;
+    until("its handler is told", reported);
     // What comes behind the cancellation is served behind it.
     vehicle.gate.open();
     vehicle.peer.block_request("waits", &mut number(1)).unwrap();

@@ -13,7 +13,7 @@ use crate::support::{fleet, meet, retire_absent, system, unit};
 const TEXT: u32 = 20_000;
 const ELEMENTS: u32 = 3_000;
 
-fn told() -> Definition {
+fn reported() -> Definition {
     format!("tell(number: int) -> (text: string[{TEXT}])").parse().unwrap()
 }
 
@@ -21,7 +21,7 @@ fn listed(name: &str) -> Definition {
     format!("{name}() -> (list: int[..{ELEMENTS}])").parse().unwrap()
 }
 
-fn tell(_: &Served, results: &mut ParametersView) -> Result<(), ServiceError> {
+fn notify(_: &Served, results: &mut ParametersView) -> Result<(), ServiceError> {
     let text = "y".repeat(TEXT as usize);
     results.set_value("text", text.as_str()).map_err(|_| ServiceError::BadResults)
 }
@@ -59,7 +59,7 @@ fn assert_lists(peer: &Peer, function: &str) {
 #[test]
 fn growing_parameters_have_room_for_the_results_of_every_form_of_call() {
     let (manager, agv) = roomy_pair();
-    agv.my_function_list().add_service(&told(), ServiceOptions::new(), tell).unwrap();
+    agv.my_function_list().add_service(&reported(), ServiceOptions::new(), notify).unwrap();
     agv.my_function_list().add_service(&listed("list"), ServiceOptions::new(), list).unwrap();
     let (peer, _) = meet(&manager, &agv);
     retire_absent(&manager);
@@ -106,7 +106,7 @@ fn growing_parameters_have_room_for_the_results_of_every_form_of_call() {
 fn growing_parameters_that_the_peer_has_no_room_for_are_refused() {
     let (manager, agv) = roomy_pair();
     let taken = "take(long: bytes[100000])".parse().unwrap();
-    agv.my_function_list().add_service(&taken, ServiceOptions::new(), tell).unwrap();
+    agv.my_function_list().add_service(&taken, ServiceOptions::new(), notify).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let mut parameters = GrowingParameters::new();
     parameters.add_bytes("long", 100_000).unwrap();
@@ -138,8 +138,8 @@ fn tasks_call_and_serve_with_growing_parameters() {
     functions.add_service(&listed("list"), ServiceOptions::new(), list).unwrap();
     let future = |parameters: GrowingParameters| async { with_list(parameters) };
     functions.add_service(&listed("future"), ServiceOptions::new(), future).unwrap();
-    let told = |_: Served, parameters: GrowingParameters| async { Ok(with_list(parameters)) };
-    functions.add_service(&listed("told"), ServiceOptions::new(), told).unwrap();
+    let reported = |_: Served, parameters: GrowingParameters| async { Ok(with_list(parameters)) };
+    functions.add_service(&listed("told"), ServiceOptions::new(), reported).unwrap();
     let (peer, _) = meet(&manager, &agv);
     retire_absent(&manager);
     assert_lists(&peer, "future");

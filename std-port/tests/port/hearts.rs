@@ -70,8 +70,8 @@ fn of_two_loops_the_one_that_hangs_ends_its_motion_and_the_other_goes_on() {
         ends.store(true, Ordering::SeqCst);
     });
     until("a loop that has ended wants nothing", || !lift.is_live());
-    let told = |event: &UnitEvent| matches!(event, UnitEvent::LeaseEnded { function, why: LeaseEnd::Expired, .. } if function == "drive");
-    until("its end is told", || events.try_iter().any(|event| told(&event)));
+    let reported = |event: &UnitEvent| matches!(event, UnitEvent::LeaseEnded { function, why: LeaseEnd::Expired, .. } if function == "drive");
+    until("its end is told", || events.try_iter().any(|event| reported(&event)));
 }
 
 #[test]

@@ -127,13 +127,13 @@ fn a_vehicle_without_one_starts_stopped_if_its_program_says_so_and_its_program_r
 fn a_stop_of_all_reaches_all_behind_a_handler_that_hangs_in_a_commit() {
     let fleet = fleet();
     let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap());
-    let (is_inside, goes_on) = (Arc::new(AtomicBool::new(false)), Arc::new(Barrier::new(2)));
+    let (is_inside, continues) = (Arc::new(AtomicBool::new(false)), Arc::new(Barrier::new(2)));
     let hangs = {
-        let (is_inside, goes_on) = (is_inside.clone(), goes_on.clone());
+        let (is_inside, continues) = (is_inside.clone(), continues.clone());
         move |call: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
             let wait = || {
                 is_inside.store(true, Ordering::SeqCst);
-                goes_on.wait();
+                continues.wait();
             };
             Ok(call.commit(wait).map(drop)?)
         }
@@ -148,6 +148,6 @@ fn a_stop_of_all_reaches_all_behind_a_handler_that_hangs_in_a_commit() {
     assert!(drive.is_live() && lift.is_live());
     peer.request("halt", &Parameters::new()).unwrap();
     until("both are dead", || !drive.is_live() && !lift.is_live());
-    goes_on.wait();
+    continues.wait();
     until("it is stopped for its caller", || ask(&peer, "lift") == Err(Error::Inhibited { by: 1, reason: 0 }));
 }

@@ -87,8 +87,8 @@ fn motion_goes_on_while_it_is_renewed_and_ends_when_it_is_released() {
     let events = vehicle.agv.events();
     vehicle.peer.release("go_to").unwrap();
     vehicle.assert_stopped();
-    let told = events.recv_timeout(PATIENCE).unwrap();
-    assert!(matches!(told, UnitEvent::LeaseExpired { ref function, .. } if function == "go_to"), "{told:?}");
+    let reported = events.recv_timeout(PATIENCE).unwrap();
+    assert!(matches!(reported, UnitEvent::LeaseExpired { ref function, .. } if function == "go_to"), "{reported:?}");
     assert_eq!(vehicle.peer.release("no_such"), Err(Error::UnknownFunction));
 }
 
@@ -166,11 +166,11 @@ fn what_a_service_has_started_stops_when_it_is_removed_or_replaced() {
 fn the_loss_of_the_manager_is_told_to_the_hook_once() {
     let vehicle = vehicle();
     let lost = Arc::new(AtomicUsize::new(0));
-    let told = lost.clone();
+    let reported = lost.clone();
     vehicle
         .agv
         .on_manager_lost(move |_| {
-            told.fetch_add(1, Ordering::SeqCst);
+            reported.fetch_add(1, Ordering::SeqCst);
         })
         .unwrap();
     vehicle.manager.stop();

@@ -28,13 +28,13 @@ struct Vehicle {
 /// A vehicle whose service answers at once, and leaves a thread and a task to await the end of what it started.
 fn vehicle(length: Duration) -> Vehicle {
     let (manager, agv) = pair();
-    let (tell, ended) = channel();
+    let (notify, ended) = channel();
     let orders = Arc::<Mutex<Vec<LeaseWatch>>>::default();
-    let begun = orders.clone();
+    let started = orders.clone();
     let go = move |call: &Served, parameters: &mut ParametersView| -> Result<(), ServiceError> {
         let (number, lease, end) = (value(parameters), call.lease.clone().unwrap(), call.lease_ended());
-        let (thread, task) = (tell.clone(), tell.clone());
-        begun.lock().unwrap().push(lease.clone());
+        let (thread, task) = (notify.clone(), notify.clone());
+        started.lock().unwrap().push(lease.clone());
         std::thread::spawn(move || {
             lease.wait_until_ended();
             let _ = thread.send(number);

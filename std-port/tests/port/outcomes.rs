@@ -62,12 +62,12 @@ fn a_request_to_all_tells_who_is_missing() {
     until("one has left", || !by_id(0).is_connected());
     until("one has withdrawn it", || by_id(1).their_function_list().is_empty());
     let outcomes = || {
-        let told = manager.call_all("f", &number(100)).wait().into_iter();
-        let mut told: Vec<_> = told
+        let reported = manager.call_all("f", &number(100)).wait().into_iter();
+        let mut reported: Vec<_> = reported
             .map(|(peer, outcome)| (peer.id(), outcome.map(|results| value(&results)).map_err(Error::from)))
             .collect();
-        told.sort_unstable_by_key(|(id, _)| *id);
-        told
+        reported.sort_unstable_by_key(|(id, _)| *id);
+        reported
     };
     let fails = (3, Err(Error::Service(ServiceError::Failed(4))));
     assert_eq!(outcomes(), [(0, Err(Error::NotConnected)), (1, Err(Error::UnknownFunction)), (2, Ok(102)), fails]);

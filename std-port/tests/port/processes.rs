@@ -242,10 +242,10 @@ fn a_restart_and_a_twin_are_told_apart() {
     assert_eq!(life("bystander"), Some(20));
 
     let duplicate = unit("agv", 7, fleet).build().unwrap();
-    let told = duplicate.events();
+    let reported = duplicate.events();
     duplicate.start().unwrap();
     loop {
-        match told.recv_timeout(PATIENCE).unwrap() {
+        match reported.recv_timeout(PATIENCE).unwrap() {
             UnitEvent::NotJoined { reason: CloseReason::Refused(refusal), .. } => {
                 assert_eq!(refusal, Refusal::DuplicateIdentity);
                 break;

@@ -62,12 +62,12 @@ pub(crate) trait NewestDock {
 pub(crate) struct Gate {
     pub(crate) given_up: u32,
     /// How many have begun.
-    begun: Arc<AtomicUsize>,
+    started: Arc<AtomicUsize>,
 }
 
 impl Dock for Gate {
     fn dock(&mut self, call: &impl TypedCall<Left, Blocked>, from: u32) -> Result<(), ServiceError> {
-        self.begun.fetch_add(1, Ordering::SeqCst);
+        self.started.fetch_add(1, Ordering::SeqCst);
         for left in (0..from).rev() {
             call.progress(&Left { left })?;
             std::thread::sleep(std::time::Duration::from_millis(20));
@@ -93,17 +93,17 @@ fn progress_and_failures_come_typed() {
     let shown = peer.function("dock").unwrap().definition.to_string();
     assert_eq!(shown, "dock(from: int) progress (left: int) fails (at: int[2])");
     let client = DockClient::at(&peer);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let outcome = client
         .dock(3)
         .watch(|Left { left }| {
-            told.push(left);
+            reported.push(left);
             ControlFlow::Continue(())
         })
         .wait();
     assert_eq!(outcome, Ok(()));
     // Which of them are told, depends on time; the first one is sent at once, and none comes twice.
-    assert!(told.first() == Some(&2) && told.is_sorted_by(|one, next| one > next), "{told:?}");
+    assert!(reported.first() == Some(&2) && reported.is_sorted_by(|one, next| one > next), "{reported:?}");
     let failed = client.dock(11).watch(|_| ControlFlow::Continue(())).wait().unwrap_err();
     assert_eq!(failed.error, Error::Service(ServiceError::Failed(7)));
     assert_eq!((failed.text(), failed.values()), ("the way is blocked", Some(Blocked { at: [3, -4] })));
@@ -112,12 +112,12 @@ fn progress_and_failures_come_typed() {
     assert_eq!(failed, Error::Cancelled);
     until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 1));
     assert_eq!(client.dock(1).wait(), Ok(()));
-    let told = NewerDockClient::at(&peer).dock(1).watch(|_| unreachable!("nothing is sent")).wait().unwrap_err();
-    assert!(matches!(told.mismatch(), Some(what) if what.part == Part::Progress), "{told}");
-    assert!(told.to_string().contains("its progress left is int there and float here"), "{told}");
-    let told = NewestDockClient::at(&peer).dock(1).wait().unwrap_err();
-    assert!(matches!(told.mismatch(), Some(what) if what.part == Part::Failure), "{told}");
-    assert!(told.to_string().contains("its failure's at is int[2] there and int[3] here"), "{told}");
+    let reported = NewerDockClient::at(&peer).dock(1).watch(|_| unreachable!("nothing is sent")).wait().unwrap_err();
+    assert!(matches!(reported.mismatch(), Some(what) if what.part == Part::Progress), "{reported}");
+    assert!(reported.to_string().contains("its progress left is int there and float here"), "{reported}");
+    let reported = NewestDockClient::at(&peer).dock(1).wait().unwrap_err();
+    assert!(matches!(reported.mismatch(), Some(what) if what.part == Part::Failure), "{reported}");
+    assert!(reported.to_string().contains("its failure's at is int[2] there and int[3] here"), "{reported}");
     manager.stop();
     agv.stop();
 }
@@ -127,7 +127,7 @@ fn another_thread_gives_typed_calls_up() {
     let fleet = fleet();
     let manager = system(fleet).build().unwrap();
     let gate = Gate::default();
-    let begun = gate.begun.clone();
+    let started = gate.started.clone();
     let agv = unit("agv", 7, fleet).state(gate).build().unwrap();
     agv.my_function_list().serve(DockServer).unwrap();
     let (peer, _) = meet(&manager, &agv);
@@ -139,11 +139,11 @@ fn another_thread_gives_typed_calls_up() {
     for (count, watched) in [(1, false), (2, true)] {
         let canceller = Canceller::new();
         std::thread::scope(|scope| {
-            let told = || agv.counted(LinkCounter::ProgressSent);
-            let (before, told_before) = (begun.load(Ordering::SeqCst), told());
+            let reported = || agv.counted(LinkCounter::ProgressSent);
+            let (before, reported_before) = (started.load(Ordering::SeqCst), reported());
             let call = scope.spawn(|| ask(watched, &canceller));
-            until("its service runs", || begun.load(Ordering::SeqCst) > before);
-            until("it tells", || !watched || told() > told_before);
+            until("its service runs", || started.load(Ordering::SeqCst) > before);
+            until("it tells", || !watched || reported() > reported_before);
             canceller.cancel();
             assert_eq!(call.join().unwrap(), Err(Error::Cancelled.into()), "watched: {watched}");
         });
@@ -342,10 +342,10 @@ fn another_version_of_the_vehicle_is_told_before_anything_is_sent() {
     agv.my_function_list().add_service(&say, ServiceOptions::new(), run).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let client = DriveClient::at(&peer);
-    let told = client.go_to([1, 2], 3).wait().unwrap_err();
-    assert_eq!(told.error, Error::Mismatch(Part::Argument));
+    let reported = client.go_to([1, 2], 3).wait().unwrap_err();
+    assert_eq!(reported.error, Error::Mismatch(Part::Argument));
     assert_eq!(
-        told.to_string(),
+        reported.to_string(),
         "the peer's go_to is of another version: its argument position is float[2] there and int[2] here: update one of the two"
     );
     assert_eq!(client.go_to([1, 2], 3).send(), Err(Error::Mismatch(Part::Argument).into()));
@@ -630,9 +630,9 @@ fn an_order_is_not_sent_to_a_function_without_lists() {
     agv.my_function_list().add_service(&plan, ServiceOptions::new(), run).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let sent = manager.counted(LinkCounter::MessagesSent);
-    let told = PlannedClient::at(&peer).plan(Order::of_50_nodes()).wait().unwrap_err();
+    let reported = PlannedClient::at(&peer).plan(Order::of_50_nodes()).wait().unwrap_err();
     assert_eq!(
-        told.to_string(),
+        reported.to_string(),
         "the peer's plan is of another version: its argument nodes is string[32] there and a list of at most 64 here: update one of the two"
     );
     let mut order = Parameters::<100_000>::sized();

@@ -70,8 +70,8 @@ impl Pair {
         let (ended, heard) = (Rc::<Cell<Option<_>>>::default(), Rc::<RefCell<Vec<_>>>::default());
         let (end, hear, agv) = (ended.clone(), heard.clone(), self.manager.peer("agv").unwrap());
         self.boards[0].spawn(async move {
-            let on_progress = |told: &ParametersView| {
-                hear.borrow_mut().push(told.variable("left").unwrap());
+            let on_progress = |reported: &ParametersView| {
+                hear.borrow_mut().push(reported.variable("left").unwrap());
                 go_on(*hear.borrow().last().unwrap())
             };
             let mut parameters = one("number", 1);
@@ -84,11 +84,11 @@ impl Pair {
     /// How a call of the manager ends, and what it is told of its failure.
     fn ask(&self, function: &'static str, options: RequestOptions) -> (Result<(), Error>, Option<Failure>) {
         let ended = Rc::<RefCell<Option<_>>>::default();
-        let (told, agv) = (ended.clone(), self.manager.peer("agv").unwrap());
+        let (reported, agv) = (ended.clone(), self.manager.peer("agv").unwrap());
         self.boards[0].spawn(async move {
             let outcome = agv.call(function, &mut one("number", 1)).with(options).await;
             let why = outcome.as_ref().err().and_then(|failed| failed.failure().cloned());
-            *told.borrow_mut() = Some((outcome.map_err(Error::from), why));
+            *reported.borrow_mut() = Some((outcome.map_err(Error::from), why));
         });
         assert!(self.bench.run_until(|| ended.borrow().is_some(), LONG));
         ended.take().unwrap()
@@ -131,22 +131,22 @@ fn a_failure_brings_its_text_and_its_values() {
 
 #[test]
 fn a_task_tells_how_far_it_is_and_its_caller_hears_it() {
-    let told = Rc::<RefCell<Vec<_>>>::default();
-    let tells = told.clone();
+    let reported = Rc::<RefCell<Vec<_>>>::default();
+    let reports = reported.clone();
     let pair = Pair::met(2, async move |call: TakenCall<()>, arguments: &ParametersView| {
         for values in [one("left", 2), one("left", 1), one("wrong", 0)] {
-            tells.borrow_mut().push(call.progress(&values));
+            reports.borrow_mut().push(call.progress(&values));
         }
         embassy_time::Timer::after_millis(50).await;
-        tells.borrow_mut().push(call.progress(&one("left", 0)));
+        reports.borrow_mut().push(call.progress(&one("left", 0)));
         embassy_time::Timer::after_millis(50).await;
         call.reply(Ok(arguments)).await;
     });
     assert_eq!(pair.watch(|_| ControlFlow::Continue(())), (Ok(()), vec![2, 0]));
-    let told = told.take();
+    let reported = reported.take();
     let full = Err(Error::Full(Limit::SendQueue));
-    assert_eq!((told[0], told[1], told[3]), (Ok(()), full, Ok(())));
-    assert!(!matches!(told[2], Ok(()) | Err(Error::Full(_))), "{told:?}");
+    assert_eq!((reported[0], reported[1], reported[3]), (Ok(()), full, Ok(())));
+    assert!(!matches!(reported[2], Ok(()) | Err(Error::Full(_))), "{reported:?}");
     assert_eq!(pair.agv.counted(LinkCounter::ProgressSent), 2);
     assert_eq!(pair.manager.counted(LinkCounter::ProgressReceived), 2);
     // A caller that does not want to know is sent nothing.

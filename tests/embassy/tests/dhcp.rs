@@ -81,17 +81,17 @@ fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
     given.set(Ipv4Addr::new(10, 77, 6, 6));
     board.set_cable(true);
     assert!(bench.run_until(|| address() == Some(given.get()), LONG));
-    let told = Rc::new(Cell::new(0));
-    let noted = Rc::clone(&told);
+    let reported = Rc::new(Cell::new(0));
+    let recorded = Rc::clone(&reported);
     board.spawn(async move {
         loop {
             if matches!(agv.next_event().await, UnitEvent::NetworkChanged { .. }) {
-                noted.set(noted.get() + 1);
+                recorded.set(recorded.get() + 1);
             }
         }
     });
     bench.run_for(Duration::from_millis(10));
-    assert!(told.get() >= 2, "it was gone, and there was another one");
+    assert!(reported.get() >= 2, "it was gone, and there was another one");
 }
 
 fn proof(own: &Identity) -> Security {

@@ -121,18 +121,18 @@ fn a_task_waits_for_values_and_for_refusals() {
         pair.subscribe::<64>("speed", Duration::ZERO),
     ];
     let (numbers, refusals) = (Rc::<RefCell<Vec<u32>>>::default(), Rc::<RefCell<Vec<Error>>>::default());
-    let told = numbers.clone();
+    let reported = numbers.clone();
     pair.boards[0].spawn(async move {
         while let Ok(()) = pose.next().await {
-            told.borrow_mut().push(newest(&pose).unwrap().0);
+            reported.borrow_mut().push(newest(&pose).unwrap().0);
         }
     });
-    let told = refusals.clone();
+    let reported = refusals.clone();
     pair.boards[0].spawn(async move {
         let refused = small.next().await.unwrap_err();
-        told.borrow_mut().push(refused);
+        reported.borrow_mut().push(refused);
         let refused = none.next().await.unwrap_err();
-        told.borrow_mut().push(refused);
+        reported.borrow_mut().push(refused);
     });
     for number in 1..=5 {
         pair.publish(number);

@@ -191,10 +191,10 @@ fn pair_with_boards(bench: &Bench, offer: impl FnOnce(Unit)) -> (Board, Unit, Un
 
 fn finish<R: 'static>(bench: &Bench, board: &Board, future: impl Future<Output = R> + 'static) -> R {
     let result = Rc::new(RefCell::new(None));
-    let told = Rc::clone(&result);
+    let reported = Rc::clone(&result);
     board.spawn(async move {
         let ended = future.await;
-        told.replace(Some(ended));
+        reported.replace(Some(ended));
     });
     assert!(bench.run_until(|| result.borrow().is_some(), LONG), "it ends");
     result.take().unwrap()
@@ -240,9 +240,9 @@ fn another_version_is_told_before_anything_is_sent() {
         unit.my_function_list().add_service("lift_to(height: int)", ServiceOptions::new(), lift_to).unwrap();
     });
     let peer = manager.peer("agv").unwrap();
-    let told = finish(&bench, &board, async move { LiftClient::at(&peer).lift_to(1.5).await });
-    let told = told.unwrap_err().to_string();
-    assert!(told.contains("lift_to") && told.contains("height is int there and float here"), "{told}");
+    let reported = finish(&bench, &board, async move { LiftClient::at(&peer).lift_to(1.5).await });
+    let reported = reported.unwrap_err().to_string();
+    assert!(reported.contains("lift_to") && reported.contains("height is int there and float here"), "{reported}");
 }
 
 #[test]
@@ -254,13 +254,13 @@ fn a_method_takes_its_call_and_a_task_tells_how_far_it_is() {
     let peer = manager.peer("agv").unwrap();
     finish(&bench, &board, async move {
         let client = DriveClient::at(&peer);
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         let heard = |Left { left }| {
-            told.push(left);
+            reported.push(left);
             ControlFlow::Continue(())
         };
         assert_eq!(client.drive(3).watch(heard).await, Ok(Arrived { metres: 7 }));
-        assert_eq!(told, [3.0, 2.0, 1.0]);
+        assert_eq!(reported, [3.0, 2.0, 1.0]);
         let failed = client.drive(10).watch(|_| unreachable!("it does not begin")).await.unwrap_err();
         assert_eq!(failed.error, Error::Service(ServiceError::Failed(3)));
         assert_eq!((failed.text(), failed.values()), ("it is too far", Some(TooHeavy { kilograms: 900 })));

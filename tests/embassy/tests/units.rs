@@ -97,10 +97,10 @@ fn doubling(unit: Unit) {
 /// Runs a future on a board, and time until it is over.
 fn finish<R: 'static>(bench: &Bench, board: &Board, future: impl Future<Output = R> + 'static) -> R {
     let result = Rc::new(RefCell::new(None));
-    let told = Rc::clone(&result);
+    let reported = Rc::clone(&result);
     board.spawn(async move {
         let ended = future.await;
-        told.replace(Some(ended));
+        reported.replace(Some(ended));
     });
     assert!(bench.run_until(|| result.borrow().is_some(), LONG), "it ends");
     result.take().unwrap()
@@ -253,11 +253,11 @@ fn a_task_takes_calls_and_awaits_before_it_replies() {
     assert!(bench.run_until(|| knows(manager, "agv", "go_to"), SHORT));
     let before = bench.now();
     let driven = Rc::new(RefCell::new(None));
-    let (told, peer) = (Rc::clone(&driven), manager.peer("agv").unwrap());
+    let (reported, peer) = (Rc::clone(&driven), manager.peer("agv").unwrap());
     manager_board.spawn(async move {
         let mut parameters = number(50);
         let driven = peer.call("go_to", &mut parameters).renewing(Renew::Process).await;
-        told.replace(Some(driven.map_err(Error::from).and_then(|()| parameters.variable("n"))));
+        reported.replace(Some(driven.map_err(Error::from).and_then(|()| parameters.variable("n"))));
     });
     bench.run_for(Duration::from_millis(100));
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 1), Ok(2), "other services run meanwhile");
@@ -285,15 +285,15 @@ fn hauling(board: &Board, unit: Unit, length: Duration) -> (Ends, Rc<RefCell<Vec
     let options = ServiceOptions::new().lease(length, lease, &made_safe).then(&|state: &mut State| state.stops += 1);
     unit.my_function_list().add_service("haul(n: int)", options, Handler::task()).unwrap();
     let (ended, orders) = (Ends::default(), Rc::new(RefCell::new(Vec::new())));
-    let (told, begun, own) = (Rc::clone(&ended), Rc::clone(&orders), board.clone());
+    let (reported, started, own) = (Rc::clone(&ended), Rc::clone(&orders), board.clone());
     board.spawn(async move {
         let mut parameters = Parameters::new();
         while let Ok(call) = unit.next_call("haul", &mut parameters).await {
-            begun.borrow_mut().extend(call.lease);
-            let (told, number) = (Rc::clone(&told), parameters.variable("n").unwrap());
+            started.borrow_mut().extend(call.lease);
+            let (reported, number) = (Rc::clone(&reported), parameters.variable("n").unwrap());
             own.spawn(async move {
                 call.lease_ended().await;
-                told.borrow_mut().push((number, cara_embassy::now()));
+                reported.borrow_mut().push((number, cara_embassy::now()));
                 call.reply(Ok(&Parameters::new())).await;
             });
         }
@@ -484,11 +484,11 @@ fn events_tell_who_came_and_why_it_left() {
     let bench = Bench::new(7);
     let ((manager_board, manager), (_, agv)) = (manager(&bench), agv(&bench));
     let events = Rc::new(RefCell::new(Vec::new()));
-    let noted = Rc::clone(&events);
+    let recorded = Rc::clone(&events);
     manager_board.spawn(async move {
         loop {
             let event = manager.next_event().await;
-            noted.borrow_mut().push(event);
+            recorded.borrow_mut().push(event);
         }
     });
     assert!(bench.run_until(|| manager.is_connected(), SHORT));
@@ -497,8 +497,8 @@ fn events_tell_who_came_and_why_it_left() {
     bench.run_for(SHORT);
     let peer = agv.identity();
     let left = UnitEvent::Left { peer: peer.clone(), reason: CloseReason::Stopped };
-    let told = events.borrow();
-    assert_eq!((told.first(), told.last()), (Some(&UnitEvent::Joined { peer }), Some(&left)));
+    let reported = events.borrow();
+    assert_eq!((reported.first(), reported.last()), (Some(&UnitEvent::Joined { peer }), Some(&left)));
     assert!(!agv.is_connected(), "it looks for nobody any more");
 }
 
@@ -602,11 +602,11 @@ fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
     let safe: &'static Hook<State> = &|state| state.done.push("made safe");
     let options = ServiceOptions::new().lease(length, &MOVING, &|| {}).then(safe);
     agv.my_function_list().add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
-    let noted = Handler::method(&|state: &mut State, _, _| {
+    let recorded = Handler::method(&|state: &mut State, _, _| {
         state.done.push("served");
         Ok(())
     });
-    agv.my_function_list().add_service("note(n: int)", ServiceOptions::new(), noted).unwrap();
+    agv.my_function_list().add_service("note(n: int)", ServiceOptions::new(), recorded).unwrap();
     agv.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(manager, "agv", "note"), SHORT));
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "go", 1), Ok(1));

@@ -104,9 +104,9 @@ impl Bench {
 
     fn emulator(&self, cable: &Cable, who: &Who) -> Result<Command> {
         let number = cable.number;
-        let (told, boots) = self.keys.told(who, &format!("{}/24", address(cable)))?;
+        let (reported, boots) = self.keys.reported(who, &format!("{}/24", address(cable)))?;
         let seed = who.seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
-        let told = format!("file={} boots={}{seed}", told.display(), boots.display());
+        let reported = format!("file={} boots={}{seed}", reported.display(), boots.display());
         // Ahead of what else the host runs, where that is allowed: a clock that counts instructions loses the time in which the
         // emulator has no turn, as no chip does.
         let mut command = Command::new("nice");
@@ -114,7 +114,7 @@ impl Bench {
             .args(["-n", "-10", "qemu-system-arm"])
             .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none"])
             .arg("-semihosting-config")
-            .arg(format!("enable=on,target=native,arg=agv,arg={told}"))
+            .arg(format!("enable=on,target=native,arg=agv,arg={reported}"))
             .arg("-kernel")
             .arg(&self.image)
             .args(self.counts.then(|| ["-icount".to_owned(), format!("shift={INSTRUCTION}")]).into_iter().flatten())

@@ -52,9 +52,9 @@ pub(crate) fn run(bench: &Bench, image: &Path, of: Image, profile: bool) -> Resu
             let peer = meet(&manager, &who)?;
             let (mut ints, mut text) = parameters()?;
             let asked = exchanges(&trace, || Ok(peer.block_request("pos_info", &mut ints)?))?;
-            tell(&places, &asked, "served request", "2 ints", profile);
+            print(&places, &asked, "served request", "2 ints", profile);
             let asked = exchanges(&trace, || Ok(peer.block_request("echo", &mut text)?))?;
-            tell(&places, &asked, "served request", &format!("{CHARACTERS} characters"), profile);
+            print(&places, &asked, "served request", &format!("{CHARACTERS} characters"), profile);
         }
         Image::Echo => {
             let mut stream = connected(SocketAddr::new(board::address(&cable).into(), ECHO_PORT))?;
@@ -66,7 +66,7 @@ pub(crate) fn run(bench: &Bench, image: &Path, of: Image, profile: bool) -> Resu
                     stream.write_all(&message)?;
                     Ok(stream.read_exact(&mut message)?)
                 })?;
-                tell(&places, &asked, "bare TCP echo", &format!("{bytes} bytes"), profile);
+                print(&places, &asked, "bare TCP echo", &format!("{bytes} bytes"), profile);
             }
         }
     }
@@ -107,7 +107,7 @@ fn exchanges(trace: &Trace, mut exchange: impl FnMut() -> Result<()>) -> Result<
 }
 
 /// Prints what is least of what each owner has, or the functions that have most.
-fn tell(places: &Places, exchanges: &[Vec<u32>], what: &str, of: &str, profile: bool) {
+fn print(places: &Places, exchanges: &[Vec<u32>], what: &str, of: &str, profile: bool) {
     let exchanges: Vec<Vec<(u32, Owner)>> = exchanges.iter().map(|executed| of_network(places, executed)).collect();
     if profile {
         println!("{what}, {of}:");

@@ -51,18 +51,18 @@ pub(crate) fn run(bench: &Bench, options: &KeptAway) -> Result<()> {
     for (manager_address, finds) in [(None, "searches"), (Some(FIXED), "has an address")] {
         let who = Who { manager_address, ..Who::agv(17) };
         let start = || joins(bench, &cable, &manager, &who);
-        tell(finds, "calm", (0..options.starts).map(|_| start()))?;
+        print(finds, "calm", (0..options.starts).map(|_| start()))?;
         for attack in &attacks {
             let sent = AtomicU64::new(0);
             let beside = |_| attack.beside(&socket, options.a_second, &sent, start);
-            tell(finds, attack.name, (0..options.starts).map(beside))?;
+            print(finds, attack.name, (0..options.starts).map(beside))?;
             ensure!(sent.into_inner() > 0, "nothing was said");
         }
     }
     Ok(())
 }
 
-fn tell(finds: &str, beside: &str, starts: impl Iterator<Item = Result<u128>>) -> Result<()> {
+fn print(finds: &str, beside: &str, starts: impl Iterator<Item = Result<u128>>) -> Result<()> {
     let mut took = starts.collect::<Result<Vec<_>>>()?;
     let (median, worst) = median_and_worst(&mut took);
     println!("board that {finds}, {beside}: {} joined, ms from power on: {median} / {worst}", took.len());

@@ -10,7 +10,7 @@ use std::rc::Rc;
 
 use anyhow::{Context, Result, ensure};
 use cara_processes::Process;
-use cara_std::keys::place;
+use cara_std::keys::location;
 use cara_std::{Builder, Fleet, Identity, MUnit};
 use tempfile::TempDir;
 
@@ -129,20 +129,20 @@ impl Keys {
     }
 
     fn file_of(&self, identity: &Identity, fleet: u32) -> PathBuf {
-        self.folder.path().join(place::file_name(identity, Fleet(fleet)))
+        self.folder.path().join(location::file_name(identity, Fleet(fleet)))
     }
 
     /// The file with what a board is told, and the one in which it counts its lives. A board that has been told before is
     /// not told again.
-    pub(crate) fn told(&self, who: &Who, address: &str) -> Result<(PathBuf, PathBuf)> {
+    pub(crate) fn reported(&self, who: &Who, address: &str) -> Result<(PathBuf, PathBuf)> {
         let Who { name, id, manager, fleet, manager_address, .. } = who;
         // The image and QEMU split what they are told at blanks and commas, which a name may have.
         let plain: String = name.bytes().map(|byte| format!("{byte:02x}")).take(SHOWN).collect();
         let mut stem = format!("{plain}-{id}-{}", address.replace(['.', '/'], "-"));
         stem.extend(manager_address.iter().map(|_| "-directly"));
-        let [told, boots] = ["told", "boots"].map(|end| self.folder.path().join(format!("{stem}.{end}")));
-        if told.exists() {
-            return Ok((told, boots));
+        let [reported, boots] = ["told", "boots"].map(|end| self.folder.path().join(format!("{stem}.{end}")));
+        if reported.exists() {
+            return Ok((reported, boots));
         }
         let keys = self.file_of(&Identity::s_unit(name, *id)?, *fleet);
         let (id, fleet) = (id.to_string(), fleet.to_string());
@@ -153,14 +153,14 @@ impl Keys {
             .chain(self.words().iter().copied())
             .map(OsStr::new)
             .collect();
-        words.extend(["--output".as_ref(), told.as_os_str()]);
+        words.extend(["--output".as_ref(), reported.as_os_str()]);
         if self.kind == Kind::Drawn {
             words.extend(["--keys".as_ref(), keys.as_os_str()]);
         }
         self.run(words)?;
         // As the file is left when the power goes while the board makes it.
         std::fs::write(&boots, [0xFF; 100])?;
-        Ok((told, boots))
+        Ok((reported, boots))
     }
 
     fn run<A: AsRef<OsStr>>(&self, words: impl IntoIterator<Item = A>) -> Result<()> {

@@ -171,8 +171,8 @@ fn after(arguments: &Arguments) -> Result<()> {
         return Ok(());
     }
     let start = Instant::now();
-    let told = session::test(&arguments.image, arguments.cara.as_deref()).context(SESSION)?;
-    println!("{SESSION:48} {:6.1} s  {told}", start.elapsed().as_secs_f64());
+    let reported = session::test(&arguments.image, arguments.cara.as_deref()).context(SESSION)?;
+    println!("{SESSION:48} {:6.1} s  {reported}", start.elapsed().as_secs_f64());
     Ok(())
 }
 
@@ -184,8 +184,8 @@ fn run(arguments: &Arguments) -> Result<()> {
     let mut passed = 0;
     for check in checks::CHECKS.iter().filter(|check| check.name.contains(&arguments.only)) {
         let start = Instant::now();
-        let told = (check.run)(&bench, arguments.restarts).with_context(|| check.name.to_owned())?;
-        println!("{:48} {:6.1} s  {told}", check.name, start.elapsed().as_secs_f64());
+        let reported = (check.run)(&bench, arguments.restarts).with_context(|| check.name.to_owned())?;
+        println!("{:48} {:6.1} s  {reported}", check.name, start.elapsed().as_secs_f64());
         passed += 1;
     }
     if passed == 0 && !SESSION.contains(&arguments.only) {

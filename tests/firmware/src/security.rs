@@ -192,7 +192,7 @@ impl Target for Boards {
         attempts.min(ATTEMPTS)
     }
 
-    fn tells_calls(&self) -> bool {
+    fn reports_calls(&self) -> bool {
         false
     }
 

@@ -134,7 +134,7 @@ impl BlockingCaller for Peer {
 /// Both forms of one program.
 pub struct Programs {
     arguments: Parameters<96>,
-    told: Silent,
+    reported: Silent,
     typed: &'static Method<(), Silent>,
     peer: Peer,
 }
@@ -149,8 +149,8 @@ impl Programs {
         arguments.lay_out(signature).expect("room for three integers");
         arguments.set_value("a", 3).expect("an integer");
         arguments.set_value("b", 4).expect("an integer");
-        let told = Silent(Identity::m_unit("depot", 1).expect("a name"));
-        Self { arguments, told, typed, peer: Peer(signature) }
+        let reported = Silent(Identity::m_unit("depot", 1).expect("a name"));
+        Self { arguments, reported, typed, peer: Peer(signature) }
     }
 
     fn serve_dynamic(&mut self) {
@@ -158,7 +158,7 @@ impl Programs {
     }
 
     fn serve_typed(&mut self) {
-        (self.typed)(&mut (), &self.told, black_box(self.arguments.as_mut_view())).expect("it adds");
+        (self.typed)(&mut (), &self.reported, black_box(self.arguments.as_mut_view())).expect("it adds");
     }
 
     fn call_dynamic(&mut self) {

@@ -71,9 +71,9 @@ impl Sealing {
 }
 
 fn agree(key: &PairKey, prologue: &[u8; 32], initiator: &mut dyn Meter, responder: &mut dyn Meter) -> [Channel; 2] {
-    let mut begun = None;
-    initiator.count(&mut || begun = Some(Initiator::begin(key, prologue, black_box(&[1; 32])).expect("it begins")));
-    let (waiting, message) = begun.take().expect("it has begun");
+    let mut started = None;
+    initiator.count(&mut || started = Some(Initiator::begin(key, prologue, black_box(&[1; 32])).expect("it begins")));
+    let (waiting, message) = started.take().expect("it has begun");
     let mut answered = None;
     responder.count(&mut || {
         answered = Some(handshake::answer(key, prologue, black_box(&[2; 32]), &message).expect("it is answered"));

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use cara_std::keys::{FleetKeys, KeyError, Store, parse_node, place};
+use cara_std::keys::{FleetKeys, KeyError, Store, location, parse_node};
 use cara_std::{Fleet, Identity, Role};
 use tempfile::TempDir;
 
@@ -45,7 +45,7 @@ impl KeyFolder {
 
     /// The file of a node.
     pub fn file(&self, identity: &Identity) -> Result<PathBuf> {
-        let file = self.path().join(place::file_name(identity, self.fleet));
+        let file = self.path().join(location::file_name(identity, self.fleet));
         file.exists().then_some(file).with_context(|| format!("{identity} has no keys in this test"))
     }
 }

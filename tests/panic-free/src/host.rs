@@ -3,7 +3,7 @@
 use core::net::{SocketAddr, SocketAddrV4};
 
 use cara_core::error::CloseReason;
-use cara_core::host::connections::{Inbound, Link, Liveness, Place};
+use cara_core::host::connections::{Inbound, Link, Liveness, Span};
 use cara_core::host::endpoint::Endpoint;
 use cara_core::host::frame::{self, ChunkWriter, Chunking, Frame};
 use cara_core::host::mailman::{LinkId, Mailman};
@@ -56,10 +56,10 @@ entry!(link_made, {
 entry!(link_receives, {
     let link: &mut AnyLink = unknown();
     keep(link.receive(unknown::<Pool<Lent>>(), unknown_slice()));
-    if let Inbound::Message(_, place) = unknown() {
-        keep(link.view(place.last(*unknown()), unknown_slice()));
+    if let Inbound::Message(_, span) = unknown() {
+        keep(link.view(span.last(*unknown()), unknown_slice()));
     }
-    keep(link.view(*unknown::<Place>(), unknown_slice()));
+    keep(link.view(*unknown::<Span>(), unknown_slice()));
 });
 
 entry!(link_sends, {

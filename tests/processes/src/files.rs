@@ -12,20 +12,20 @@ pub fn can_write(path: &Path) -> Result<()> {
     if path.is_dir() {
         bail!("{shown} is a folder: name a file in it");
     }
-    let told = || format!("cannot write {shown}: name a file in a folder that is there and where you may write");
+    let reported = || format!("cannot write {shown}: name a file in a folder that is there and where you may write");
     match OpenOptions::new().write(true).create_new(true).open(path) {
-        Ok(_) => std::fs::remove_file(path).with_context(told),
+        Ok(_) => std::fs::remove_file(path).with_context(reported),
         Err(error) if error.kind() == ErrorKind::AlreadyExists => {
-            OpenOptions::new().append(true).open(path).map(drop).with_context(told)
+            OpenOptions::new().append(true).open(path).map(drop).with_context(reported)
         }
-        Err(error) => Err(error).with_context(told),
+        Err(error) => Err(error).with_context(reported),
     }
 }
 
 /// Fails unless files can be written in `folder`, which is made if it is not there.
 pub fn can_write_in(folder: &Path) -> Result<()> {
-    let told = || format!("cannot make the folder {}: name one where you may write", folder.display());
-    std::fs::create_dir_all(folder).with_context(told)?;
+    let reported = || format!("cannot make the folder {}: name one where you may write", folder.display());
+    std::fs::create_dir_all(folder).with_context(reported)?;
     can_write(&folder.join(".trial"))
 }
 

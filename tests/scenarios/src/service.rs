@@ -36,7 +36,7 @@ pub struct Service {
     pub(crate) in_turns: bool,
     pub(crate) commits: bool,
     gate: Option<Arc<AtomicBool>>,
-    pub(crate) tells: i64,
+    pub(crate) reports: i64,
     pub(crate) failure: Option<Failure>,
     log: Arc<CallLog>,
 }
@@ -57,7 +57,7 @@ impl Service {
             in_turns: false,
             commits: false,
             gate: None,
-            tells: 0,
+            reports: 0,
             failure: None,
             log: Arc::new(CallLog::default()),
         }
@@ -125,8 +125,8 @@ impl Service {
 
     /// Before it answers it tells so many values of its progress `left`, from 1 on, one in each millisecond, for as long as its
     /// call is not given up. The log notes how many.
-    pub fn tells(self, count: i64) -> Self {
-        Self { tells: count, ..self }
+    pub fn reports(self, count: i64) -> Self {
+        Self { reports: count, ..self }
     }
 
     /// It fails, and says why.
@@ -137,7 +137,7 @@ impl Service {
     /// Whether its handler waits for anything, so that one that must not wait cannot serve it.
     pub(crate) fn awaits(&self) -> bool {
         let waits = self.takes > Duration::ZERO || self.calls_back.is_some() || self.gate.is_some();
-        waits || self.moves_every.is_some() || self.tells > 0 || self.commits
+        waits || self.moves_every.is_some() || self.reports > 0 || self.commits
     }
 
     /// Moves once, if the call of these parameters is wanted; the pause until the next move.

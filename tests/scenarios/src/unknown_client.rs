@@ -77,7 +77,7 @@ impl UnknownClient {
     }
 
     /// What it must be told before the end.
-    pub(crate) fn is_told(self) -> Option<Vec<u8>> {
+    pub(crate) fn is_reported(self) -> Option<Vec<u8>> {
         let refusal = match self {
             Self::OtherVersion => Refusal::Version(Self::OTHER_VERSIONS),
             Self::OtherFleet => Refusal::Fleet,

@@ -176,7 +176,7 @@ impl<T> Pending<T> {
 #[derive(Debug)]
 pub struct Watched {
     /// The values of its progress `left`, as they came.
-    pub told: Vec<i64>,
+    pub reported: Vec<i64>,
     /// How it ended.
     pub outcome: Result<(), CallError>,
 }

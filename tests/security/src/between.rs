@@ -151,8 +151,8 @@ impl<'l> Middle<'l> {
             let next = way.carry(|_, bytes| vec![bytes], |_| wait_for(|| way.has_joined()));
             next.with_context(|| {
                 let (events, counters) = (way.manager_joins(), way.unit.counters());
-                let told: Vec<_> = counters.into_iter().filter(|(_, count)| *count > 0).collect();
-                format!("behind bit {bit} of {at:?}, after which the manager had {events} joins: {told:?}")
+                let reported: Vec<_> = counters.into_iter().filter(|(_, count)| *count > 0).collect();
+                format!("behind bit {bit} of {at:?}, after which the manager had {events} joins: {reported:?}")
             })?;
             ensure!(way.has_joined(), "bit {bit} of {at:?}: nor did the next link come up");
         }

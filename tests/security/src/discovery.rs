@@ -278,7 +278,7 @@ fn relayed(report: &mut Report, linux: &Linux, extent: Extent) -> Result<()> {
         std::thread::sleep(Duration::from_millis(20));
         noticed.extend(risen(&before, &named(unit.counters())));
         unit.stop();
-        successes += u64::from(log.all().joins > 0 || speaker.told);
+        successes += u64::from(log.all().joins > 0 || speaker.reported);
     }
     noticed.sort();
     noticed.dedup();

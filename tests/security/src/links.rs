@@ -78,7 +78,7 @@ pub fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
         let end = Instant::now() + PATIENCE;
         loop {
             let seen = (visit.seen)()?;
-            let served = !target.tells_calls() || asked.iter().all(|mark| seen.marks.contains(mark));
+            let served = !target.reports_calls() || asked.iter().all(|mark| seen.marks.contains(mark));
             if (seen.joins == 1 && served) || Instant::now() > end {
                 return Ok(seen.joins == 1 && served);
             }

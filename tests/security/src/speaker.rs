@@ -92,7 +92,7 @@ pub struct Speaker {
     /// Frames that came, whole.
     pub heard: Vec<Vec<u8>>,
     /// The other end sent a message that only a proven peer may receive.
-    pub told: bool,
+    pub reported: bool,
 }
 
 fn random<const BYTES: usize>() -> [u8; BYTES] {
@@ -129,7 +129,7 @@ impl Speaker {
             next_id: 1,
             asked: Vec::new(),
             heard: Vec::new(),
-            told: false,
+            reported: false,
         })
     }
 
@@ -313,11 +313,11 @@ impl Speaker {
                 Frame::parse(body),
                 Ok(Frame::Hello(_) | Frame::Proof(_) | Frame::Close(_) | Frame::Refuse(_))
             );
-            self.told |= !hello_or_end;
+            self.reported |= !hello_or_end;
             return Ok(body.to_vec());
         }
         let opened = self.cipher.open(body).map_err(|_| over("it does not open"))?;
-        self.told |= !secured && opened.first().is_some_and(|kind| kind & 0x10 != 0);
+        self.reported |= !secured && opened.first().is_some_and(|kind| kind & 0x10 != 0);
         Ok(opened.to_vec())
     }
 

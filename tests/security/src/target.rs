@@ -26,7 +26,7 @@ pub trait Target: Sync {
     fn counters(&self) -> Result<Counters>;
 
     /// Whether it reports the calls that it ran. Otherwise only joins are seen.
-    fn tells_calls(&self) -> bool {
+    fn reports_calls(&self) -> bool {
         true
     }
 
@@ -74,7 +74,7 @@ impl Visit<'_> {
     pub fn was_seen(&self, mut speaker: Speaker) -> Result<bool> {
         speaker.finish();
         let seen = (self.seen)()?;
-        Ok(speaker.told || seen.joins > 0 || !seen.marks.is_empty())
+        Ok(speaker.reported || seen.joins > 0 || !seen.marks.is_empty())
     }
 
     /// Whether the application saw more than a genuine peer sent: more than `joins` joins, a request that is not in

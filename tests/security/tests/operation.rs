@@ -12,7 +12,7 @@ use cara_security::speaker::{HANDSHAKE, Speaker};
 use cara_security::target::Target;
 use cara_std::access::AccessTable;
 use cara_std::control::Control;
-use cara_std::keys::{FleetKeys, Store, place};
+use cara_std::keys::{FleetKeys, Store, location};
 use cara_std::{CommunicationSystem, Fleet, Interfaces, Unit};
 
 /// Log lines written since the subscriber was installed.
@@ -55,8 +55,8 @@ fn every_refusal_is_counted_and_one_line_a_second_is_logged() {
             speaker
         })
         .into();
-    let (begun, mut asked) = (Instant::now(), 0);
-    while begun.elapsed() < Duration::from_millis(2_500) {
+    let (started, mut asked) = (Instant::now(), 0);
+    while started.elapsed() < Duration::from_millis(2_500) {
         for speaker in &mut speakers {
             let request = speaker.request(0, Priority::Normal, true);
             speaker.say_bytes(&request).unwrap();
@@ -65,7 +65,7 @@ fn every_refusal_is_counted_and_one_line_a_second_is_logged() {
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    let seconds = begun.elapsed().as_secs() as usize + 1;
+    let seconds = started.elapsed().as_secs() as usize + 1;
     assert!(manager.counters().unwrap()["RequestsForbidden"] >= asked);
     let written = lines.with("may not call mark");
     // One more before the loop, from their first call after joining.
@@ -82,7 +82,7 @@ fn a_live_link_ends_soon_after_its_key_is_revoked() {
     [depot(), agv(1), agv(2)].iter().for_each(|node| keys.add(node, &[]).unwrap());
     let mut store = Store::create(folder.path(), keys).unwrap();
     store.save().unwrap();
-    let file = |node| folder.path().join(place::file_name(&node, fleet));
+    let file = |node| folder.path().join(location::file_name(&node, fleet));
     let builder = CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0).control(Control::Off);
     let manager = builder.interfaces(Interfaces::Loopback).key_file(file(depot())).build().unwrap();
     manager.start().unwrap();

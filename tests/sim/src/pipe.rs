@@ -31,7 +31,7 @@ pub(crate) enum End {
     /// The end has arrived, perhaps before the bytes were read.
     Arrived,
     /// The reader was told.
-    Told,
+    Report,
 }
 
 /// One direction of a stream. Offsets count from the stream's first byte: read ≤ lent ≤ arrived ≤ sent ≤ written.
@@ -142,7 +142,7 @@ impl Pipe {
 
     /// Frees the memory: the reader is gone.
     pub(crate) fn drop_all(&mut self) {
-        *self = Self { end: End::Told, ..Self::new() };
+        *self = Self { end: End::Report, ..Self::new() };
     }
 
     fn compact(&mut self) {

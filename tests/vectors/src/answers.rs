@@ -109,7 +109,7 @@ fn items(items: &[Vec<u8>]) -> Vec<u8> {
 }
 
 /// A control message of one item, as it is written.
-fn told(item: Value) -> Value {
+fn reported(item: Value) -> Value {
     json!({ "priority": "high", "message": { "control": [item] } })
 }
 
@@ -148,7 +148,7 @@ fn handshakes() -> Vec<Answer> {
     let mut taken = stream::decode(&Context::limits(4096, 32_800), &same);
     let mut other_versions = taken.clone();
     let then = |seen: &mut Value, next| seen.as_array_mut().unwrap_or_else(|| panic!("a stream")).push(next);
-    then(&mut taken, told(json!({ "list_end": { "serial": 1 } })));
+    then(&mut taken, reported(json!({ "list_end": { "serial": 1 } })));
     then(&mut other_versions, json!({ "refuse": 1 }));
     let refuse = |code: u8| json!([{ "refuse": code }]);
     let given = |hello: &[u8]| frame(&Frame::Hello(hello));
@@ -197,7 +197,7 @@ fn messages() -> Vec<Answer> {
     let nameless = item(1, &[0, 0, 8, 2, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0]);
     let withdraw = item(2, &[77]);
     let attributes = Control::Publish { slot: 0, generation: 0, attributes: &[2; 7], signature: &[0, 0, 0] };
-    let ack = |skipped| told(json!({ "list_ack": { "serial": 9, "skipped": skipped } }));
+    let ack = |skipped| reported(json!({ "list_ack": { "serial": 9, "skipped": skipped } }));
     answers([
         ("message_unknown", "there is no kind 5", "live", normal(&[5; 16]), 0, close(5)),
         (
@@ -281,7 +281,7 @@ fn requests() -> Vec<Answer> {
         "signature": "08706f735f696e666f0001000802000000706f736974696f6e",
     }});
     let stale = refused(1, json!("stale_function"));
-    let news = json!([stale, told(publish), told(json!({ "list_end": { "serial": 2 } }))]);
+    let news = json!([stale, reported(publish), reported(json!({ "list_end": { "serial": 2 } }))]);
     let one_way = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "unknown_function" } } }]);
     let twice = [request(first(), &[]), request(first(), &[])].concat();
     let below = [request(header(100, 0), &[]), request(header(36, 0), &[]), request(header(37, 0), &[])].concat();
@@ -397,7 +397,7 @@ fn leases() -> Vec<Answer> {
     let released = vec![started.clone(), release.clone()];
     let all = vec![started.clone(), body(&SessionBody::release_all(Slot(1), 9))];
     let overtaken = vec![release, request(RequestHeader { wants_reply: true, ..go_to }, &position)];
-    let expired = || told(json!({ "lease_ended": { "call": 1, "why": "expired" } }));
+    let expired = || reported(json!({ "lease_ended": { "call": 1, "why": "expired" } }));
     let heard = || json!({ "session": { "renewed": { "call": 1 } } });
     let failure = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "expired" } } }]);
     let lease_released = answer(("lease_released", "it ends without an answer", "live", released, 600, json!([])));

@@ -92,7 +92,7 @@ fn messages() -> Vec<Vector> {
     }});
     let failed = Error::Service(ServiceError::Failed(7));
     let details = [&[7, 0, 0, 0, 0, 0, 0, 0][..], b"blocked\0", &results].concat();
-    let told = json!({
+    let reported = json!({
         "id": 0x0102_0304, "error": { "service_failed": { "code": 7 } },
         "details": { "text": "blocked", "values": "0102030405060708090a0b0c0d0e0f10" },
     });
@@ -127,12 +127,12 @@ fn messages() -> Vec<Vector> {
         message(
             ("reply_with_details", "why a service failed, in words and values"),
             &[&encode_reply(0x0102_0304, Err(failed))[..], &details].concat(),
-            &json!({ "reply": told }),
+            &json!({ "reply": reported }),
         ),
         message(
             ("failure_with_details", "the same of a request that nothing waits for"),
             &[&encode_failure(0x0102_0304, failed)[..], &details].concat(),
-            &json!({ "failure": told }),
+            &json!({ "failure": reported }),
         ),
         message(
             ("reply_with_cut_details", "what cannot be read leaves the code"),

@@ -147,11 +147,11 @@ impl Side {
     fn hear_stream(&mut self, bytes: &[u8]) {
         let mut rest = bytes.to_vec();
         loop {
-            let (consumed, noted, call) = self.receive(&mut rest);
+            let (consumed, recorded, call) = self.receive(&mut rest);
             self.calls.extend(call);
             rest.drain(..consumed);
-            self.events.extend(noted.clone());
-            if consumed == 0 && noted.is_none() {
+            self.events.extend(recorded.clone());
+            if consumed == 0 && recorded.is_none() {
                 break;
             }
         }
@@ -170,7 +170,7 @@ impl Side {
         };
         let receipt = self.session.receive(&mut cx, rest, None);
         let call = if let Some(Event::Incoming(call)) = &receipt.event { Some(*call) } else { None };
-        (receipt.consumed, receipt.event.as_ref().map(told), call)
+        (receipt.consumed, receipt.event.as_ref().map(reported), call)
     }
 
     fn hear_datagram(&mut self, bytes: &[u8]) {
@@ -191,7 +191,7 @@ impl Side {
     }
 
     fn note(&mut self, event: &Event) {
-        self.events.push(told(event));
+        self.events.push(reported(event));
     }
 
     /// Publishes functions of the list.
@@ -248,7 +248,7 @@ pub(crate) enum How {
     BestEffort,
 }
 
-fn told(event: &Event) -> String {
+fn reported(event: &Event) -> String {
     let text = format!("{event:?}");
     text.split(['(', ' ']).next().unwrap_or_default().to_owned()
 }

@@ -72,10 +72,10 @@ impl Browser {
 
     /// Opens a page whose server may still be starting.
     pub(crate) async fn open_soon(&self, url: &str) -> Result<()> {
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             match self.open(url).await {
-                Err(_) if begun.elapsed() < PATIENCE => tokio::time::sleep(LOOK).await,
+                Err(_) if started.elapsed() < PATIENCE => tokio::time::sleep(LOOK).await,
                 outcome => return outcome,
             }
         }
@@ -117,9 +117,9 @@ impl Browser {
 
     /// Waits until an expression is true in the page.
     pub(crate) async fn wait(&self, what: &str, expression: &str) -> Result<()> {
-        let begun = Instant::now();
+        let started = Instant::now();
         while self.run(&format!("return Boolean({expression})")).await? != true {
-            if begun.elapsed() > PATIENCE {
+            if started.elapsed() > PATIENCE {
                 self.shoot("failed").await?;
                 bail!("{what}: not so after {PATIENCE:?}: {expression}\n{}", self.text("body").await?);
             }

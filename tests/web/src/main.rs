@@ -307,13 +307,13 @@ async fn crowd(browser: &Browser, url: &str) -> Result<()> {
         browser.says("#link", "live").await?;
     }
     browser.switch(&first).await?;
-    let begun = std::time::Instant::now();
+    let started = std::time::Instant::now();
     browser.click("#stop-all").await?;
     browser.says("#stop-title", "Stop of all").await?;
     browser.says("#stop-summary", &format!("{count} of {count} acknowledged")).await?;
     // Those that are hidden give their connections up after 10 s.
-    ensure!(begun.elapsed().as_secs() < 4, "the stop has waited for a connection: {:?}", begun.elapsed());
-    println!("stopped beside {PAGES} more pages after {:?}", begun.elapsed());
+    ensure!(started.elapsed().as_secs() < 4, "the stop has waited for a connection: {:?}", started.elapsed());
+    println!("stopped beside {PAGES} more pages after {:?}", started.elapsed());
     for window in others {
         browser.switch(&window).await?;
         browser.shut().await?;

@@ -18,19 +18,19 @@ struct Way {
     server: &'static str,
     location: &'static str,
     /// Whether `cara web` has been told its origin.
-    is_told: bool,
+    is_reported: bool,
 }
 
 /// As `docs/web.md` has it.
 const DOCUMENTED: &str =
     "proxy_http_version 1.1; proxy_buffering off; proxy_read_timeout 1h; proxy_set_header Host $http_host;";
 const WAYS: [Way; 6] = [
-    Way { scheme: "http", path: "/", server: "", location: "", is_told: true },
-    Way { scheme: "https", path: "/", server: "", location: DOCUMENTED, is_told: true },
-    Way { scheme: "http", path: "/hall/2/", server: "", location: DOCUMENTED, is_told: true },
-    Way { scheme: "https", path: "/hall/2/", server: "", location: "", is_told: true },
-    Way { scheme: "https", path: "/", server: "", location: "", is_told: false },
-    Way { scheme: "http", path: "/", server: "location ~ [.]js$ { return 403; }", location: "", is_told: true },
+    Way { scheme: "http", path: "/", server: "", location: "", is_reported: true },
+    Way { scheme: "https", path: "/", server: "", location: DOCUMENTED, is_reported: true },
+    Way { scheme: "http", path: "/hall/2/", server: "", location: DOCUMENTED, is_reported: true },
+    Way { scheme: "https", path: "/hall/2/", server: "", location: "", is_reported: true },
+    Way { scheme: "https", path: "/", server: "", location: "", is_reported: false },
+    Way { scheme: "http", path: "/", server: "location ~ [.]js$ { return 403; }", location: "", is_reported: true },
 ];
 
 /// Ports of this test: of `cara web`, and of the ways to it.
@@ -56,7 +56,7 @@ impl Ports {
     /// What `cara web` is told.
     pub(crate) fn origins(&self) -> Vec<String> {
         (0..WAYS.len())
-            .filter(|number| WAYS[*number].is_told)
+            .filter(|number| WAYS[*number].is_reported)
             .map(|number| format!("--origin={}", self.url(number)))
             .collect()
     }
@@ -100,7 +100,7 @@ pub(crate) async fn stop(browser: &Browser, stage: &Stage, key: &str) -> Result<
             continue;
         }
         browser.says("#link", "live").await?;
-        if !way.is_told {
+        if !way.is_reported {
             browser.says("#stop-all:disabled", "refused by the server").await?;
             browser
                 .says("#banner", "STOP ALL does not work on this page.\n403: only the page of `cara web` itself")

@@ -38,10 +38,10 @@ impl Warehouse {
             Process::start(name, Path::new("env"), variables.chain([&*program]).chain(arguments.iter().copied()))
         };
         let mut run = start("warehouse", arguments)?;
-        let told = run.expect("to watch: cara ", PATIENCE)?.text;
-        let told = told.split_once("to watch: cara ").context("it says how to watch")?.1;
+        let reported = run.expect("to watch: cara ", PATIENCE)?.text;
+        let reported = reported.split_once("to watch: cara ").context("it says how to watch")?.1;
         // The path of the map, which stands last, may have spaces.
-        let arguments: Vec<_> = told.splitn(7, ' ').chain(["--listen", "127.0.0.1:0"]).collect();
+        let arguments: Vec<_> = reported.splitn(7, ' ').chain(["--listen", "127.0.0.1:0"]).collect();
         run.expect("commands them", PATIENCE)?;
         let mut web = start("cara", &arguments)?;
         let line = web.expect("the page is at ", PATIENCE)?.text;
@@ -142,15 +142,15 @@ pub(crate) async fn watch(browser: &Browser, programs: &Path, vehicles: u32, min
     crate::measure(browser).await?;
     let frames = "window.frames = 0; const count = () => { window.frames++; requestAnimationFrame(count) }; count()";
     browser.run(frames).await?;
-    let (begun, before) = (Instant::now(), cpu(web.id())?);
+    let (started, before) = (Instant::now(), cpu(web.id())?);
     let ended = "no process ended on its own";
     while !run.has(ended) {
         tokio::time::sleep(LOOKED).await;
-        ensure!(begun.elapsed() < Duration::from_secs(60) * (minutes + 6), "the warehouse does not end");
+        ensure!(started.elapsed() < Duration::from_secs(60) * (minutes + 6), "the warehouse does not end");
         let about = browser.run("return document.querySelector('#count').textContent").await?;
-        println!("{:4.0} s  {}", begun.elapsed().as_secs_f64(), about.as_str().unwrap_or("the page does not answer"));
+        println!("{:4.0} s  {}", started.elapsed().as_secs_f64(), about.as_str().unwrap_or("the page does not answer"));
     }
-    let (took, used) = (begun.elapsed(), cpu(web.id())?.saturating_sub(before));
+    let (took, used) = (started.elapsed(), cpu(web.id())?.saturating_sub(before));
     let drawn = browser.run("return window.frames").await?;
     let status = fs::read_to_string(format!("/proc/{}/status", web.id()))?;
     let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap_or("unknown").trim();

@@ -86,8 +86,8 @@ impl Run {
         Ok(output)
     }
 
-    /// Standard output and standard error as one text, in the order in which they were written; each line is `told` at once.
-    pub(crate) fn merged(mut self, told: impl Fn(&str)) -> Result<String> {
+    /// Standard output and standard error as one text, in the order in which they were written; each line is `reported` at once.
+    pub(crate) fn merged(mut self, reported: impl Fn(&str)) -> Result<String> {
         let shown = self.shown();
         let (reader, writer) = std::io::pipe()?;
         let mut reader = BufReader::new(reader);
@@ -98,7 +98,7 @@ impl Run {
         let (mut output, mut line) = (String::new(), Vec::new());
         while reader.read_until(b'\n', &mut line)? > 0 {
             let text = String::from_utf8_lossy(&line);
-            told(&text);
+            reported(&text);
             output.push_str(&text);
             line.clear();
         }

@@ -66,7 +66,7 @@ fn late(stage: &Stage, manager: &mut Process, began: Instant) -> Result<Process>
     stage.title("An AGV that comes late");
     std::thread::sleep(LATE.saturating_sub(began.elapsed()));
     let third = stage.agv(3)?;
-    stage.tell(&format!("agv-3 starts {:.1} s after the manager", began.elapsed().as_secs_f64()));
+    stage.show(&format!("agv-3 starts {:.1} s after the manager", began.elapsed().as_secs_f64()));
     stage.heard(&manager.seen("joined agv-3/13", STEP)?, manager);
     stage.heard(&third.seen("call_mechanic: one comes in 5 minutes", STEP)?, &third);
     let units = stage.command(manager, "units", "= 3 s_units")?;
@@ -82,12 +82,12 @@ fn restart(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Result<()
     stage.command(manager, "pos_info 1", "= position [2, 0]")?;
     let before = epoch(&stage.command(manager, "units", "1 is agv-2/12, epoch")?)?;
     agv.kill()?;
-    stage.tell("agv-2 is killed (SIGKILL)");
+    stage.show("agv-2 is killed (SIGKILL)");
     stage.heard(&manager.expect("left agv-2/12", STEP)?, manager);
     stage.command(manager, "units", "1 is agv-2/12, away")?;
     stage.command(manager, "pos_info 1", "! ")?;
     *agv = stage.agv(2)?;
-    stage.tell("agv-2 is started again");
+    stage.show("agv-2 is started again");
     stage.heard(&manager.expect("joined agv-2/12", STEP)?, manager);
     let after = epoch(&stage.command(manager, "units", "1 is agv-2/12, epoch")?)?;
     ensure!(before != after, "agv-2 restarted and has the same epoch {after}");
@@ -110,17 +110,17 @@ fn hang_manager(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Resu
     ensure!(!agv.has(EXPIRED), "the lease of go_to ended while the manager was there");
     let place = stops(stage, agv, || {
         let frozen = manager.freeze()?;
-        stage.tell("the manager is held up (SIGSTOP); its connections stay open");
+        stage.show("the manager is held up (SIGSTOP); its connections stay open");
         Ok(frozen)
     })?;
     // Printed by another thread than the place: either comes first.
     stage.heard(&agv.seen(EXPIRED, STEP)?, agv);
     manager.thaw()?;
-    stage.tell("the manager goes on (SIGCONT)");
+    stage.show("the manager goes on (SIGCONT)");
     // Which of the two comes first: the vehicle's word, or the manager's look how long no renewal was answered.
     let end = manager.expect("lease of go_to at agv-1/11 ", STEP)?;
-    let is_told = ["expired", "unanswered"].iter().any(|word| end.text.contains(word));
-    ensure!(is_told, "the lease of a frozen manager ended otherwise: {}", end.text);
+    let is_reported = ["expired", "unanswered"].iter().any(|word| end.text.contains(word));
+    ensure!(is_reported, "the lease of a frozen manager ended otherwise: {}", end.text);
     stage.heard(&end, manager);
     stands(stage, agv, &place)?;
     stage.command(manager, "units", "= 3 s_units")?;
@@ -133,7 +133,7 @@ fn lose_manager(stage: &Stage, mut manager: Process, agv: &mut Process) -> Resul
     drive(stage, &mut manager, agv, [9, 2])?;
     let place = stops(stage, agv, || {
         let killed = manager.kill()?;
-        stage.tell("the manager is killed (SIGKILL)");
+        stage.show("the manager is killed (SIGKILL)");
         Ok(killed)
     })?;
     stands(stage, agv, &place)?;
@@ -165,7 +165,7 @@ fn stops(stage: &Stage, agv: &mut Process, lose: impl FnOnce() -> Result<Instant
         "agv-1 drove on for {after:?}, more than {most:?}, of which the machine was held up {held_up:?}"
     );
     let place = place(&stopped.text)?;
-    stage.tell(&format!("agv-1 stopped {} ms after that, at {place}", after.as_millis()));
+    stage.show(&format!("agv-1 stopped {} ms after that, at {place}", after.as_millis()));
     Ok(place)
 }
 
@@ -207,7 +207,7 @@ fn stands(stage: &Stage, agv: &mut Process, there: &str) -> Result<()> {
     if let Some(line) = agv.lines()[before..].iter().find(|line| moves(&line.text)) {
         bail!("agv-1 moves again: {}", line.text);
     }
-    stage.tell(&format!("agv-1 reported {REPORTS} times that it stands at {there}"));
+    stage.show(&format!("agv-1 reported {REPORTS} times that it stands at {there}"));
     Ok(())
 }
 
@@ -243,7 +243,7 @@ fn end(stage: &Stage, agvs: [Process; 3]) -> Result<()> {
         let status = agv.wait(STEP)?;
         ensure!(status.success(), "{} ended with {status}", agv.name());
     }
-    stage.tell("all processes have ended");
+    stage.show("all processes have ended");
     Ok(())
 }
 

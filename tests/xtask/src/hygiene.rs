@@ -107,10 +107,10 @@ mod tests {
     #[test]
     fn a_path_of_a_machine_is_told() {
         let [work, temporary] = MACHINE_PATHS;
-        let told = |text: String| offences(Path::new("README.md"), &text).len();
-        assert_eq!(told(format!("see `{work}main`")), 1);
-        assert_eq!(told(format!("(\"{temporary}x\")\n")), 1);
-        assert_eq!(told(format!("target{temporary}x and https://example.org{work}")), 0);
+        let reported = |text: String| offences(Path::new("README.md"), &text).len();
+        assert_eq!(reported(format!("see `{work}main`")), 1);
+        assert_eq!(reported(format!("(\"{temporary}x\")\n")), 1);
+        assert_eq!(reported(format!("target{temporary}x and https://example.org{work}")), 0);
     }
 
     #[test]
@@ -122,10 +122,10 @@ mod tests {
     #[test]
     fn a_property_whose_failing_cases_are_not_kept_is_told() {
         let files = ["core/src/lib.rs", "sim/tests/network/main.rs"].map(PathBuf::from);
-        let told = |file: &str, text: &str| loses_failing_cases(Path::new(file), text, &files).is_some();
-        assert!(told("core/tests/hostile.rs", "proptest! {}"));
-        assert!(!told("core/tests/hostile.rs", "use proptest::prelude::*; // proptest! {}"));
-        assert!(!told("core/src/services/session/tests.rs", "proptest! {}"));
-        assert!(!told("sim/tests/network/streams.rs", "proptest! {}"));
+        let reported = |file: &str, text: &str| loses_failing_cases(Path::new(file), text, &files).is_some();
+        assert!(reported("core/tests/hostile.rs", "proptest! {}"));
+        assert!(!reported("core/tests/hostile.rs", "use proptest::prelude::*; // proptest! {}"));
+        assert!(!reported("core/src/services/session/tests.rs", "proptest! {}"));
+        assert!(!reported("sim/tests/network/streams.rs", "proptest! {}"));
     }
 }

@@ -129,13 +129,13 @@ fn board() -> Result<Vec<Row>> {
     let machine = ["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none", "-nic", "none"];
     // A board that panics would start again and again.
     let machine = machine.iter().chain(&["-no-reboot"]);
-    let told = Run::new("qemu-system-arm")
+    let reported = Run::new("qemu-system-arm")
         .args(machine)
         .args(["-icount", "shift=10,sleep=off", "-semihosting-config", "enable=on,target=native", "-kernel"])
         .args([built(TARGET, OPERATIONS)])
         .text()?;
     // A board that panics is started again, which ends the emulator without an error.
-    let rows = told.trim_end().strip_suffix("end").context("the board has ended before its last operation")?;
+    let rows = reported.trim_end().strip_suffix("end").context("the board has ended before its last operation")?;
     rows.lines().map(of_board).collect()
 }
 
@@ -148,7 +148,7 @@ fn network() -> Result<Option<Vec<Row>>> {
     let mut rows = Vec::new();
     for (image, file) in images {
         match firmware::tests(&file)?.args(["--insecure", "instructions", image]).output()? {
-            (Some(0), told) => rows.extend(told.lines().map(of_board).collect::<Result<Vec<Row>>>()?),
+            (Some(0), reported) => rows.extend(reported.lines().map(of_board).collect::<Result<Vec<Row>>>()?),
             (Some(firmware::NOT_ALLOWED), _) => return Ok(None),
             (code, _) => bail!("the board's instructions could not be counted: exit code {code:?}"),
         }

@@ -30,10 +30,10 @@ pub(crate) fn run(names: &[String]) -> Result<ExitCode> {
         ensure!(known.contains(&name.as_str()), "no other system is called {name}; there are {known:?}");
     }
     let chosen = peers.iter().filter(|peer| names.is_empty() || names.contains(&peer.name));
-    let told: Vec<(String, bool)> = chosen.map(Peer::build).collect();
+    let reported: Vec<(String, bool)> = chosen.map(Peer::build).collect();
     println!();
-    told.iter().for_each(|(line, _)| println!("{line}"));
-    Ok(if told.iter().all(|(_, is_fine)| *is_fine) { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    reported.iter().for_each(|(line, _)| println!("{line}"));
+    Ok(if reported.iter().all(|(_, is_fine)| *is_fine) { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 fn all() -> Result<Vec<Peer>> {

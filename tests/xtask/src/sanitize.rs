@@ -55,7 +55,8 @@ mod tests {
         let both = format!("{stable}nightly-x86_64-unknown-linux-gnu\n");
         assert!(missing(stable, "").unwrap().contains("toolchain install nightly"));
         assert!(
-            missing("nightly-2026-01-01-x86_64-unknown-linux-gnu\n", "").is_some_and(|told| told.contains("install"))
+            missing("nightly-2026-01-01-x86_64-unknown-linux-gnu\n", "")
+                .is_some_and(|reported| reported.contains("install"))
         );
         assert!(missing(&both, "cargo\nrustc\n").unwrap().contains("component add rust-src"));
         assert_eq!(missing(&both, "cargo\nrust-src\n"), None);

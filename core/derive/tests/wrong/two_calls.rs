@@ -8,7 +8,7 @@ struct Left {
 
 #[interface]
 trait Lift {
-    fn lift_to(&mut self, call: &impl AnyCall, told: &impl TypedCall<Left>, height: f64);
+    fn lift_to(&mut self, call: &impl AnyCall, reported: &impl TypedCall<Left>, height: f64);
 }
 
 fn main() {}

@@ -151,7 +151,7 @@ impl<P: Port> Node<P> {
         let until = if newcomer.decided { now } else { now + CHALLENGE_TIMEOUT };
         let directive = if newcomer.is_higher { Directive::Yield } else { Directive::Challenge };
         self.table.schedule(place, until, Task::Supersede);
-        Some(Command::Tell(old, directive))
+        Some(Command::Notify(old, directive))
     }
 
     /// The challenged link has answered: the newcomer is not taken.
@@ -175,7 +175,7 @@ impl<P: Port> Node<P> {
         };
         self.table.set_link(newcomer.link, None);
         self.refuse(now, newcomer.address, &identity, refusal);
-        Some(Command::Tell(newcomer.link, Directive::Refuse(refusal)))
+        Some(Command::Notify(newcomer.link, Directive::Refuse(refusal)))
     }
 
     /// The challenge has not been answered in time: the link makes room. The newcomer takes the place when it has
@@ -191,7 +191,7 @@ impl<P: Port> Node<P> {
         };
         // From here on an answer of the old link comes too late, and must not refuse a newcomer whose rival is being closed.
         newcomer.decided = true;
-        Some(Command::Tell(old, Directive::Close(reason)))
+        Some(Command::Notify(old, Directive::Close(reason)))
     }
 
     /// A newcomer joins in the place of a link that is gone.

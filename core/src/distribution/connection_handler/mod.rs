@@ -113,7 +113,7 @@ pub enum Command<E> {
         identity: Option<Identity>,
     },
     /// Pass this on to a link.
-    Tell(LinkId, Directive),
+    Notify(LinkId, Directive),
 }
 
 /// A directive to a link because of another one. Only the node makes one.
@@ -353,11 +353,11 @@ impl<P: Port> Node<P> {
                 Task::Challenge => self.challenge(now, place),
                 Task::Supersede => self.supersede(place),
                 Task::Admit => {
-                    self.table.node(place).and_then(Known::link).map(|new| Command::Tell(new, Directive::Admit))
+                    self.table.node(place).and_then(Known::link).map(|new| Command::Notify(new, Directive::Admit))
                 }
                 Task::Refuse => self.refuse_newcomer(now, place),
                 Task::Yield => {
-                    self.table.node(place).and_then(Known::link).map(|old| Command::Tell(old, Directive::Yield))
+                    self.table.node(place).and_then(Known::link).map(|old| Command::Notify(old, Directive::Yield))
                 }
             };
             if command.is_some() {

@@ -73,24 +73,24 @@ fn replacing_makes_old_requests_stale() {
 #[test]
 fn a_peers_list_grows_with_its_functions_and_up_to_what_it_may_have() {
     let mut list = theirs(1, 8);
-    let tell = |list: &mut Theirs, slot: u16, text: &str| {
+    let notify = |list: &mut Theirs, slot: u16, text: &str| {
         list.insert(Slot(slot), Generation(7), usual(), parse(text).as_bytes())
     };
-    tell(&mut list, 0, "a()").unwrap();
-    assert_eq!(tell(&mut list, 1, "b()").err(), Some(Error::Full(Limit::Functions)), "it may not grow");
+    notify(&mut list, 0, "a()").unwrap();
+    assert_eq!(notify(&mut list, 1, "b()").err(), Some(Error::Full(Limit::Functions)), "it may not grow");
     list.let_grow(4, 60);
-    tell(&mut list, 1, "b(position: int[2])").unwrap();
+    notify(&mut list, 1, "b(position: int[2])").unwrap();
     assert_eq!(list.table.entries.len(), 2, "half as many again, or those that are needed");
-    tell(&mut list, 9, "c()").unwrap();
+    notify(&mut list, 9, "c()").unwrap();
     assert_eq!(format!("{}", list.show_functions()), "a()\nb(position: int[2])\nc()\n");
     assert!(list.iter().all(|function| function.generation == Generation(7)));
     let long = "d(wwwwwwwwwwwwwwwwwwwwwwwwwwwwww: int, xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx: int)";
-    assert_eq!(tell(&mut list, 2, long).err(), Some(Error::Full(Limit::SignatureBytes)));
-    tell(&mut list, 2, "d()").unwrap();
-    assert_eq!(tell(&mut list, 3, "e()").err(), Some(Error::Full(Limit::Functions)));
+    assert_eq!(notify(&mut list, 2, long).err(), Some(Error::Full(Limit::SignatureBytes)));
+    notify(&mut list, 2, "d()").unwrap();
+    assert_eq!(notify(&mut list, 3, "e()").err(), Some(Error::Full(Limit::Functions)));
     assert_eq!((list.table.entries.len(), list.table.bytes.len()), (4, 60));
     assert!(list.remove(Slot(0)));
-    tell(&mut list, 3, "e()").unwrap();
+    notify(&mut list, 3, "e()").unwrap();
     assert_eq!((list.table.entries.len(), list.len(), list.skipped()), (4, 4, 3));
     list.clear();
     assert!(list.is_empty());
@@ -120,8 +120,8 @@ fn a_name_is_not_found_by_its_beginning() {
 fn what_a_small_list_cannot_keep_is_counted() {
     let mut list = theirs(2, 99);
     for (slot, name) in ["a()", "b()", "c()", "d()"].into_iter().enumerate() {
-        let told = list.insert(Slot(slot as u16 + 100), Generation(7), usual(), parse(name).as_bytes());
-        assert_eq!(told, if slot < 2 { Ok(()) } else { Err(Error::Full(Limit::Functions)) });
+        let reported = list.insert(Slot(slot as u16 + 100), Generation(7), usual(), parse(name).as_bytes());
+        assert_eq!(reported, if slot < 2 { Ok(()) } else { Err(Error::Full(Limit::Functions)) });
     }
     assert_eq!((list.len(), list.skipped()), (2, 2));
     assert_eq!(list.find("b"), Some(Slot(101)));
@@ -244,8 +244,8 @@ proptest! {
             model.retain(|_, (_, old)| old.name() != new.name());
             let used: usize = model.values().map(|(_, old)| old.as_bytes().len()).sum();
             let fits = model.len() < 6 && used + new.as_bytes().len() <= 90;
-            let told = list.insert(Slot(slot), Generation(generation), usual(), new.as_bytes());
-            prop_assert_eq!(told.is_ok(), fits);
+            let reported = list.insert(Slot(slot), Generation(generation), usual(), new.as_bytes());
+            prop_assert_eq!(reported.is_ok(), fits);
             if fits {
                 model.insert(slot, (generation, new));
             } else {

@@ -47,14 +47,14 @@ fn what_is_encoded_when_compiling_is_what_is_parsed_at_run_time() {
 #[cfg(feature = "details")]
 #[test]
 fn sections_are_encoded_when_compiling() {
-    const TOLD: Declared<'static> = Declared { progress: PROGRESS, fails: FAILS, ..DECLARED };
-    const NO_PROGRESS: Declared<'static> = Declared { progress: &[], ..TOLD };
+    const REPORTED: Declared<'static> = Declared { progress: PROGRESS, fails: FAILS, ..DECLARED };
+    const NO_PROGRESS: Declared<'static> = Declared { progress: &[], ..REPORTED };
     let text = "go-to(text: string[200], position: int[2]) -> (done: bool, position: int[2], left: float)";
-    let told = Encoded::<{ TOLD.encoded_bytes("go-to") }>::new("go-to", TOLD).unwrap();
+    let reported = Encoded::<{ REPORTED.encoded_bytes("go-to") }>::new("go-to", REPORTED).unwrap();
     let whole = std::format!("{text} progress (left: float) fails (at: int[2])");
-    assert_eq!(told.signature().as_bytes(), parsed(&whole).as_bytes());
-    let told = Encoded::<{ NO_PROGRESS.encoded_bytes("go-to") }>::new("go-to", NO_PROGRESS).unwrap();
-    assert_eq!(told.signature().as_bytes(), parsed(&std::format!("{text} fails (at: int[2])")).as_bytes());
+    assert_eq!(reported.signature().as_bytes(), parsed(&whole).as_bytes());
+    let reported = Encoded::<{ NO_PROGRESS.encoded_bytes("go-to") }>::new("go-to", NO_PROGRESS).unwrap();
+    assert_eq!(reported.signature().as_bytes(), parsed(&std::format!("{text} fails (at: int[2])")).as_bytes());
 }
 
 #[cfg(feature = "details")]
@@ -67,12 +67,12 @@ fn a_peer_may_leave_sections_out_and_has_them_alike() {
     };
     assert_eq!(differs("go()"), None);
     assert_eq!(differs("go() progress (at: int[2], left: float, more: int)"), None);
-    let told = differs("go() progress (at: int[2], left: int)").unwrap();
-    assert!(told.contains("its progress left is int there and float here"), "{told}");
-    let told = differs("go() fails (at: int[3])").unwrap();
-    assert!(told.contains("its failure's at is int[3] there and int[2] here"), "{told}");
-    let told = differs("go() progress (left: float)").unwrap();
-    assert!(told.contains("its progress at is missing there"), "{told}");
+    let reported = differs("go() progress (at: int[2], left: int)").unwrap();
+    assert!(reported.contains("its progress left is int there and float here"), "{reported}");
+    let reported = differs("go() fails (at: int[3])").unwrap();
+    assert!(reported.contains("its failure's at is int[3] there and int[2] here"), "{reported}");
+    let reported = differs("go() progress (left: float)").unwrap();
+    assert!(reported.contains("its progress at is missing there"), "{reported}");
 }
 
 #[test]

@@ -114,7 +114,7 @@ mod tests {
         Instant::START + Duration::from_millis(millis)
     }
 
-    fn told(received: u32) -> Report {
+    fn reported(received: u32) -> Report {
         Report { received, hears: true, holds: false }
     }
 
@@ -128,16 +128,19 @@ mod tests {
 
     #[test]
     fn bytes_that_do_not_arrive_for_eight_seconds_end_the_stream() {
-        assert_eq!(dead_at((1..60).map(|second| (second, 100, told(90)))), Some(9));
-        assert_eq!(dead_at((1..60).map(|second| (second, 100, told(100)))), None);
+        assert_eq!(dead_at((1..60).map(|second| (second, 100, reported(90)))), Some(9));
+        assert_eq!(dead_at((1..60).map(|second| (second, 100, reported(100)))), None);
     }
 
     #[test]
     fn any_progress_is_a_sign_of_life() {
         // One byte a second of a megabyte.
-        assert_eq!(dead_at((1..600).map(|second| (second, 1 << 20, told(second as u32)))), None);
+        assert_eq!(dead_at((1..600).map(|second| (second, 1 << 20, reported(second as u32)))), None);
         // All has arrived at times, and something new was written just before each report.
-        assert_eq!(dead_at((1..600).map(|second| (second, 10 * second as u32, told(10 * second as u32 - 1)))), None);
+        assert_eq!(
+            dead_at((1..600).map(|second| (second, 10 * second as u32, reported(10 * second as u32 - 1)))),
+            None
+        );
     }
 
     #[test]
@@ -146,7 +149,7 @@ mod tests {
             let mut delivery = Delivery::new(at(0));
             let dead = (1..90).find(|second| {
                 let now = at(second * 1_000);
-                delivery.reported(now, 100, told(90), now, lossy).is_some()
+                delivery.reported(now, 100, reported(90), now, lossy).is_some()
             });
             assert_eq!(dead, Some(expected));
         }
@@ -154,26 +157,26 @@ mod tests {
 
     #[test]
     fn a_peer_that_holds_reading_back_is_slow() {
-        let held = Report { holds: true, ..told(90) };
+        let held = Report { holds: true, ..reported(90) };
         assert_eq!(dead_at((1..600).map(|second| (second, 100, held))), None);
         // Its time begins when it reads again.
-        let later = (1..60).map(|second| (second, 100, if second < 30 { held } else { told(90) }));
+        let later = (1..60).map(|second| (second, 100, if second < 30 { held } else { reported(90) }));
         assert_eq!(dead_at(later), Some(37));
     }
 
     #[test]
     fn one_report_after_a_suspension_ends_nothing() {
         let mut delivery = Delivery::new(at(0));
-        assert_eq!(delivery.reported(at(1_000), 100, told(90), at(0), false), None);
-        assert_eq!(delivery.reported(at(3_600_000), 100, told(90), at(0), false), None);
-        assert_eq!(delivery.reported(at(3_600_100), 100, told(100), at(0), false), None);
+        assert_eq!(delivery.reported(at(1_000), 100, reported(90), at(0), false), None);
+        assert_eq!(delivery.reported(at(3_600_000), 100, reported(90), at(0), false), None);
+        assert_eq!(delivery.reported(at(3_600_100), 100, reported(100), at(0), false), None);
     }
 
     #[test]
     fn counts_may_wrap() {
         let sent = |second: u64| u32::MAX.wrapping_sub(50).wrapping_add(10 * second as u32);
-        assert_eq!(dead_at((1..60).map(|second| (second, sent(second), told(sent(second).wrapping_sub(5))))), None);
-        assert_eq!(dead_at((1..60).map(|second| (second, sent(9), told(sent(8))))), Some(9));
+        assert_eq!(dead_at((1..60).map(|second| (second, sent(second), reported(sent(second).wrapping_sub(5))))), None);
+        assert_eq!(dead_at((1..60).map(|second| (second, sent(9), reported(sent(8))))), Some(9));
     }
 
     #[test]
@@ -183,7 +186,7 @@ mod tests {
         for _ in 0..10 {
             let now = delivery.deadline();
             let probe = delivery.poll(now, 7);
-            delivery.reported(now, 7, told(7), now, false);
+            delivery.reported(now, 7, reported(7), now, false);
             assert!(delivery.deadline() <= now + PROBE + SLACK);
             probes += u32::from(probe.write);
         }

@@ -132,9 +132,9 @@ pub(super) fn offer<C: Seal>(
 
 fn item<C: Seal>(link: &Link<Boxed, C>, inbound: Inbound, lent: &[u8]) -> Item {
     match inbound {
-        Inbound::Message(priority, place) => Item::Message(priority, link.view(place, lent).to_vec()),
-        Inbound::Session(place) => Item::Session(link.view(place, lent).to_vec()),
-        Inbound::Hello(place) => Item::Hello(link.view(place, lent).to_vec()),
+        Inbound::Message(priority, span) => Item::Message(priority, link.view(span, lent).to_vec()),
+        Inbound::Session(span) => Item::Session(link.view(span, lent).to_vec()),
+        Inbound::Hello(span) => Item::Hello(link.view(span, lent).to_vec()),
         Inbound::Ping => Item::Ping,
         _ => Item::Other,
     }

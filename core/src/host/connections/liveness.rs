@@ -234,10 +234,10 @@ mod tests {
 
     #[test]
     fn a_peer_that_tells_no_end_of_a_pause_is_lost_all_the_same() {
-        let told = Duration::from_millis(u64::from(u32::MAX));
+        let reported = Duration::from_millis(u64::from(u32::MAX));
         let start = Instant::from_micros(1_000_000);
         for datagrams_pass in [true, false] {
-            let mut liveness = Liveness::new(start, told);
+            let mut liveness = Liveness::new(start, reported);
             if datagrams_pass {
                 liveness.heard_datagram(start);
             }

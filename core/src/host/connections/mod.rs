@@ -31,7 +31,7 @@ use sender::Sender;
 #[repr(u32)]
 pub enum Inbound {
     /// The peer's hello.
-    Hello(Place),
+    Hello(Span),
     /// The peer refuses, with a code.
     Refuse(u8),
     /// The peer closes, with a code.
@@ -41,26 +41,26 @@ pub enum Inbound {
     /// An answer to a ping.
     Pong,
     /// A session body that came in the stream.
-    Session(Place),
+    Session(Span),
     /// A message of the proof.
-    Proof(Place),
+    Proof(Span),
     /// What the peer tells in its first frame under its keys.
-    Confirm(Place),
+    Confirm(Span),
     /// A whole message.
-    Message(Priority, Place),
+    Message(Priority, Span),
     /// A frame of a later version, which a live link passes over.
     Skipped,
 }
 
 /// Where bytes that arrived lie, until the next call of [`Link::receive`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct Span {
     store: Store,
     start: usize,
     end: usize,
 }
 
-impl Place {
+impl Span {
     /// All of a lent slice of `length` bytes.
     pub(crate) const fn lent(length: usize) -> Self {
         Self { store: Store::Lent, start: 0, end: length }
@@ -82,7 +82,7 @@ impl Place {
     }
 }
 
-/// Which bytes a [`Place`] is in.
+/// Which bytes a [`Span`] is in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Store {
     /// Those that the port lent.
@@ -179,9 +179,9 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.receiver.holds_anything()
     }
 
-    /// The bytes at `place`; `lent` is the slice that was lent to [`receive`](Self::receive).
-    pub fn view<'b>(&'b self, place: Place, lent: &'b [u8]) -> &'b [u8] {
-        view(&self.receiver, place, lent)
+    /// The bytes at `span`; `lent` is the slice that was lent to [`receive`](Self::receive).
+    pub fn view<'b>(&'b self, span: Span, lent: &'b [u8]) -> &'b [u8] {
+        view(&self.receiver, span, lent)
     }
 
     /// Accepts one message of `total` bytes, which `write` puts into the send buffer, and writes what the network takes
@@ -294,24 +294,24 @@ impl<S: Storage, C: Seal> Link<S, C> {
 }
 
 impl<S: Storage, C: Secure> Link<S, C> {
-    /// Gives the hello at `place` to the cipher.
-    pub(crate) fn introduce(&mut self, place: Place, lent: &[u8]) {
-        self.cipher.introduce(view(&self.receiver, place, lent));
+    /// Gives the hello at `span` to the cipher.
+    pub(crate) fn introduce(&mut self, span: Span, lent: &[u8]) {
+        self.cipher.introduce(view(&self.receiver, span, lent));
     }
 
-    /// Gives the message of the proof at `place` to the cipher; the answer to send, if there is one.
-    pub(crate) fn answer(&mut self, place: Place, lent: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
-        self.cipher.answer(view(&self.receiver, place, lent))
+    /// Gives the message of the proof at `span` to the cipher; the answer to send, if there is one.
+    pub(crate) fn answer(&mut self, span: Span, lent: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+        self.cipher.answer(view(&self.receiver, span, lent))
     }
 
-    /// Gives the confirmation at `place` to the cipher.
-    pub(crate) fn confirmed(&mut self, place: Place, lent: &[u8]) -> Result<(), CloseReason> {
-        self.cipher.confirmed(view(&self.receiver, place, lent))
+    /// Gives the confirmation at `span` to the cipher.
+    pub(crate) fn confirmed(&mut self, span: Span, lent: &[u8]) -> Result<(), CloseReason> {
+        self.cipher.confirmed(view(&self.receiver, span, lent))
     }
 }
 
-fn view<'b, S: Storage>(receiver: &'b Receiver<S>, place: Place, lent: &'b [u8]) -> &'b [u8] {
-    receiver.store(place.store, lent).get(place.start..place.end).unwrap_or(&[])
+fn view<'b, S: Storage>(receiver: &'b Receiver<S>, span: Span, lent: &'b [u8]) -> &'b [u8] {
+    receiver.store(span.store, lent).get(span.start..span.end).unwrap_or(&[])
 }
 
 #[cfg(test)]

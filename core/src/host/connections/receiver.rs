@@ -4,7 +4,7 @@
 //! for a message in several chunks, or for both: the frame then follows the assembled part of the message. So a link
 //! that waits for a buffer holds none, and links cannot deadlock.
 
-use super::{Inbound, Place, Received, Store};
+use super::{Inbound, Received, Span, Store};
 use crate::bytes;
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::CloseReason;
@@ -104,8 +104,8 @@ impl<S: Storage> Receiver<S> {
             // for each, and a frame that had waited for a buffer consumes no bytes, which would look as if nothing were
             // left to do.
             let progress = received.consumed > before;
-            let goes_on = if progress { received.consumed < lent.len() } else { self.partial.done };
-            if !goes_on || received.paused || received.inbound.is_some() {
+            let continues = if progress { received.consumed < lent.len() } else { self.partial.done };
+            if !continues || received.paused || received.inbound.is_some() {
                 return Ok(());
             }
         }
@@ -179,7 +179,7 @@ impl<S: Storage> Receiver<S> {
             return Ok(None);
         }
         self.partial.done = true;
-        let (store, start) = self.partial_place();
+        let (store, start) = self.partial_span();
         Ok(Some((store, start, length)))
     }
 
@@ -206,28 +206,28 @@ impl<S: Storage> Receiver<S> {
     }
 
     /// Where the partial frame begins.
-    fn partial_place(&self) -> (Store, usize) {
+    fn partial_span(&self) -> (Store, usize) {
         if self.partial.in_buffer { (Store::Buffer, self.assembled()) } else { (Store::Small, 0) }
     }
 
     fn partial_frame_length(&self) -> Option<usize> {
-        let (store, start) = self.partial_place();
+        let (store, start) = self.partial_span();
         let end = start.saturating_add(self.partial.length);
         frame::first_frame_length(self.store(store, &[]).get(start..end)?)
     }
 
     /// Copies from `bytes` until the partial frame has `length` bytes; returns how many were copied.
     fn collect(&mut self, bytes: &[u8], length: usize) -> usize {
-        let (_, start) = self.partial_place();
+        let (_, start) = self.partial_span();
         let store: &mut [u8] = match &mut self.buffer {
             Some(buffer) if self.partial.in_buffer => buffer,
             _ => &mut self.small,
         };
         let count = length.saturating_sub(self.partial.length).min(bytes.len());
         let from = start.saturating_add(self.partial.length);
-        let place = store.get_mut(from..from.saturating_add(count));
-        let (Some(place), Some(piece)) = (place, bytes.get(..count)) else { return 0 };
-        bytes::copy(piece, place);
+        let span = store.get_mut(from..from.saturating_add(count));
+        let (Some(span), Some(piece)) = (span, bytes.get(..count)) else { return 0 };
+        bytes::copy(piece, span);
         self.partial.length = self.partial.length.saturating_add(count);
         count
     }
@@ -236,10 +236,10 @@ impl<S: Storage> Receiver<S> {
     fn move_to_buffer(&mut self, length: usize) -> Result<(), CloseReason> {
         let start = self.assembled();
         let buffer = self.buffer.as_mut().ok_or(CloseReason::Protocol)?;
-        let place = buffer.get_mut(start..start.saturating_add(length)).ok_or(CloseReason::Oversize)?;
+        let span = buffer.get_mut(start..start.saturating_add(length)).ok_or(CloseReason::Oversize)?;
         let collected = self.small.get(..self.partial.length).unwrap_or(&[]);
-        if let Some(place) = place.get_mut(..collected.len()) {
-            bytes::copy(collected, place);
+        if let Some(span) = span.get_mut(..collected.len()) {
+            bytes::copy(collected, span);
         }
         self.partial.in_buffer = true;
         Ok(())
@@ -265,35 +265,35 @@ impl<S: Storage> Receiver<S> {
         let body = cipher.open(sealed)?;
         let end = body_at.saturating_add(body.len());
         let (content, tail) = Content::of(Frame::parse(body)?);
-        self.deliver(content, Place { store, start: end.saturating_sub(tail), end }, lent, received)
+        self.deliver(content, Span { store, start: end.saturating_sub(tail), end }, lent, received)
     }
 
     fn deliver(
         &mut self,
         content: Content,
-        place: Place,
+        span: Span,
         lent: &[u8],
         received: &mut Received,
     ) -> Result<(), CloseReason> {
         // Totals and lengths are the peer's word. Each arm compares them with the limits before a byte is copied.
         received.inbound = Some(match content {
-            Content::Hello => Inbound::Hello(place),
+            Content::Hello => Inbound::Hello(span),
             Content::Refuse(code) => Inbound::Refuse(code),
             Content::Close(code) => Inbound::Close(code),
             Content::Ping => Inbound::Ping,
             Content::Pong => Inbound::Pong,
-            Content::Session => Inbound::Session(place),
-            Content::Proof => Inbound::Proof(place),
-            Content::Confirm => Inbound::Confirm(place),
+            Content::Session => Inbound::Session(span),
+            Content::Proof => Inbound::Proof(span),
+            Content::Confirm => Inbound::Confirm(span),
             Content::Skipped => Inbound::Skipped,
             Content::Piece(Piece { priority, total: Some(total), last: true }) => {
-                self.check_whole(place, total as usize)?;
-                Inbound::Message(priority, place)
+                self.check_whole(span, total as usize)?;
+                Inbound::Message(priority, span)
             }
             Content::Piece(Piece { priority, total: Some(total), last: false }) => {
-                return self.begin(priority, total as usize, place, lent);
+                return self.begin(priority, total as usize, span, lent);
             }
-            Content::Piece(piece) => match self.go_on(&piece, place, lent)? {
+            Content::Piece(piece) => match self.go_on(&piece, span, lent)? {
                 Some(whole) => Inbound::Message(piece.priority, whole),
                 None => return Ok(()),
             },
@@ -301,57 +301,57 @@ impl<S: Storage> Receiver<S> {
         Ok(())
     }
 
-    fn check_whole(&self, place: Place, total: usize) -> Result<(), CloseReason> {
+    fn check_whole(&self, span: Span, total: usize) -> Result<(), CloseReason> {
         if total > self.message_limit {
             return Err(CloseReason::Oversize);
         }
-        if total == place.length() { Ok(()) } else { Err(CloseReason::Protocol) }
+        if total == span.length() { Ok(()) } else { Err(CloseReason::Protocol) }
     }
 
     /// The first of several chunks.
-    fn begin(&mut self, priority: Priority, total: usize, place: Place, lent: &[u8]) -> Result<(), CloseReason> {
+    fn begin(&mut self, priority: Priority, total: usize, span: Span, lent: &[u8]) -> Result<(), CloseReason> {
         let room = self.buffer.as_ref().map_or(0, |buffer| buffer.len());
-        if self.assembly.is_some() || place.length() >= total {
+        if self.assembly.is_some() || span.length() >= total {
             return Err(CloseReason::Protocol);
         }
         if total > self.message_limit || total > room {
             return Err(CloseReason::Oversize);
         }
-        self.keep(place, lent, 0)?;
-        self.assembly = Some(Assembly { length: place.length(), total, priority, done: false });
+        self.keep(span, lent, 0)?;
+        self.assembly = Some(Assembly { length: span.length(), total, priority, done: false });
         Ok(())
     }
 
     /// A chunk behind the first one; the whole message with the last one.
-    fn go_on(&mut self, piece: &Piece, place: Place, lent: &[u8]) -> Result<Option<Place>, CloseReason> {
+    fn go_on(&mut self, piece: &Piece, span: Span, lent: &[u8]) -> Result<Option<Span>, CloseReason> {
         let Some(Assembly { length, total, priority, .. }) = self.assembly else { return Err(CloseReason::Protocol) };
-        let end = length.saturating_add(place.length());
+        let end = length.saturating_add(span.length());
         // One message at a time and class: a chunk that does not continue it is no loss to be skipped, but another implementation's
         // mistake, and guessing on would mix two messages.
         if piece.priority != priority || end > total || piece.last != (end == total) {
             return Err(CloseReason::Protocol);
         }
-        self.keep(place, lent, length)?;
+        self.keep(span, lent, length)?;
         self.assembly = Some(Assembly { length: end, total, priority, done: piece.last });
-        let whole = Place { store: Store::Buffer, start: 0, end };
+        let whole = Span { store: Store::Buffer, start: 0, end };
         Ok(piece.last.then_some(whole))
     }
 
-    /// Copies the bytes at `place` into the buffer at `at`; if they are in that buffer already, `at` is not behind
+    /// Copies the bytes at `span` into the buffer at `at`; if they are in that buffer already, `at` is not behind
     /// them.
-    fn keep(&mut self, place: Place, lent: &[u8], at: usize) -> Result<(), CloseReason> {
+    fn keep(&mut self, span: Span, lent: &[u8], at: usize) -> Result<(), CloseReason> {
         let buffer = self.buffer.as_mut().ok_or(CloseReason::Protocol)?;
-        let from = match place.store {
+        let from = match span.store {
             Store::Lent => lent,
             Store::Small => &self.small,
             Store::Buffer => {
-                let rest = buffer.get_mut(at..place.end).ok_or(CloseReason::Protocol)?;
+                let rest = buffer.get_mut(at..span.end).ok_or(CloseReason::Protocol)?;
                 let end = rest.len();
-                bytes::move_down(rest, place.start.saturating_sub(at)..end);
+                bytes::move_down(rest, span.start.saturating_sub(at)..end);
                 return Ok(());
             }
         };
-        let from = from.get(place.start..place.end).ok_or(CloseReason::Protocol)?;
+        let from = from.get(span.start..span.end).ok_or(CloseReason::Protocol)?;
         let to = buffer.get_mut(at..at.saturating_add(from.len())).ok_or(CloseReason::Oversize)?;
         bytes::copy(from, to);
         Ok(())

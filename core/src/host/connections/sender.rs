@@ -172,8 +172,8 @@ impl<S: Storage> Sender<S> {
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> bool {
-        let place = self.urgent.append(self.chunking.framed_length(total));
-        let writer = place.and_then(|place| ChunkWriter::new(place, self.chunking, priority, total));
+        let span = self.urgent.append(self.chunking.framed_length(total));
+        let writer = span.and_then(|span| ChunkWriter::new(span, self.chunking, priority, total));
         writer.map(|mut writer| write(&mut writer)).is_some()
     }
 
@@ -197,8 +197,8 @@ impl<S: Storage> Sender<S> {
         if length == 0 || end > URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE) {
             return false;
         }
-        let place = self.urgent.append(length);
-        place.map(|place| bytes::copy(scratch.get(..length).unwrap_or(&[]), place)).is_some()
+        let span = self.urgent.append(length);
+        span.map(|span| bytes::copy(scratch.get(..length).unwrap_or(&[]), span)).is_some()
     }
 
     /// Whether all of these frames that are no chunks would be accepted now.
@@ -320,8 +320,8 @@ impl<S: Storage> SendQueue<S> {
     /// A queue that holds the frames of a short message, which fit into any buffer.
     fn of(buffer: Buffer<S>, frames: &[u8]) -> Self {
         let mut queue = Self::new(buffer);
-        if let Some(place) = queue.buffer.get_mut(..frames.len()) {
-            bytes::copy(frames, place);
+        if let Some(span) = queue.buffer.get_mut(..frames.len()) {
+            bytes::copy(frames, span);
             queue.end = frames.len();
         }
         queue
@@ -357,8 +357,8 @@ impl<S: Storage> SendQueue<S> {
             self.close_gap();
         }
         let end = self.end.saturating_add(framed);
-        let place = self.buffer.get_mut(self.end..end).unwrap_or(&mut []);
-        let mut writer = ChunkWriter::new(place, chunking, priority, total).ok_or(Error::Full(Limit::SendQueue))?;
+        let span = self.buffer.get_mut(self.end..end).unwrap_or(&mut []);
+        let mut writer = ChunkWriter::new(span, chunking, priority, total).ok_or(Error::Full(Limit::SendQueue))?;
         write(&mut writer);
         self.end = end;
         Ok(())

@@ -26,9 +26,9 @@ impl<const BYTES: usize> Urgent<BYTES> {
     /// `count` more bytes, to be written now; `None` if fewer are free.
     pub(super) fn append(&mut self, count: usize) -> Option<&mut [u8]> {
         let end = self.filled.checked_add(count)?;
-        let place = self.bytes.get_mut(self.filled..end)?;
+        let span = self.bytes.get_mut(self.filled..end)?;
         self.filled = end;
-        Some(place)
+        Some(span)
     }
 
     /// What can be written: the sealed frames.

@@ -65,11 +65,11 @@ impl<P: Port> Session<P> {
             }
             read_arguments(function.signature, block, arguments).map(|()| function.attributes)
         })?;
-        let begun = read.and_then(|attributes| self.begin(cx, head, attributes));
-        if let Err(error) = begun {
+        let started = read.and_then(|attributes| self.begin(cx, head, attributes));
+        if let Err(error) = started {
             self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error);
         }
-        Some(begun)
+        Some(started)
     }
 
     /// Whether [`next_call`](Self::next_call) would look at a call.
@@ -285,7 +285,7 @@ impl<P: Port> Session<P> {
             self.link.counters.count(LinkCounter::RepliesDropped);
         }
         if error == Error::StaleFunction {
-            self.publishing.tell_again(slot);
+            self.publishing.notify_again(slot);
             self.pump(cx);
         }
     }

@@ -63,7 +63,7 @@ impl<P: Port> Session<P> {
             return None;
         }
         self.joined = true;
-        if self.is_told(cx) {
+        if self.is_advertised(cx) {
             self.pump(cx);
         } else {
             self.publish(cx);

@@ -13,7 +13,7 @@ use crate::distribution::message::{
 };
 use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
-use crate::host::connections::{LinkCounter, Place};
+use crate::host::connections::{LinkCounter, Span};
 use crate::host::frame::Frame;
 use crate::services::calls::{CallHead, Cancelled, Ticket};
 use crate::services::requests::{CallId, Pending};
@@ -25,7 +25,7 @@ pub(super) struct Details {
     /// Calls that run were given up, and the port has yet to be told.
     cancelled: bool,
     /// Those of the failure that came last.
-    failure: Option<Noted>,
+    failure: Option<Recorded>,
     /// When progress may be sent again.
     progress_due: Instant,
     /// The port has progress that was not due.
@@ -33,8 +33,8 @@ pub(super) struct Details {
 }
 
 /// Where the details of a failure lie.
-struct Noted {
-    message: Place,
+struct Recorded {
+    message: Span,
     step: u32,
     code: u16,
     /// The function, where the call waited for its reply.
@@ -67,8 +67,8 @@ impl<P: Port> Session<P> {
     /// Text and values of the failure that an [`Event::Reply`] or [`Event::Failed`] has just told; `None` where it has none.
     /// Values come with replies alone. `lent` is what was lent to the [`receive`](Self::receive) that returned the event.
     pub fn failure(&mut self, lent: &[u8]) -> Option<Failure> {
-        let Noted { message, code, function, .. } =
-            self.details.failure.take().filter(|noted| noted.step == self.step)?;
+        let Recorded { message, code, function, .. } =
+            self.details.failure.take().filter(|recorded| recorded.step == self.step)?;
         let FailureDetails { text, values } = FailureDetails::of(self.link.view(message, lent))?;
         let mut failure = Failure::new(code, text);
         let mut is_whole = !failure.is_cut();
@@ -85,7 +85,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Before the message is dealt with, since the call is forgotten then.
-    pub(super) fn note_failure(&mut self, message: Place, lent: &[u8]) {
+    pub(super) fn note_failure(&mut self, message: Span, lent: &[u8]) {
         self.details.failure = None;
         let bytes = self.link.view(message, lent);
         if FailureDetails::of(bytes).is_none() {
@@ -95,7 +95,7 @@ impl<P: Port> Session<P> {
         let pending = self.requests.waiting_for(CallId(u32::from_le_bytes([a, b, c, d])));
         let function = pending.map(|pending| (pending.slot, pending.generation));
         let code = u16::from_le_bytes([low, high]);
-        self.details.failure = Some(Noted { message, step: self.step, code, function });
+        self.details.failure = Some(Recorded { message, step: self.step, code, function });
     }
 
     /// Answers with an error. What exceeds a limit is left out, the values first; so is all but the code where there is no
@@ -198,20 +198,21 @@ impl<P: Port> Session<P> {
         Ok(ReplyBlock { specs: block.signature.progress(), ..block })
     }
 
-    pub(super) fn progress_arrived(&mut self, id: CallId, block: Place, lent: &[u8]) -> Option<Event> {
+    pub(super) fn progress_arrived(&mut self, id: CallId, block: Span, lent: &[u8]) -> Option<Event> {
         let pending = self.requests.waiting_for(id);
-        let told = pending.map(|Pending { slot, generation, .. }| Results {
+        let reported = pending.map(|Pending { slot, generation, .. }| Results {
             slot: *slot,
             generation: *generation,
             block,
             step: self.step,
         });
-        let is_known = told.as_ref().and_then(|told| self.progress_values(told, lent).ok()).is_some_and(|values| {
-            let declares = values.specs.clone().next().is_some();
-            declares && block::check(values.specs, values.bytes).is_ok()
-        });
+        let is_known =
+            reported.as_ref().and_then(|reported| self.progress_values(reported, lent).ok()).is_some_and(|values| {
+                let declares = values.specs.clone().next().is_some();
+                declares && block::check(values.specs, values.bytes).is_ok()
+            });
         self.link.counters.count(if is_known { LinkCounter::ProgressReceived } else { LinkCounter::ProgressDropped });
-        told.filter(|_| is_known).map(|told| Event::Progress(id, told))
+        reported.filter(|_| is_known).map(|reported| Event::Progress(id, reported))
     }
 
     // --- cancellation

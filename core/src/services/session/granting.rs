@@ -84,7 +84,7 @@ impl<P: Port> Session<P> {
         match known.and_then(|index| self.granted.get_mut(index)) {
             Some(known) => {
                 let replaced = core::mem::replace(known, granted).call;
-                self.tell_end(cx, replaced, LeaseEnd::Replaced);
+                self.notify_end(cx, replaced, LeaseEnd::Replaced);
             }
             None => self.granted.push(granted).map_err(|_| Error::Full(Limit::Leases))?,
         }
@@ -98,7 +98,7 @@ impl<P: Port> Session<P> {
             // A call that is on its way or waits for its turn has no lease yet.
             let Renewal { call, class, .. } = *renewal;
             if self.calls.has_arrived(class, call) && !self.calls.is_waiting(class, call) {
-                self.tell_end(cx, call, LeaseEnd::Expired);
+                self.notify_end(cx, call, LeaseEnd::Expired);
             }
             return;
         };
@@ -141,7 +141,7 @@ impl<P: Port> Session<P> {
         let service = granted.and_then(|granted| service_of(cx, granted.slot, granted.generation));
         let is_finished = service.is_some_and(|service| service.finish_lease(cx.now, order));
         if is_finished && let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
-            self.tell_end(cx, granted.call, LeaseEnd::Finished);
+            self.notify_end(cx, granted.call, LeaseEnd::Finished);
         }
         is_finished
     }
@@ -293,17 +293,17 @@ impl<P: Port> Session<P> {
             if expire_granted(cx, &granted, why) {
                 self.publishing.actuators_due |= why == LeaseEnd::Stopped;
                 self.link.counters.count(LinkCounter::LeasesExpired);
-                self.tell_end(cx, granted.call, why);
+                self.notify_end(cx, granted.call, why);
                 return Some(granted.slot);
             }
             let is_gone = service_of(cx, granted.slot, granted.generation).is_none();
-            self.tell_end(cx, granted.call, if is_gone { LeaseEnd::Expired } else { LeaseEnd::Replaced });
+            self.notify_end(cx, granted.call, if is_gone { LeaseEnd::Expired } else { LeaseEnd::Replaced });
         }
         self.timers.lease = self.granted.iter().map(|granted| granted.end).min().unwrap_or(Instant::FAR_FUTURE);
         None
     }
 
-    fn tell_end(&mut self, cx: &mut Context<'_, P>, call: u32, why: LeaseEnd) {
+    fn notify_end(&mut self, cx: &mut Context<'_, P>, call: u32, why: LeaseEnd) {
         if !self.send_control(cx, &Control::LeaseEnded { call, why }) {
             let _ = self.ends.push((call, why));
         }

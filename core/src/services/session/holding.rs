@@ -111,7 +111,7 @@ impl<P: Port> Session<P> {
     /// Renews what is due. What the peer has not answered for the length of a lease is not renewed blindly: it is released,
     /// and returned, one at a time.
     pub(super) fn renew_leases(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        let (stamp, since) = self.clock.tell(cx.now);
+        let (stamp, since) = self.clock.stamp(cx.now);
         let now = cx.now;
         for index in 0..self.held.len() {
             let due = self.held.get_mut(index).filter(|held| held.next <= now);

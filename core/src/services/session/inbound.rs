@@ -2,7 +2,7 @@
 
 use super::answering::{is_emergency, read_arguments};
 use super::permitting::may_publish;
-use super::publishing::Told;
+use super::publishing::Advertised;
 use super::timing::sent_at_earliest;
 use super::{Event, Phase, Session, close_reason};
 use crate::config::{EMERGENCY_BYTES, Mode, Priority};
@@ -13,7 +13,7 @@ use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeade
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
-use crate::host::connections::{Inbound, LinkCounter, Place};
+use crate::host::connections::{Inbound, LinkCounter, Span};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
@@ -47,7 +47,7 @@ pub struct Receipt {
 pub struct Results {
     pub(super) slot: Slot,
     pub(super) generation: Generation,
-    pub(super) block: Place,
+    pub(super) block: Span,
     /// Refuses those of an earlier [`receive`](Session::receive), whose place may hold other bytes by now.
     pub(super) step: u32,
 }
@@ -169,7 +169,7 @@ impl<P: Port> Session<P> {
         };
         self.link.counters.count(LinkCounter::DatagramsReceived);
         self.datagram_opened(cx.now);
-        self.session_body(cx, Place::lent(body.len()), body, Way::Datagram)
+        self.session_body(cx, Span::lent(body.len()), body, Way::Datagram)
     }
 
     /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
@@ -219,13 +219,13 @@ impl<P: Port> Session<P> {
                 self.end(close_reason(code));
                 None
             }
-            (Inbound::Hello(place), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, place, lent),
-            (Inbound::Proof(place), Phase::Proving { .. }) => self.proof_arrived(cx, place, lent),
-            (Inbound::Confirm(place), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
-                self.confirmation_arrived(cx, place, lent)
+            (Inbound::Hello(span), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, span, lent),
+            (Inbound::Proof(span), Phase::Proving { .. }) => self.proof_arrived(cx, span, lent),
+            (Inbound::Confirm(span), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
+                self.confirmation_arrived(cx, span, lent)
             }
-            (Inbound::Proof(place), Phase::Live) => self.proof_on_live(cx, place, lent),
-            (Inbound::Confirm(place), Phase::Live) => self.confirmation_on_live(cx, place, lent),
+            (Inbound::Proof(span), Phase::Live) => self.proof_on_live(cx, span, lent),
+            (Inbound::Confirm(span), Phase::Live) => self.confirmation_on_live(cx, span, lent),
             // Answered in the stream as well: only a reply that has passed the same queue shows that the stream moves.
             (Inbound::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
@@ -233,9 +233,9 @@ impl<P: Port> Session<P> {
                 None
             }
             (Inbound::Pong, Phase::Live) => self.pong_arrived(cx),
-            (Inbound::Session(place), Phase::Live) => self.session_body(cx, place, lent, Way::Stream),
-            (Inbound::Message(priority, place), Phase::Live) => {
-                self.message_arrived(cx, priority, place, lent, arguments)
+            (Inbound::Session(span), Phase::Live) => self.session_body(cx, span, lent, Way::Stream),
+            (Inbound::Message(priority, span), Phase::Live) => {
+                self.message_arrived(cx, priority, span, lent, arguments)
             }
             (Inbound::Skipped, Phase::Live) => {
                 self.link.counters.count(LinkCounter::ItemsSkipped);
@@ -249,8 +249,8 @@ impl<P: Port> Session<P> {
     }
 
     /// Does what a session body says, which shows life if it can be read.
-    fn session_body(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8], way: Way) -> Option<Event> {
-        let body = SessionBody::decode(self.link.view(place, lent));
+    fn session_body(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8], way: Way) -> Option<Event> {
+        let body = SessionBody::decode(self.link.view(span, lent));
         if body.is_some() {
             match way {
                 Way::Stream => self.liveness.heard(cx.now),
@@ -290,7 +290,7 @@ impl<P: Port> Session<P> {
             Some(SessionBody::Message(priority, message)) => {
                 match (Priority::from_wire(priority), Message::decode(message)) {
                     (Some(priority), Some(Message::Request(header, block))) => {
-                        let block = place.last(block.len());
+                        let block = span.last(block.len());
                         self.request_arrived(cx, priority, &header, block, lent, None)
                     }
                     _ => self.unreadable_datagram(),
@@ -326,19 +326,19 @@ impl<P: Port> Session<P> {
         &mut self,
         cx: &mut Context<'_, P>,
         priority: Priority,
-        place: Place,
+        span: Span,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
         #[cfg(feature = "details")]
-        self.note_failure(place, lent);
-        match Message::decode(self.link.view(place, lent)) {
+        self.note_failure(span, lent);
+        match Message::decode(self.link.view(span, lent)) {
             Some(Message::Request(header, block)) => {
-                let block = place.last(block.len());
+                let block = span.last(block.len());
                 self.request_arrived(cx, priority, &header, block, lent, arguments)
             }
             Some(Message::Reply(id, result)) => {
-                let block = result.map(|block| place.last(block.len()));
+                let block = result.map(|block| span.last(block.len()));
                 self.reply_arrived(cx, CallId(id), block)
             }
             Some(Message::Failure(id, error)) => {
@@ -347,16 +347,16 @@ impl<P: Port> Session<P> {
             }
             #[cfg(feature = "streams")]
             Some(Message::Sample(header, block)) => {
-                let block = place.last(block.len());
+                let block = span.last(block.len());
                 self.sample_arrived(cx.now, &header, block, lent)
             }
             #[cfg(feature = "details")]
             Some(Message::Progress(id, block)) => {
-                let block = place.last(block.len());
+                let block = span.last(block.len());
                 self.progress_arrived(CallId(id), block, lent)
             }
             Some(Message::Control(items)) => {
-                let items = place.last(items.len());
+                let items = span.last(items.len());
                 self.controls_arrived(cx, items, lent)
             }
             None => {
@@ -367,7 +367,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Does what the items of a control message say, in their order. One of which a program is told is the last.
-    fn controls_arrived(&mut self, cx: &mut Context<'_, P>, items: Place, lent: &[u8]) -> Option<Event> {
+    fn controls_arrived(&mut self, cx: &mut Context<'_, P>, items: Span, lent: &[u8]) -> Option<Event> {
         let (mut left, mut event) = (self.link.view(items, lent).len(), None);
         while left > 0 && event.is_none() && self.phase == Phase::Live {
             (left, event) = self.control_arrived(cx, items.last(left), lent);
@@ -378,7 +378,7 @@ impl<P: Port> Session<P> {
         event
     }
 
-    fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Place, Error>) -> Option<Event> {
+    fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Span, Error>) -> Option<Event> {
         let Some(pending) = self.requests.close(id) else {
             // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
             self.link.counters.count(LinkCounter::RepliesLate);
@@ -399,7 +399,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Does what the first item says; returns how many bytes of items are left.
-    fn control_arrived(&mut self, cx: &mut Context<'_, P>, items: Place, lent: &[u8]) -> (usize, Option<Event>) {
+    fn control_arrived(&mut self, cx: &mut Context<'_, P>, items: Span, lent: &[u8]) -> (usize, Option<Event>) {
         let mut items = Items::new(self.link.view(items, lent));
         let Some(item) = items.next() else { return (0, None) };
         let left = items.rest().len();
@@ -486,7 +486,7 @@ impl<P: Port> Session<P> {
         cx: &mut Context<'_, P>,
         priority: Priority,
         header: &RequestHeader,
-        block: Place,
+        block: Span,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
@@ -542,7 +542,8 @@ impl<P: Port> Session<P> {
     ) -> Result<(CallHead, Function<'f, dyn Service>), Error> {
         // First of all what a stop stops, however late it is and whatever its handler has to wait for, or is refused for.
         let stops = function.as_ref().ok().filter(|function| function.attributes.stop);
-        if let Some(function) = stops.filter(|_| self.publishing.told(header.slot, header.generation) == Told::Now)
+        if let Some(function) =
+            stops.filter(|_| self.publishing.advertised(header.slot, header.generation) == Advertised::Now)
             && self.permit_call(cx, function, priority, false).is_ok()
         {
             self.stop_orders(cx, header);
@@ -569,10 +570,10 @@ impl<P: Port> Session<P> {
             return Err(Error::Expired);
         }
         // By what this peer was told, not by what the unit offers: a function that was shown to another node stays unknown here.
-        let function = match self.publishing.told(header.slot, header.generation) {
-            Told::Never => return Err(Error::UnknownFunction),
-            Told::Earlier => return Err(Error::StaleFunction),
-            Told::Now => function?,
+        let function = match self.publishing.advertised(header.slot, header.generation) {
+            Advertised::Never => return Err(Error::UnknownFunction),
+            Advertised::Earlier => return Err(Error::StaleFunction),
+            Advertised::Now => function?,
         };
         #[cfg(feature = "streams")]
         if function.attributes.stream.is_some() {

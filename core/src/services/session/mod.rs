@@ -217,7 +217,7 @@ pub struct Session<P: Port> {
     nonce: u64,
     fleet: Fleet,
     /// The pause between keep-alives, in milliseconds, that this unit's hello has named.
-    told_keep_alive: u32,
+    reported_keep_alive: u32,
     constraints: Constraints,
     remote: Option<Remote<P::Endpoint>>,
     peer_address: P::Endpoint,
@@ -274,7 +274,7 @@ impl<P: Port> Session<P> {
             joined: false,
             nonce,
             fleet: Fleet(0),
-            told_keep_alive: 0,
+            reported_keep_alive: 0,
             constraints,
             remote: None,
             peer_address: address,
@@ -536,20 +536,21 @@ impl<P: Port> Session<P> {
     pub fn set_constraints(&mut self, cx: &mut Context<'_, P>, constraints: Constraints) {
         self.constraints = constraints;
         self.link.set_message_limit(message_limit(&constraints));
-        self.publishing.tell_limits();
+        self.publishing.notify_limits();
         self.pump(cx);
     }
 
     fn send_hello(&mut self, cx: &mut Context<'_, P>) {
         let (mut bytes, mut length) = ([0; HELLO_BYTES], 0);
         let (now, mode, link) = (cx.now, self.mode(), self.link.id());
-        let (nonce, remote, fleet, told) = (self.nonce, &self.remote, &mut self.fleet, &mut self.told_keep_alive);
+        let (nonce, remote, fleet, reported) =
+            (self.nonce, &self.remote, &mut self.fleet, &mut self.reported_keep_alive);
         cx.hub.enter(&mut |hub| {
             let mut hello = hub.node.hello(now, link, nonce);
             if let Some(remote) = remote {
                 hello.obeyed = hub.node.obeyed_report(now, &remote.hello.identity);
             }
-            (*fleet, *told) = (hello.fleet, hello.keep_alive);
+            (*fleet, *reported) = (hello.fleet, hello.keep_alive);
             length = hello.encode(mode, &mut bytes).unwrap_or(0);
         });
         let bytes = bytes.get(..length).unwrap_or(&[]);

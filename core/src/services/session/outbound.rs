@@ -184,7 +184,7 @@ impl<P: Port> Session<P> {
         if priority != Priority::Emergency && !is_urgent {
             self.requests.gate(cx.now, self.interval())?;
         }
-        let (stamp, since) = self.clock.tell(cx.now);
+        let (stamp, since) = self.clock.stamp(cx.now);
         let remaining = options.timeout.unwrap_or(self.constraints.request_timeout);
         #[cfg(feature = "details")]
         let wants_progress = wants_reply && options.progress && function.signature.progress().next().is_some();

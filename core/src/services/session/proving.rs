@@ -7,7 +7,7 @@ use super::{Event, Phase, Remote, Session};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode, VERSIONS};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
-use crate::host::connections::{LinkCounter, Liveness, Place};
+use crate::host::connections::{LinkCounter, Liveness, Span};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::Secure;
@@ -35,11 +35,11 @@ impl<P: Port> Session<P> {
         &mut self,
         cx: &mut Context<'_, P>,
         until: Instant,
-        place: Place,
+        span: Span,
         lent: &[u8],
     ) -> Option<Event> {
         let mode = self.mode();
-        let hello = match Hello::decode(self.link.view(place, lent), mode) {
+        let hello = match Hello::decode(self.link.view(span, lent), mode) {
             Ok(hello) => hello,
             Err(error) => {
                 self.link.counters.count(LinkCounter::FramesRefused);
@@ -51,7 +51,7 @@ impl<P: Port> Session<P> {
                 return None;
             }
         };
-        self.link.introduce(place, lent);
+        self.link.introduce(span, lent);
         self.link.counters.add(LinkCounter::ItemsSkipped, hello.skipped.into());
         let datagrams = self.peer_address.at_port(hello.udp_port);
         let version = VERSIONS.common(hello.versions).unwrap_or(VERSIONS.last);
@@ -73,8 +73,8 @@ impl<P: Port> Session<P> {
     /// The peer's message of the proof. To the end that dialled it proves the peer, since it covers this link's fresh nonce:
     /// that end answers, confirms that it has the keys, and says what it has published. The peer reads the list once it has
     /// decided to take this unit.
-    pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
-        match self.link.answer(place, lent) {
+    pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
+        match self.link.answer(span, lent) {
             Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
             Err(_) => self.fail(cx),
         }
@@ -86,8 +86,8 @@ impl<P: Port> Session<P> {
     }
 
     /// The peer's first sealed frame has opened: it is who it says it is.
-    pub(super) fn confirmation_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
-        if self.link.confirmed(place, lent).is_err() {
+    pub(super) fn confirmation_arrived(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
+        if self.link.confirmed(span, lent).is_err() {
             self.fail(cx);
             return None;
         }

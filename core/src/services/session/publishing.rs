@@ -19,7 +19,7 @@ use crate::time::{Duration, Instant};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Publication {
     wanted: Option<Generation>,
-    told: Option<Generation>,
+    advertised: Option<Generation>,
     /// It has been visible at some time, so a call of it is stale rather than unknown.
     ever: bool,
     /// The peer has released its requests up to this one.
@@ -35,7 +35,7 @@ pub struct Publication {
 
 /// Whether a peer may call a function.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Told {
+pub(super) enum Advertised {
     Now,
     Earlier,
     Never,
@@ -58,7 +58,7 @@ pub(super) struct Publishing<S: Storage> {
     /// The peer may have been told another state of what is moved here.
     pub(super) actuators_due: bool,
     /// What the peer was told, as a sum of all [`Lease::changes`], each at places of its own.
-    actuators_told: u32,
+    actuators_reported: u32,
     pub(super) refusals: Refusals,
 }
 
@@ -95,7 +95,7 @@ impl<S: Storage> Publishing<S> {
             acknowledgement_due: None,
             limits_due: false,
             actuators_due: false,
-            actuators_told: 0,
+            actuators_reported: 0,
             refusals: Refusals { count: 0, next: Instant::START },
         }
     }
@@ -121,11 +121,11 @@ impl<S: Storage> Publishing<S> {
         table
     }
 
-    pub(super) fn told(&self, slot: Slot, generation: Generation) -> Told {
+    pub(super) fn advertised(&self, slot: Slot, generation: Generation) -> Advertised {
         match self.table.get(usize::from(slot.0)) {
-            Some(publication) if publication.wanted == Some(generation) => Told::Now,
-            Some(publication) if publication.ever => Told::Earlier,
-            _ => Told::Never,
+            Some(publication) if publication.wanted == Some(generation) => Advertised::Now,
+            Some(publication) if publication.ever => Advertised::Earlier,
+            _ => Advertised::Never,
         }
     }
 
@@ -199,14 +199,14 @@ impl<S: Storage> Publishing<S> {
         self.acknowledged = self.acknowledged.max(serial);
     }
 
-    pub(super) fn tell_limits(&mut self) {
+    pub(super) fn notify_limits(&mut self) {
         self.limits_due = true;
     }
 
     /// The peer has old news of a function.
-    pub(super) fn tell_again(&mut self, slot: Slot) {
+    pub(super) fn notify_again(&mut self, slot: Slot) {
         if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
-            publication.told = None;
+            publication.advertised = None;
             self.dirty = true;
             self.end_due = true;
         }
@@ -238,7 +238,7 @@ impl<P: Port> Session<P> {
 
     /// Tells the peer what it is still to be told, as far as there is room.
     pub(super) fn pump(&mut self, cx: &mut Context<'_, P>) {
-        if !self.may_tell() {
+        if !self.may_advertise() {
             return;
         }
         self.send_ends(cx);
@@ -268,7 +268,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Whether the peer may be told what is published: it has proven itself to this end, which dialled, or the link is live.
-    fn may_tell(&mut self) -> bool {
+    fn may_advertise(&mut self) -> bool {
         match self.phase {
             Phase::Live => true,
             Phase::Proving { .. } => self.dialed && self.link.cipher().is_sealing(),
@@ -277,17 +277,17 @@ impl<P: Port> Session<P> {
     }
 
     /// Whether the peer was told of everything up to the unit's newest publication, or will be as soon as there is room.
-    pub(super) fn is_told(&self, cx: &mut Context<'_, P>) -> bool {
+    pub(super) fn is_advertised(&self, cx: &mut Context<'_, P>) -> bool {
         self.publishing.serial != 0 && !self.is_behind(cx)
     }
 
     /// Whether something waits for room.
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
-        let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty() && !self.obedience.has_news;
+        let advertised = publishing.acknowledgement_due.is_none() && self.ends.is_empty() && !self.obedience.has_news;
         #[cfg(feature = "streams")]
-        let told = told && !self.streaming.has_news();
-        publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !told
+        let advertised = advertised && !self.streaming.has_news();
+        publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !advertised
     }
 
     /// Tells the state of what each function moves, if it has changed; `false` when there was no more room.
@@ -296,13 +296,16 @@ impl<P: Port> Session<P> {
         let moves = |slot| functions.function(slot).filter(|function| function.attributes.lease.is_some());
         let leases = self.publishing.all_slots().filter_map(|slot| moves(slot)?.handler.lease());
         let changes = leases.fold(0, |sum: u32, lease| sum.rotate_left(7).wrapping_add(lease.changes()));
-        if changes == self.publishing.actuators_told {
+        if changes == self.publishing.actuators_reported {
             return true;
         }
         let peer = self.identity().map_or(0, Identity::id);
         for slot in self.publishing.all_slots() {
-            let told = self.publishing.table.get(usize::from(slot.0)).and_then(|publication| publication.told);
-            let Some(function) = moves(slot).filter(|function| told == Some(function.generation)) else { continue };
+            let advertised =
+                self.publishing.table.get(usize::from(slot.0)).and_then(|publication| publication.advertised);
+            let Some(function) = moves(slot).filter(|function| advertised == Some(function.generation)) else {
+                continue;
+            };
             let ActuatorState { latch, last } = function.handler.state();
             // A link's nonce and a claim are their own caller's alone.
             let last = last.map(|last| if last.holder == peer { last } else { last.of_another() });
@@ -310,7 +313,7 @@ impl<P: Port> Session<P> {
                 return false;
             }
         }
-        self.publishing.actuators_told = changes;
+        self.publishing.actuators_reported = changes;
         true
     }
 
@@ -325,7 +328,7 @@ impl<P: Port> Session<P> {
             let Some(&publication) = self.publishing.table.get(index) else { break };
             let slot = Slot(index as u16);
             let wanted = publication.wanted.filter(|_| self.may_see(cx, slot));
-            if wanted == publication.told {
+            if wanted == publication.advertised {
                 continue;
             }
             let function = wanted.and_then(|generation| cx.functions.lookup(slot, generation).ok());
@@ -351,11 +354,11 @@ impl<P: Port> Session<P> {
                 return false;
             }
             if function.is_some_and(|function| function.attributes.lease.is_some()) {
-                (self.publishing.actuators_due, self.publishing.actuators_told) = (true, 0);
+                (self.publishing.actuators_due, self.publishing.actuators_reported) = (true, 0);
             }
             // Only once it is in the queue: after a full queue the loop begins again at the first function that is not told.
             if let Some(publication) = self.publishing.table.get_mut(index) {
-                publication.told = wanted;
+                publication.advertised = wanted;
             }
         }
         true
@@ -371,7 +374,7 @@ impl<P: Port> Session<P> {
 
     /// Sends a control message; `false` when there is no room, or nobody to send it to.
     pub(super) fn send_control(&mut self, cx: &mut Context<'_, P>, control: &Control<'_>) -> bool {
-        if !self.may_tell() {
+        if !self.may_advertise() {
             return false;
         }
         let mut bytes = [0; CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES];

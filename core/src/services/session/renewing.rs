@@ -16,7 +16,7 @@
 use super::{Event, Session};
 use crate::config::{HANDSHAKE_LIFE, Mode, PREVIOUS_KEY_LIFE, RENEWAL_TIMEOUT, SHORTEST_HANDSHAKE_LIFE};
 use crate::error::CloseReason;
-use crate::host::connections::{LinkCounter, Place};
+use crate::host::connections::{LinkCounter, Span};
 use crate::host::frame::Frame;
 use crate::host::secure::{PROOF_BYTES, Secure};
 use crate::services::{Context, Port};
@@ -109,11 +109,11 @@ impl<P: Port> Session<P> {
     fn begin_renewal(&mut self, cx: &mut Context<'_, P>, message: &[u8; PROOF_BYTES]) {
         let Some(credentials) = self.credentials(cx) else { return };
         let begins = self.dialed();
-        let told = match self.link.cipher().prove(begins, credentials) {
+        let reported = match self.link.cipher().prove(begins, credentials) {
             Ok(None) => self.link.cipher().answer(message),
-            told => told,
+            reported => reported,
         };
-        match told {
+        match reported {
             Ok(Some(message)) => {
                 self.renewal.step = Step::Telling { until: cx.now + RENEWAL_TIMEOUT, message };
                 self.pump_renewal(cx);
@@ -152,11 +152,11 @@ impl<P: Port> Session<P> {
     }
 
     /// A proof frame on a live link: the peer's message, or its turn.
-    pub(super) fn proof_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
-        let message = self.link.view(place, lent);
+    pub(super) fn proof_on_live(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
+        let message = self.link.view(span, lent);
         let understood = match (message.first_chunk(), self.renewal.step) {
             (None, _) if message.is_empty() => self.link.cipher().turned(),
-            (Some(_), Step::Awaiting { .. }) if self.dialed() => return self.answered_anew(cx, place, lent),
+            (Some(_), Step::Awaiting { .. }) if self.dialed() => return self.answered_anew(cx, span, lent),
             // Not before it is due: a handshake costs a board much computing, which a peer could otherwise ask for at will.
             (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed() && message.len() == PROOF_BYTES => {
                 let first = *first;
@@ -171,23 +171,23 @@ impl<P: Port> Session<P> {
         None
     }
 
-    fn answered_anew(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
-        if self.link.answer(place, lent) != Ok(None) {
+    fn answered_anew(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
+        if self.link.answer(span, lent) != Ok(None) {
             self.fail(cx);
         }
         None
     }
 
     /// A confirm frame on a live link: the first one under the peer's new keys, or what acknowledges this end's.
-    pub(super) fn confirmation_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
+    pub(super) fn confirmation_on_live(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
         let Step::Awaiting { until } = self.renewal.step else {
             self.close(cx, CloseReason::Protocol);
             return None;
         };
-        let understood = match self.link.view(place, lent).is_empty() {
+        let understood = match self.link.view(span, lent).is_empty() {
             true if self.dialed() => self.adopt_keys(cx).map(|()| self.rest_until_renewal(cx.now)),
             true => Err(CloseReason::Protocol),
-            false => self.link.confirmed(place, lent).and_then(|()| self.confirmed_anew(cx, until)),
+            false => self.link.confirmed(span, lent).and_then(|()| self.confirmed_anew(cx, until)),
         };
         if let Err(reason) = understood {
             self.close(cx, reason);

@@ -5,14 +5,14 @@
 //! the lowest class.
 
 use super::permitting::decide;
-use super::publishing::Told;
+use super::publishing::Advertised;
 use super::{Event, Phase, Results, Session};
 use crate::config::Priority;
 use crate::distribution::block;
 use crate::distribution::function_list::{Function, Generation, Slot};
 use crate::distribution::message::{Control, NO_SUBSCRIPTION, SAMPLE_BYTES, SampleHeader, SubscriptionRefusal};
 use crate::error::{Error, Limit};
-use crate::host::connections::{LinkCounter, Place};
+use crate::host::connections::{LinkCounter, Span};
 use crate::services::access::{Decision, Verb};
 use crate::services::stream::{Source, Value};
 use crate::services::{Context, Port};
@@ -182,7 +182,7 @@ impl<P: Port> Session<P> {
                 break;
             }
             if let Some(wish) = self.theirs.wish_mut(slot) {
-                wish.told = interval;
+                wish.advertised = interval;
             }
         }
         if self.streaming.answers_due {
@@ -266,8 +266,8 @@ impl<P: Port> Session<P> {
         generation: Generation,
     ) -> Option<Function<'f, dyn crate::services::lease::Service>> {
         let function = cx.functions.lookup(slot, generation).ok()?;
-        let is_told = matches!(self.publishing.told(slot, generation), Told::Now);
-        (is_told && function.attributes.stream.is_some()).then_some(function)
+        let is_advertised = matches!(self.publishing.advertised(slot, generation), Advertised::Now);
+        (is_advertised && function.attributes.stream.is_some()).then_some(function)
     }
 
     fn decide_stream(
@@ -348,7 +348,7 @@ impl<P: Port> Session<P> {
         subscription: &Subscription,
         source: &dyn Source,
     ) -> Attempt {
-        let (stamp, since) = self.clock.tell(cx.now);
+        let (stamp, since) = self.clock.stamp(cx.now);
         let most = self.peer_message_size() as usize;
         let mut sent = None;
         source.newest(&mut |value: &Value<'_>| {
@@ -380,11 +380,11 @@ impl<P: Port> Session<P> {
             let replaced = version.wrapping_sub(subscription.version).saturating_sub(1);
             self.link.counters.add(LinkCounter::SamplesReplaced, replaced.into());
         }
-        if let Some(place) = self.publishing.subscription(slot) {
-            place.version = version;
+        if let Some(span) = self.publishing.subscription(slot) {
+            span.version = version;
             // Counted from when it was due, so that the pace holds where polls come late.
             let interval = millis(subscription.interval);
-            place.due =
+            span.due =
                 if subscription.due + interval > cx.now { subscription.due + interval } else { cx.now + interval };
         }
         Attempt::Sent
@@ -405,7 +405,7 @@ impl<P: Port> Session<P> {
         &mut self,
         now: Instant,
         header: &SampleHeader,
-        block: Place,
+        block: Span,
         lent: &[u8],
     ) -> Option<Event> {
         let SampleHeader { slot, generation, made } = *header;
@@ -440,7 +440,7 @@ impl<P: Port> Session<P> {
             SubscriptionRefusal::NotAllowed => Error::NotAllowed,
             SubscriptionRefusal::Full => Error::Full(Limit::Subscriptions),
         };
-        (wish.interval, wish.told) = (NO_SUBSCRIPTION, NO_SUBSCRIPTION);
+        (wish.interval, wish.advertised) = (NO_SUBSCRIPTION, NO_SUBSCRIPTION);
         Some(Event::Subscribed(slot, Err(error)))
     }
 }

@@ -48,7 +48,7 @@ impl PeerClock {
     }
 
     /// (the stamp, time since it was heard).
-    pub(super) fn tell(&self, now: Instant) -> (u64, Duration) {
+    pub(super) fn stamp(&self, now: Instant) -> (u64, Duration) {
         (self.stamp, now.since(self.heard))
     }
 }
@@ -258,8 +258,8 @@ impl<P: Port> Session<P> {
 
     fn send_keep_alive(&mut self, cx: &mut Context<'_, P>) {
         // The peer counts by what it was told in the hello.
-        let told = Duration::from_millis(self.told_keep_alive.into());
-        self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
+        let reported = Duration::from_millis(self.reported_keep_alive.into());
+        self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(reported).max(Duration::from_millis(1));
         self.publishing.actuators_due = true;
         self.pump(cx);
         let body = SessionBody::keep_alive(cx.now.as_micros(), self.report());

@@ -14,7 +14,7 @@ pub const TICK: Duration = Duration::from_millis(20);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cause {
     /// A service, or a fault.
-    Told,
+    Report,
     /// The unit was switched off.
     Off,
     /// Nobody wanted it any more: the manager or the link has gone.
@@ -24,7 +24,7 @@ pub enum Cause {
 impl Cause {
     const fn word(self) -> &'static str {
         match self {
-            Self::Told => "told",
+            Self::Report => "told",
             Self::Off => "off",
             Self::Lease => "lease",
         }
@@ -34,7 +34,7 @@ impl Cause {
     /// the motion.
     const fn bound(self) -> Duration {
         match self {
-            Self::Told | Self::Off => RAMP.saturating_add(TICK),
+            Self::Report | Self::Off => RAMP.saturating_add(TICK),
             Self::Lease => Duration::from_millis(LEASE_MS).saturating_add(RAMP).saturating_add(TICK),
         }
     }
@@ -74,7 +74,7 @@ pub struct Motor {
     /// The last sign that the motion is wanted.
     wanted: Duration,
     /// When a service had it stop, until it is driven again.
-    told: Option<Duration>,
+    reported: Option<Duration>,
     stopping: Option<Stopping>,
 }
 
@@ -90,12 +90,12 @@ pub struct Turned {
 impl Motor {
     /// One that is off.
     pub const fn new() -> Self {
-        Self { on: false, wanted: Duration::ZERO, told: None, stopping: None }
+        Self { on: false, wanted: Duration::ZERO, reported: None, stopping: None }
     }
 
     /// A service, or a fault, has it stop.
     pub const fn stop(&mut self, now: Duration) {
-        self.told = Some(now);
+        self.reported = Some(now);
     }
 
     /// A turn of the loop, `elapsed` behind the last one. `left` is of the lease; `off` is when the unit was switched off.
@@ -117,11 +117,11 @@ impl Motor {
         if self.on {
             let lease = Duration::from_millis(LEASE_MS);
             self.wanted = now.saturating_sub(lease.saturating_sub(left.unwrap_or(lease)));
-            self.told = None;
+            self.reported = None;
         } else if self.stopping.is_none() && !body.stands() {
-            let (cause, since) = match (off, self.told.take()) {
+            let (cause, since) = match (off, self.reported.take()) {
                 (Some(off), _) => (Cause::Off, off),
-                (None, Some(told)) => (Cause::Told, told),
+                (None, Some(reported)) => (Cause::Report, reported),
                 (None, None) => (Cause::Lease, self.wanted),
             };
             self.stopping = Some(Stopping { cause, since, held_up: elapsed.saturating_sub(TICK) });
@@ -151,7 +151,7 @@ mod tests {
     const START: Cell = Cell { x: 1, y: 1 };
 
     /// Drives for some turns, then turns with another stage until it stands. What it measured.
-    fn stopped(told: bool, off: bool, tick: Duration) -> Stop {
+    fn stopped(reported: bool, off: bool, tick: Duration) -> Stop {
         let mut body = Body::new(START, 100.0);
         body.enter(Cell { x: 2, y: 1 });
         let mut now = Duration::from_secs(7);
@@ -163,7 +163,7 @@ mod tests {
             assert!(!turned.arrived && turned.stopped.is_none());
         }
         let off = off.then_some(now);
-        if told {
+        if reported {
             motor.stop(now);
         }
         for _ in 0..100 {
@@ -179,13 +179,13 @@ mod tests {
 
     #[test]
     fn a_stop_is_measured_from_its_cause() {
-        let told = stopped(true, false, TICK);
-        assert_eq!((told.cause, told.held_up), (Cause::Told, Duration::ZERO));
-        assert!(told.took > Duration::from_millis(400) && told.took <= RAMP, "{told:?}");
+        let reported = stopped(true, false, TICK);
+        assert_eq!((reported.cause, reported.held_up), (Cause::Report, Duration::ZERO));
+        assert!(reported.took > Duration::from_millis(400) && reported.took <= RAMP, "{reported:?}");
         assert_eq!(stopped(true, true, TICK).cause, Cause::Off);
         // From the last sign, a tick before the last turn that was on.
         let lease = stopped(false, false, TICK);
-        assert_eq!((lease.cause, lease.took), (Cause::Lease, told.took + TICK));
+        assert_eq!((lease.cause, lease.took), (Cause::Lease, reported.took + TICK));
     }
 
     #[test]

@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn signs_are_told_apart() {
+    fn signs_are_distinguished() {
         let signs = [Sign::Unprovisioned, Sign::Looking, Sign::Connected, Sign::Driving];
         let changes = |sign: Sign| (0..20).filter(|tick| sign.is_on(*tick) != sign.is_on(tick + 1)).count();
         assert_eq!(signs.map(ticks_on), [10, 10, 1, 20]);

@@ -178,11 +178,11 @@ fn cut() {
 pub fn stand_still(agv: &mut Agv) {
     HAS_TARGET.store(false, Ordering::Release);
     if let Some(place) = agv.stop() {
-        tell_stop(place);
+        notify_stop(place);
     }
 }
 
-fn tell_stop(place: Place) {
+fn notify_stop(place: Place) {
     let [_x, _y] = place.rounded();
     info!("stopped at {} {}", _x, _y);
 }
@@ -211,7 +211,7 @@ pub async fn drive(vehicle: Vehicle) -> ! {
                 let [_x, _y] = place.rounded();
                 info!("arrived at {} {}", _x, _y);
             }
-            Some(Progress::Stopped(place)) => tell_stop(place),
+            Some(Progress::Stopped(place)) => notify_stop(place),
             _ => {}
         }
     }

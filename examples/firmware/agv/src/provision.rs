@@ -156,14 +156,14 @@ pub fn provisioned(read: Result<Settings, PageError>) -> Option<Settings> {
 mod tests {
     use super::*;
 
-    fn told(text: &str) -> Settings {
+    fn reported(text: &str) -> Settings {
         text.parse().unwrap()
     }
 
     #[test]
     fn a_vehicle_without_a_manager_is_not_provisioned() {
-        assert!(provisioned(Ok(told("name=agv id=1 manager=depot/1"))).is_some());
-        assert!(provisioned(Ok(told("name=agv id=1"))).is_none());
+        assert!(provisioned(Ok(reported("name=agv id=1 manager=depot/1"))).is_some());
+        assert!(provisioned(Ok(reported("name=agv id=1"))).is_none());
         assert!(provisioned(Err(PageError::Damaged)).is_none());
     }
 
@@ -171,8 +171,8 @@ mod tests {
     #[test]
     fn a_board_without_keys_joins_nobody_unless_it_is_told_so_in_words() {
         let absent = || Err(KeysError::Absent);
-        assert!(Provision::of(told("name=agv id=1 manager=depot/1"), absent).is_none());
-        let insecure = Provision::of(told("name=agv id=1 manager=depot/1 insecure=yes"), absent);
+        assert!(Provision::of(reported("name=agv id=1 manager=depot/1"), absent).is_none());
+        let insecure = Provision::of(reported("name=agv id=1 manager=depot/1 insecure=yes"), absent);
         assert!(matches!(insecure, Some(Provision { proof: Proof::Insecure, .. })));
     }
 

@@ -38,9 +38,9 @@ pub type Vehicle = Handle<Agv>;
 pub type VehicleResources = resources!(Agv, LIMITS);
 
 /// A service had it stop, which the motors' loop has not seen.
-static IS_TOLD: AtomicBool = AtomicBool::new(false);
+static IS_REPORTED: AtomicBool = AtomicBool::new(false);
 /// When that was, in microseconds, without those above 32 bits.
-static TOLD_AT: AtomicU32 = AtomicU32::new(0);
+static REPORTED_AT: AtomicU32 = AtomicU32::new(0);
 
 impl Transport for Agv {
     type Order = LeaseWatch;
@@ -79,8 +79,8 @@ impl Agv {
     fn turn(&mut self, now: Instant, elapsed: Duration) -> Option<LeaseWatch> {
         let warehouse::Vehicle { body, motor, .. } = &mut self.vehicle;
         let time = |micros: u64| core::time::Duration::from_micros(micros);
-        if IS_TOLD.swap(false, Ordering::AcqRel) {
-            let ago = (now.as_micros() as u32).wrapping_sub(TOLD_AT.load(Ordering::Acquire));
+        if IS_REPORTED.swap(false, Ordering::AcqRel) {
+            let ago = (now.as_micros() as u32).wrapping_sub(REPORTED_AT.load(Ordering::Acquire));
             motor.stop(time(now.as_micros().saturating_sub(ago.into())));
         }
         let before = body.at();
@@ -121,8 +121,8 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
     list.serve(TransportServer { drive: Actuator::new(&DRIVING, &|| ()) })?;
     // The order has ended before this runs.
     let stop = Handler::free(&|_, _| {
-        TOLD_AT.store(now().as_micros() as u32, Ordering::Release);
-        IS_TOLD.store(true, Ordering::Release);
+        REPORTED_AT.store(now().as_micros() as u32, Ordering::Release);
+        IS_REPORTED.store(true, Ordering::Release);
         Ok(())
     });
     let stops = ServiceOptions::new().idempotent().priority(Priority::Emergency).stops(&DRIVING);

@@ -26,7 +26,7 @@ const BYTES: usize = 256;
 const WORDS: usize = 1024;
 
 /// What the command line told.
-pub struct Told {
+pub struct Given {
     /// The settings.
     pub settings: Settings,
     /// Where a vehicle of the warehouse stands.
@@ -94,7 +94,7 @@ impl Words {
 }
 
 /// Reads the arguments, and the file that they name.
-pub fn read() -> Result<Told, ArgumentError> {
+pub fn read() -> Result<Given, ArgumentError> {
     let mut words = Words::default();
     add_arguments(&mut words).map_err(|()| ArgumentError::None)?;
     if !words.file.is_empty() {
@@ -102,7 +102,7 @@ pub fn read() -> Result<Told, ArgumentError> {
     }
     let settings = words.text().parse().map_err(ArgumentError::Settings)?;
     let noise = words.seed.unwrap_or_else(clock);
-    Ok(Told {
+    Ok(Given {
         settings,
         #[cfg(feature = "warehouse")]
         at: words.at,
@@ -152,7 +152,7 @@ mod secured {
 
     use static_cell::StaticCell;
 
-    use super::{Path, Told, Words};
+    use super::{Given, Path, Words};
     use crate::boots;
 
     /// The keys, and the file of the host for the count of starts.
@@ -169,7 +169,7 @@ mod secured {
         }
     }
 
-    impl Told {
+    impl Given {
         /// The settings, the proof of identity, and the noise; raises the boot counter. `None` without keys, which is
         /// logged.
         #[inline(never)]
@@ -188,7 +188,7 @@ mod secured {
 }
 
 #[cfg(not(feature = "secure"))]
-impl Told {
+impl Given {
     /// The settings, plain mode if the settings opt in to it, and the noise.
     pub fn security(self) -> Option<(Settings, cara_embassy::Security, u64)> {
         let Provision { settings, proof } = Provision::of(self.settings)?;

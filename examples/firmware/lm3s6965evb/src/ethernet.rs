@@ -182,8 +182,8 @@ impl TxToken for Free<'_> {
     fn consume<R, F: FnOnce(&mut [u8]) -> R>(self, length: usize, act: F) -> R {
         let length = length.min(FRAME_BYTES);
         let result = act(&mut self.buffer[LENGTH_BYTES..LENGTH_BYTES + length]);
-        let told = length.saturating_sub(HEADER_BYTES) as u16;
-        self.buffer[..LENGTH_BYTES].copy_from_slice(&told.to_le_bytes());
+        let reported = length.saturating_sub(HEADER_BYTES) as u16;
+        self.buffer[..LENGTH_BYTES].copy_from_slice(&reported.to_le_bytes());
         let bytes = (LENGTH_BYTES + length).next_multiple_of(4);
         for word in self.buffer[..bytes].chunks_exact(4) {
             MACDATA.write(word.try_into().map(u32::from_le_bytes).unwrap_or(0));

@@ -43,7 +43,7 @@ fn main() -> Result<()> {
     let served = offer(&zone)?;
     zone.start()?;
     zone.broadcast();
-    let (mut made, mut told) = (0, false);
+    let (mut made, mut reported) = (0, false);
     let outcome = loop {
         if let Some(outcome) = stop.wait_for(PERIOD) {
             break outcome;
@@ -51,11 +51,11 @@ fn main() -> Result<()> {
         let peer = other(&zone);
         match &peer {
             Some(peer) if made < calls => hand_over(peer, &mut made)?,
-            Some(peer) if !told => told = tell(peer),
+            Some(peer) if !reported => reported = notify(peer),
             _ => {}
         }
         // One of the two ends first; then the other one has no peer left to tell.
-        if served.finished.load(Ordering::Acquire) && (told || peer.is_none()) {
+        if served.finished.load(Ordering::Acquire) && (reported || peer.is_none()) {
             break Ok(());
         }
     };
@@ -91,7 +91,7 @@ fn other(zone: &CommunicationSystem) -> Option<Peer> {
 }
 
 /// Says that this one needs nothing more; whether it was heard.
-fn tell(peer: &Peer) -> bool {
+fn notify(peer: &Peer) -> bool {
     let heard = peer.block_request("finished", &mut Parameters::new());
     heard.inspect_err(|error| say!("{} did not hear it: {error}", peer.identity())).is_ok()
 }

@@ -10,7 +10,7 @@
 //! |---|---|
 //! | `stop-all`, `go-on` | stops all vehicles; lets those drive again that were stopped |
 //! | `stop agv-7`, `go-on agv-7` | the same of one |
-//! | `tell` | prints what it knows of each vehicle |
+//! | `notify` | prints what it knows of each vehicle |
 
 mod care;
 mod driver;
@@ -164,14 +164,14 @@ impl Manager {
 
     /// The loop, until standard input ends.
     fn command_all(mut self) -> Result<()> {
-        let mut told = Instant::now();
+        let mut reported = Instant::now();
         loop {
             let turn = Instant::now();
             if !self.turn()? {
                 return Ok(());
             }
-            if told.elapsed() >= Duration::from_secs(1) {
-                told = Instant::now();
+            if reported.elapsed() >= Duration::from_secs(1) {
+                reported = Instant::now();
                 let counters = [LinkCounter::MessagesSent, LinkCounter::DatagramsSent];
                 let [messages, datagrams] = counters.map(|counter| self.system.counted(counter));
                 println!("sent {messages} {datagrams}");

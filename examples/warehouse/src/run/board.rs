@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use cara_std::Identity;
-use cara_std::keys::place::file_name;
+use cara_std::keys::location::file_name;
 
 use crate::map::Cell;
 use crate::network::{MANAGER, Network, vehicle_id, vehicle_name};
@@ -47,10 +47,10 @@ impl Board {
 
     /// Puts power on it. `folder` has the keys of all.
     pub(super) fn start(&self, folder: &Path, fleet: Network) -> Result<Command> {
-        let told = folder.join("told");
-        self.provision(folder, fleet, &told)?;
+        let reported = folder.join("told");
+        self.provision(folder, fleet, &reported)?;
         let Cell { x, y } = self.at;
-        let words = format!("file={} boots={} at={x},,{y}", told.display(), folder.join("boots").display());
+        let words = format!("file={} boots={} at={x},,{y}", reported.display(), folder.join("boots").display());
         let mut emulator = Command::new("setpriv");
         emulator
             .args(["--pdeathsig", "KILL", "qemu-system-arm", "-M", "lm3s6965evb", "-display", "none"])
@@ -64,14 +64,14 @@ impl Board {
     }
 
     /// Its settings and keys in a file, made as a user makes them.
-    fn provision(&self, folder: &Path, network: Network, told: &Path) -> Result<()> {
+    fn provision(&self, folder: &Path, network: Network, reported: &Path) -> Result<()> {
         let (name, id, fleet) = (vehicle_name(self.number), vehicle_id(self.number), network.fleet.to_string());
         let keys = folder.join("keys").join(file_name(&Identity::s_unit(&name, id)?, cara_std::Fleet(network.fleet)));
         let cara = std::env::current_exe()?.with_file_name("cara");
         let mut command = Command::new(&cara);
         command.args(["provision", "lm3s6965evb", "--name", &name, "--id", &id.to_string(), "--fleet", &fleet]);
         command.args(["--manager", &format!("{}/{}", MANAGER.0, MANAGER.1), "--address", &self.address]);
-        command.arg("--keys").arg(keys).arg("--output").arg(told).stdin(Stdio::null());
+        command.arg("--keys").arg(keys).arg("--output").arg(reported).stdin(Stdio::null());
         let output = command.output().with_context(|| format!("cannot start {}", cara.display()))?;
         ensure!(output.status.success(), "cara provision: {}", String::from_utf8_lossy(&output.stderr));
         Ok(())

@@ -79,7 +79,7 @@ impl Child {
     }
 
     /// Writes a line to it. One that has ended hears nothing, which its end tells.
-    pub(super) fn tell(&mut self, line: &str) {
+    pub(super) fn show(&mut self, line: &str) {
         if let Some(input) = &mut self.input {
             let _ = writeln!(input, "{line}");
         }

@@ -38,7 +38,7 @@ const FROZEN: Duration = Duration::from_millis(1_200);
 /// The manager is away for so long.
 const AWAY: Duration = Duration::from_millis(1_500);
 /// It is told so again until it does.
-const TOLD_AGAIN: Duration = Duration::from_secs(3);
+const REPORTED_AGAIN: Duration = Duration::from_secs(3);
 /// A fault that cannot happen now is tried again.
 const AGAIN: Duration = Duration::from_millis(300);
 /// Drawn orders come within this part of a run, so that the last ones are done at about its end.
@@ -118,7 +118,7 @@ pub fn run(options: &Options) -> Result<ExitCode> {
         progress: Instant::now(),
         stopped: HashSet::new(),
     };
-    run.stage.tell(&format!("{} vehicles, {} orders, seed {}", options.vehicles, orders.len(), options.seed));
+    run.stage.show(&format!("{} vehicles, {} orders, seed {}", options.vehicles, orders.len(), options.seed));
     let finished = run.play(span, options);
     if let Err(error) = finished {
         run.tally.wrong.push(format!("{error:#}"));
@@ -186,7 +186,7 @@ impl Run<'_> {
             ensure!(began.elapsed() < JOINING, "the vehicles have not joined within {JOINING:?}");
             self.hear()?;
         }
-        self.stage.tell(&format!("all vehicles have joined after {:.1} s", began.elapsed().as_secs_f64()));
+        self.stage.show(&format!("all vehicles have joined after {:.1} s", began.elapsed().as_secs_f64()));
         let start = Instant::now();
         if !options.no_faults {
             self.due = schedule(options.seed, span).into_iter().map(|(at, fault)| (at, Due::Break(fault))).collect();
@@ -197,7 +197,7 @@ impl Run<'_> {
             self.tally.took = start.elapsed();
             if self.progress.elapsed() >= PROGRESS {
                 self.progress = Instant::now();
-                self.stage.tell(&format!("{} of {} orders are done", self.truth.done.len(), self.tally.orders));
+                self.stage.show(&format!("{} of {} orders are done", self.truth.done.len(), self.tally.orders));
             }
             let late = span + FINISHING;
             ensure!(start.elapsed() < late, "{} orders are not done", self.tally.orders - self.truth.done.len());
@@ -233,7 +233,7 @@ impl Run<'_> {
             ["failed", ..] => self.tally.failed_calls += 1,
             ["commands"] if self.stage.is_manager(number) => {
                 self.commanding = true;
-                self.stage.tell("the manager knows where all vehicles are, and commands them");
+                self.stage.show("the manager knows where all vehicles are, and commands them");
             }
             // Also a stop that came late, behind the word to go on.
             ["stopped", name] => {
@@ -244,17 +244,17 @@ impl Run<'_> {
             ["goes-on", name] => drop(self.stopped.remove(name)),
             ["mended", name] => {
                 self.tally.mended += 1;
-                self.stage.tell(&format!("{name} has been mended"));
+                self.stage.show(&format!("{name} has been mended"));
             }
             ["stopped-all", stopped, asked, micros] => {
                 let took = Duration::from_micros(micros.parse()?);
-                self.stage.tell(&format!("stop-all: {stopped} of {asked} have stopped"));
+                self.stage.show(&format!("stop-all: {stopped} of {asked} have stopped"));
                 self.tally.stopped_all.push((stopped.parse()?, asked.parse()?, took));
             }
             ["fenced:", ..] if self.old_manager == Some(number) => {
                 self.old_manager = None;
                 self.tally.take_overs += 1;
-                self.stage.tell("the other manager has taken over; the first one has stepped down");
+                self.stage.show("the other manager has taken over; the first one has stepped down");
             }
             ["is", ..] => println!("          {line}"),
             ["up", ..] | ["commands"] | ["done", _] | ["mechanic", ..] => {}
@@ -286,12 +286,13 @@ impl Run<'_> {
                 // Told again until the manager says so: the one that was told may be killed before it has done it.
                 let is_one_stopped = whom.as_ref().is_none_or(|name| self.stopped.contains(name));
                 if self.commanding && is_one_stopped {
-                    self.stage.tell_manager(&whom.as_ref().map_or("go-on".to_owned(), |name| format!("go-on {name}")));
+                    self.stage
+                        .notify_manager(&whom.as_ref().map_or("go-on".to_owned(), |name| format!("go-on {name}")));
                 }
-                (is_one_stopped && !self.stopped.is_empty()).then_some((TOLD_AGAIN, Due::GoOn(whom)))
+                (is_one_stopped && !self.stopped.is_empty()).then_some((REPORTED_AGAIN, Due::GoOn(whom)))
             }
             Due::SwitchOn(name) => {
-                self.stage.tell_vehicle("on", &name)?;
+                self.stage.notify_vehicle("on", &name)?;
                 None
             }
             Due::ThawManager => {
@@ -317,41 +318,41 @@ impl Run<'_> {
                 let Some(name) = self.rng.choice(moving) else { return Ok(Some((AGAIN, Due::Break(fault)))) };
                 match fault {
                     Fault::Stop => {
-                        self.stage.tell_manager(&format!("stop {name}"));
+                        self.stage.notify_manager(&format!("stop {name}"));
                         self.stopped.insert(name.clone());
                         Some((STOPPED, Due::GoOn(Some(name))))
                     }
                     Fault::Off => {
-                        self.stage.tell(&format!("{name} is switched off"));
-                        self.stage.tell_vehicle("off", &name)?;
+                        self.stage.show(&format!("{name} is switched off"));
+                        self.stage.notify_vehicle("off", &name)?;
                         Some((OFF, Due::SwitchOn(name)))
                     }
                     _ => {
-                        self.stage.tell(&format!("{name} has a fault"));
-                        self.stage.tell_vehicle("fail", &name)?;
+                        self.stage.show(&format!("{name} has a fault"));
+                        self.stage.notify_vehicle("fail", &name)?;
                         None
                     }
                 }
             }
             Fault::StopAll => {
-                self.stage.tell_manager("stop-all");
+                self.stage.notify_manager("stop-all");
                 self.stopped.extend((1..=self.stage.vehicles()).map(vehicle_name));
                 Some((STOPPED, Due::GoOn(None)))
             }
             Fault::FreezeManager => {
-                self.stage.tell("the manager hangs");
+                self.stage.show("the manager hangs");
                 self.stage.signal_manager(Signal::STOP)?;
                 self.frozen = true;
                 Some((FROZEN, Due::ThawManager))
             }
             Fault::KillManager => {
-                self.stage.tell("the manager is killed");
+                self.stage.show("the manager is killed");
                 self.stage.kill_manager()?;
                 self.commanding = false;
                 Some((AWAY, Due::StartManager))
             }
             Fault::TakeOver => {
-                self.stage.tell("another manager takes over");
+                self.stage.show("another manager takes over");
                 self.old_manager = Some(self.stage.start_manager(true)?);
                 self.commanding = false;
                 None
@@ -361,7 +362,7 @@ impl Run<'_> {
 
     /// What the manager knows, where the orders are not done.
     fn ask_why(&mut self) -> Result<()> {
-        self.stage.tell_manager("tell");
+        self.stage.notify_manager("tell");
         let until = Instant::now() + Duration::from_secs(1);
         while Instant::now() < until {
             self.hear()?;

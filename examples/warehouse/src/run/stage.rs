@@ -99,7 +99,7 @@ impl Stage {
     }
 
     /// Says something to who watches.
-    pub(super) fn tell(&self, what: &str) {
+    pub(super) fn show(&self, what: &str) {
         println!("{:7.1} s  {what}", self.began.elapsed().as_secs_f64());
     }
 
@@ -123,7 +123,7 @@ impl Stage {
         self.start(Role::Mechanic, &["mechanic".to_owned(), "--fleet".to_owned(), self.network.fleet.to_string()])?;
         self.start_manager(false)?;
         let (fleet, map) = (self.network.fleet, self.files.map.display());
-        self.tell(&format!("to watch: cara web --unit {}/{} --fleet {fleet} --background {map}", MANAGER.0, MANAGER.1));
+        self.show(&format!("to watch: cara web --unit {}/{} --fleet {fleet} --background {map}", MANAGER.0, MANAGER.1));
         Ok(())
     }
 
@@ -193,18 +193,18 @@ impl Stage {
         self.manager == number
     }
 
-    pub(super) fn tell_manager(&mut self, line: &str) {
-        self.children[self.manager].tell(line);
+    pub(super) fn notify_manager(&mut self, line: &str) {
+        self.children[self.manager].show(line);
     }
 
     /// Has a vehicle's process do something with it.
-    pub(super) fn tell_vehicle(&mut self, verb: &str, name: &str) -> Result<()> {
+    pub(super) fn notify_vehicle(&mut self, verb: &str, name: &str) -> Result<()> {
         let has = |role: &Role| match role {
             Role::Vehicles { first, count } => (*first..first + count).any(|number| vehicle_name(number) == name),
             Role::Board | Role::Manager | Role::Mechanic => false,
         };
         let number = self.roles.iter().position(has).with_context(|| format!("no process has {name}"))?;
-        self.children[number].tell(&format!("{verb} {name}"));
+        self.children[number].show(&format!("{verb} {name}"));
         Ok(())
     }
 

@@ -238,8 +238,8 @@ mod tests {
             found.remove(0)
         };
         for finding in [found(5, 4), found(4, 5)] {
-            let told = "(claim 5.0000), and refuse the one at 10.0.0.9:5000 (claim 4.0000)";
-            assert!(finding.id == Id::Fenced && finding.found.contains(told), "{finding:?}");
+            let reported = "(claim 5.0000), and refuse the one at 10.0.0.9:5000 (claim 4.0000)";
+            assert!(finding.id == Id::Fenced && finding.found.contains(reported), "{finding:?}");
             assert_eq!(finding.about.as_deref(), Some("boss/1"));
         }
         let equal = found(4, 4);

@@ -173,29 +173,29 @@ mod tests {
             datagrams: None,
             segment: Some(1_448),
         };
-        let mut told = |link: LinkInfo, died| {
+        let mut reported = |link: LinkInfo, died| {
             seen.running[0].nodes[0].link = Some(link);
             seen.running[0].count("agv/7", &[("StreamsDied", died)]);
             let found = check(&seen, &seen.running[0], &seen.running[0].nodes[0]);
             found.into_iter().map(|finding| (finding.id, finding.found)).collect::<Vec<_>>()
         };
         for datagrams in [None, Some(DatagramsInfo::Pass)] {
-            assert_eq!(told(LinkInfo { datagrams, ..link }, 0)[0].0, Id::Connected);
+            assert_eq!(reported(LinkInfo { datagrams, ..link }, 0)[0].0, Id::Connected);
         }
         for (datagrams, text) in [
             (DatagramsInfo::ToUnit, "datagrams of boss/1 do not arrive at agv/7"),
             (DatagramsInfo::ToNode, "no datagrams of agv/7 (10.0.0.7:5000) arrive at boss/1"),
             (DatagramsInfo::None, "no datagrams pass between boss/1 and agv/7"),
         ] {
-            let found = told(LinkInfo { datagrams: Some(datagrams), ..link }, 0);
+            let found = reported(LinkInfo { datagrams: Some(datagrams), ..link }, 0);
             assert!(found.len() == 1 && found[0].0 == Id::DatagramsBlocked && found[0].1.contains(text), "{found:?}");
         }
-        let silent = told(LinkInfo { stream_ms: 9_500, ..link }, 0);
+        let silent = reported(LinkInfo { stream_ms: 9_500, ..link }, 0);
         assert!(silent.len() == 1 && silent[0].0 == Id::StreamDead && silent[0].1.contains("for 9 s"), "{silent:?}");
-        let died = told(link, 2);
+        let died = reported(link, 2);
         assert_eq!([died[0].0, died[1].0], [Id::StreamDead, Id::Connected]);
         assert!(died[0].1.contains("dead 2 times") && !died[0].1.contains("segments"), "{died:?}");
-        let short = told(LinkInfo { segment: Some(524), ..link }, 1);
+        let short = reported(LinkInfo { segment: Some(524), ..link }, 1);
         assert!(short[0].1.contains("segments of 524 bytes"), "{short:?}");
     }
 

@@ -113,7 +113,7 @@ pub(crate) fn unit_refused(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     let shown =
         |name: &str| seen.reach.iter().any(|reach| reach.interface.name == name && send_refused(reach).is_some());
     let refused = unit.unit.interfaces.iter().filter(|interface| interface.up && !shown(&interface.name));
-    let told = refused.filter_map(|interface| {
+    let reported = refused.filter_map(|interface| {
         let found = format!(
             "a broadcast of {} did not leave through {}: {}",
             unit.name(),
@@ -124,7 +124,7 @@ pub(crate) fn unit_refused(seen: &Evidence, unit: &Running) -> Vec<Finding> {
             "look at this host's firewall for outgoing packets (`nft list ruleset`) and at the routes (`ip route`)";
         Some(Finding::warning(Id::SendRefused, found, advice).about(&interface.name))
     });
-    told.collect()
+    reported.collect()
 }
 
 fn broadcast_lost(reach: &Reach) -> Option<Finding> {

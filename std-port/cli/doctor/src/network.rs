@@ -48,8 +48,8 @@ pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
 
 /// A duplicate that a unit has refused and that was heard as well is one.
 fn once(found: Vec<Finding>) -> Vec<Finding> {
-    let mut told = BTreeSet::new();
-    let is_new = |finding: &Finding| finding.id != Id::Duplicate || told.insert(finding.about.clone());
+    let mut reported = BTreeSet::new();
+    let is_new = |finding: &Finding| finding.id != Id::Duplicate || reported.insert(finding.about.clone());
     found.into_iter().filter(is_new).collect()
 }
 
@@ -107,9 +107,9 @@ fn searching(seen: &Evidence) -> Vec<Finding> {
 }
 
 fn versions(seen: &Evidence) -> Vec<Finding> {
-    let mut told = BTreeSet::new();
+    let mut reported = BTreeSet::new();
     let strange = seen.heard.iter().filter(|heard| !heard.same_version());
-    let first = strange.filter(|heard| told.insert(heard.source));
+    let first = strange.filter(|heard| reported.insert(heard.source));
     first
         .take(MOST)
         .map(|heard| {
@@ -129,12 +129,12 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
         found.push(no_room(unit));
     }
     // A refused version that was heard here as well is told already.
-    let told =
+    let reported =
         |address: &str| seen.heard.iter().any(|heard| !heard.same_version() && heard.source.to_string() == address);
     let refusals = unit
         .refused
         .iter()
-        .filter(|refused| !told(&refused.address))
+        .filter(|refused| !reported(&refused.address))
         .filter(|refused| !(unit.is_full() && refused.reason == "Full"))
         .filter_map(|refused| refusal(&unit.name(), refused));
     found.extend(refusals.take(MOST).map(|finding| Finding { severity: Severity::Warning, ..finding }));
@@ -174,7 +174,7 @@ fn fleets(seen: &Evidence) -> Vec<Finding> {
         let who = heard.identity.as_ref().map_or_else(|| heard.source.to_string(), ToString::to_string);
         fleets.entry(heard.fleet.0).or_default().insert(who);
     }
-    let told = fleets.iter().take(MOST).map(|(fleet, nodes)| {
+    let reported = fleets.iter().take(MOST).map(|(fleet, nodes)| {
         let names: Vec<&str> = nodes.iter().take(3).map(String::as_str).collect();
         let more = if nodes.len() > names.len() { " and others" } else { "" };
         let found =
@@ -182,7 +182,7 @@ fn fleets(seen: &Evidence) -> Vec<Finding> {
         let advice = "in order if that is meant; a node of it that should be here needs this fleet";
         Finding::info(Id::OtherFleet, found, advice).about(format!("fleet {fleet}"))
     });
-    told.collect()
+    reported.collect()
 }
 
 fn foreign(seen: &Evidence) -> Vec<Finding> {
@@ -192,12 +192,12 @@ fn foreign(seen: &Evidence) -> Vec<Finding> {
     }
     let ports: Vec<String> = seen.ports.numbers().iter().map(u16::to_string).collect();
     let ports = ports.join(" or ");
-    let told = hosts.iter().take(MOST).map(|(host, datagrams)| {
+    let reported = hosts.iter().take(MOST).map(|(host, datagrams)| {
         let found = format!("{host} sent {datagrams} datagrams to UDP port {ports} that are not CARA's");
         let advice = "they are dropped; if they are many, find the program there and give it another port";
         Finding::warning(Id::ForeignDatagrams, found, advice).about(host)
     });
-    told.collect()
+    reported.collect()
 }
 
 fn several(seen: &Evidence) -> Option<Finding> {

@@ -334,12 +334,12 @@ fn refusals(seen: &Evidence, which: &Which, heard: Option<&Heard>) -> Vec<Findin
         refused.ago_ms <= recent
             && (refused.node.as_deref().is_some_and(|node| which.is_text(node)) || same_host(refused))
     };
-    let told =
+    let reported =
         seen.running.iter().flat_map(|unit| unit.refused.iter().filter(of_it).map(move |refused| (unit, refused)));
-    let mut told: Vec<_> = told.collect();
-    told.sort_by_key(|(_, refused)| refused.ago_ms);
+    let mut reported: Vec<_> = reported.collect();
+    reported.sort_by_key(|(_, refused)| refused.ago_ms);
     let mut found: Vec<Finding> = Vec::new();
-    for finding in told.iter().filter_map(|(unit, refused)| refusal(&unit.name(), refused)) {
+    for finding in reported.iter().filter_map(|(unit, refused)| refusal(&unit.name(), refused)) {
         if found.iter().all(|known| known.id != finding.id) {
             found.push(finding.certain(true));
         }

@@ -97,7 +97,7 @@ impl Sources {
         let mut sources = Self { news, latest: vec![None; clients.len()], unasked, refused };
         for (index, client) in clients.into_iter().enumerate() {
             let (sender, which) = (sender.clone(), which.cloned());
-            thread::spawn(move || report(client, which.as_ref(), |told| sender.send((index, told)).is_ok()));
+            thread::spawn(move || report(client, which.as_ref(), |reported| sender.send((index, reported)).is_ok()));
         }
         drop(sender);
         sources.first_answers();
@@ -109,7 +109,7 @@ impl Sources {
         let end = Instant::now() + FIRST_ANSWER;
         while self.latest.iter().any(Option::is_none) {
             match self.news.recv_timeout(end.saturating_duration_since(Instant::now())) {
-                Ok(told) => self.take(told),
+                Ok(reported) => self.take(reported),
                 Err(_) => return,
             }
         }
@@ -117,15 +117,15 @@ impl Sources {
 
     /// The units as they were last; one that has stopped is no longer among them.
     pub(crate) fn look(&mut self) -> Vec<Running> {
-        while let Ok(told) = self.news.try_recv() {
-            self.take(told);
+        while let Ok(reported) = self.news.try_recv() {
+            self.take(reported);
         }
         self.latest.iter().flatten().cloned().collect()
     }
 
-    fn take(&mut self, (index, told): (usize, Option<Running>)) {
+    fn take(&mut self, (index, reported): (usize, Option<Running>)) {
         if let Some(place) = self.latest.get_mut(index) {
-            *place = told;
+            *place = reported;
         }
     }
 }
@@ -165,14 +165,14 @@ fn named(wanted: &str) -> Result<Vec<RunningUnit>, ControlError> {
 }
 
 /// Asks a unit again and again, until it stops or the receiver is gone.
-fn report(mut client: Client, which: Option<&Which>, tell: impl Fn(Option<Running>) -> bool) {
+fn report(mut client: Client, which: Option<&Which>, notify: impl Fn(Option<Running>) -> bool) {
     loop {
         let began = Instant::now();
         let Ok(running) = ask(&mut client, which) else {
-            tell(None);
+            notify(None);
             return;
         };
-        if !tell(Some(running)) {
+        if !notify(Some(running)) {
             return;
         }
         // A manager of a thousand nodes has more to tell, and is asked less often.
@@ -197,7 +197,9 @@ fn ask(client: &mut Client, which: Option<&Which>) -> Result<Running, ControlErr
     if let Some(question) = counters_question(which, &nodes) {
         for answer in client.ask(&question)? {
             match answer {
-                Ok(Answer::Counters { node, counters: told }) => counters.push(Counted { node, counters: told }),
+                Ok(Answer::Counters { node, counters: reported }) => {
+                    counters.push(Counted { node, counters: reported })
+                }
                 // A node that has just left has no counters.
                 Ok(_) | Err(ControlError::Failed(_)) => {}
                 Err(error) => return Err(error),

@@ -220,9 +220,9 @@ mod tests {
         let mut unit = running("boss", 1);
         (unit.unit.mode, unit.unit.keys) = (Some("plain".into()), None);
         (seen.running, seen.mode) = (vec![unit], Some(Mode::Plain));
-        let told = node::check(&seen, &Which("agv".into()));
-        assert_eq!((told.len(), told[0].id), (1, Id::ModeMismatch));
-        assert!(told[0].advice.contains("`cara keys derive --fleet 7 'boss/1@m_unit'`"), "{told:?}");
+        let reported = node::check(&seen, &Which("agv".into()));
+        assert_eq!((reported.len(), reported[0].id), (1, Id::ModeMismatch));
+        assert!(reported[0].advice.contains("`cara keys derive --fleet 7 'boss/1@m_unit'`"), "{reported:?}");
         // A fleet of which one half is plain and meets is none of ours.
         seen.heard = vec![plain(searching("agv", 7, "boss"))];
         assert!(all_ids(&seen).is_empty());
@@ -234,8 +234,8 @@ mod tests {
         seen.heard = vec![of(Standing::OtherKeys)];
         assert_eq!((ids(&seen), all_ids(&seen)), (vec![Id::WrongKeys], vec![Id::WrongKeys]));
         seen.heard = vec![of(Standing::Proven(1)), Heard { standing: Standing::OtherKeys, ..answering("boss", 3) }];
-        let told = node::check(&seen, &Which("agv".into()));
-        assert_eq!((told.len(), told[0].id, told[0].about.as_deref()), (1, Id::WrongKeys, Some("boss/1")));
+        let reported = node::check(&seen, &Which("agv".into()));
+        assert_eq!((reported.len(), reported[0].id, reported[0].about.as_deref()), (1, Id::WrongKeys, Some("boss/1")));
     }
 
     #[test]

@@ -1,16 +1,16 @@
-//! `cara keys`: makes the keys of a fleet and of its nodes. The work is in `cara_std::keys`; `told` reports changes
+//! `cara keys`: makes the keys of a fleet and of its nodes. The work is in `cara_std::keys`; `report` reports changes
 //! and next steps, and `show` the state, never a key.
 
+mod report;
 mod show;
-mod told;
 
-use told::Done;
+use report::Done;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cara_core::distribution::identity::{Fleet, Identity};
-use cara_std::keys::place::own_folder;
+use cara_std::keys::location::own_folder;
 use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, parse_node};
 
 use cara_tools::exit::{Ended, Exit};
@@ -121,7 +121,7 @@ fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<
     let asked = Asked::catch()?;
     let made = Store::create_unless(&folder, keys, &|| asked.came());
     let (store, written) = made.map_err(|error| not_changed(error, &asked))?;
-    told::tell(Done::Made, &store, &written, global)
+    report::print(Done::Made, &store, &written, global)
 }
 
 fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
@@ -173,11 +173,11 @@ impl Step {
 
     /// Whether it is the one that was made last.
     fn is_last(self, members: &Members) -> bool {
-        let begun = members.beside().map(|beside| beside > members.generation());
+        let started = members.beside().map(|beside| beside > members.generation());
         match self {
-            Self::Begin => begun == Some(true),
-            Self::Switch => begun == Some(false),
-            Self::Finish => begun.is_none(),
+            Self::Begin => started == Some(true),
+            Self::Switch => started == Some(false),
+            Self::Finish => started.is_none(),
         }
     }
 }
@@ -185,7 +185,7 @@ impl Step {
 fn save(done: Done<'_>, store: &Store, global: &Global) -> anyhow::Result<()> {
     let asked = Asked::catch()?;
     let written = store.save_unless(&|| asked.came()).map_err(|error| not_changed(error, &asked))?;
-    told::tell(done, store, &written, global)
+    report::print(done, store, &written, global)
 }
 
 /// The keys of the fleet that is meant: of the only one in the folder, unless one is named.

@@ -5,7 +5,7 @@ use std::path::Path;
 use cara_std::keys::{KeyRing, Member, Store, full_name, shown};
 use serde_json::json;
 
-use super::told::generations;
+use super::report::generations;
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
 use cara_tools::keys::failed;

@@ -1,15 +1,15 @@
 //! `cara provision`: gives a board its identity. One image serves all boards of a kind; what differs is written to two
 //! pages of the board's flash.
 //!
-//! `told` makes settings of the command line and `secrets` keys of a node's file, `copy` the bytes of the next copy and
+//! `given` makes settings of the command line and `secrets` keys of a node's file, `copy` the bytes of the next copy and
 //! `probe` brings them to the board. `show` reads what a page says.
 
 mod copy;
+mod given;
 mod probe;
 mod secrets;
 mod show;
 mod text;
-mod told;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -43,7 +43,7 @@ pub struct Arguments {
     #[arg(required_unless_present_any = ["list", "read"])]
     board: Option<String>,
     #[command(flatten)]
-    told: told::Told,
+    given: given::Given,
     /// The file with the board's keys, as `cara keys` makes it. It tells name, id, fleet and manager where these are not
     /// given. Without it, keys that the board has stay, where its pages can be read.
     #[arg(long, value_name = "FILE", requires = "board")]
@@ -85,7 +85,7 @@ fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
         return Err(Ended::usage(text));
     }
     let ring = arguments.keys.as_deref().map(secrets::load).transpose()?;
-    let settings = arguments.told.settings(board, global, ring.as_ref())?;
+    let settings = arguments.given.settings(board, global, ring.as_ref())?;
     let secrets = ring.as_ref().map(|ring| Secrets::draw(ring, &settings)).transpose()?;
     let content = Content { settings, secrets };
     match &arguments.output {
@@ -179,7 +179,7 @@ fn report(
     for copy in written {
         let Written { address, generation, has_keys, left, .. } = copy;
         let place = file.map_or_else(|| "the board".to_owned(), |file| file.display().to_string());
-        let keys = secrets::told(&copy.bytes).ok().flatten().map(|keys| keys.generations);
+        let keys = secrets::given(&copy.bytes).ok().flatten().map(|keys| keys.generations);
         match global.json {
             true => output::object(&json!({
                 "board": board.name, "file": file, "address": address, "generation": generation, "keys": keys,

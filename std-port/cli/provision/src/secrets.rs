@@ -73,12 +73,12 @@ impl Shown {
 }
 
 /// What may be shown of the keys in the text of an emulated board.
-pub(super) fn told_by(text: &str) -> Result<Option<Shown>, KeysError> {
+pub(super) fn given_by(text: &str) -> Result<Option<Shown>, KeysError> {
     Ok(cara_settings::keys::of_text(text)?.as_ref().map(Shown::of))
 }
 
 /// What may be shown of the keys in a page.
-pub(super) fn told(page: &[u8]) -> Result<Option<Shown>, KeysError> {
+pub(super) fn given(page: &[u8]) -> Result<Option<Shown>, KeysError> {
     match cara_settings::keys::newest(page, &[]) {
         Ok((_, keys)) => Ok(Some(Shown::of(&keys))),
         Err(KeysError::Absent) => Ok(None),

@@ -10,7 +10,7 @@ use cara_settings::uf2::{BLOCK, PAYLOAD};
 use serde_json::json;
 use zeroize::Zeroizing;
 
-use super::secrets::{Shown, told, told_by};
+use super::secrets::{Shown, given, given_by};
 use super::text::{self, EMULATED};
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
@@ -65,7 +65,7 @@ pub(super) fn file(file: &Path, global: &Global) -> anyhow::Result<()> {
     let bytes = super::read_whole(file)?;
     let wrong = |error: KeysError| Ended::failed("Page", format!("{}: {error}", file.display()));
     if let Some(text) = text::of_emulated(&bytes) {
-        return Ok(told_by_text(text).map_err(wrong)?.print(global)?);
+        return Ok(given_by_text(text).map_err(wrong)?.print(global)?);
     }
     for page in pages(&bytes) {
         page_of(&page).map_err(wrong)?.print(global)?;
@@ -95,23 +95,23 @@ fn pages(bytes: &[u8]) -> Vec<Zeroizing<Vec<u8>>> {
 }
 
 /// What a board is told.
-struct Told {
+struct Given {
     settings: Settings,
     /// None of the emulated board, which has one text and no copies.
     generation: Option<u32>,
     keys: Option<Shown>,
 }
 
-fn page_of(page: &[u8]) -> Result<Told, KeysError> {
+fn page_of(page: &[u8]) -> Result<Given, KeysError> {
     let (settings, generation) = decode(page)?;
-    Ok(Told { settings, generation: Some(generation), keys: told(page)? })
+    Ok(Given { settings, generation: Some(generation), keys: given(page)? })
 }
 
-fn told_by_text(text: &str) -> Result<Told, KeysError> {
-    Ok(Told { settings: text.parse()?, generation: None, keys: told_by(text)? })
+fn given_by_text(text: &str) -> Result<Given, KeysError> {
+    Ok(Given { settings: text.parse()?, generation: None, keys: given_by(text)? })
 }
 
-impl Told {
+impl Given {
     fn print(self, global: &Global) -> std::io::Result<()> {
         let Self { settings, generation, keys } = self;
         let wifi = settings.wifi.as_ref().map(|wifi| wifi.name());

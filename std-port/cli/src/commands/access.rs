@@ -100,7 +100,7 @@ fn answer(table: &AccessTable, who: &str, function: &str, verb: Verb, global: &G
             format!("the answer differs between an m_unit {who} and an s_unit: write {who}@m_unit or {who}@s_unit");
         return Err(Ended::usage(text));
     }
-    tell(table, who, function, verb, decisions[0], global)
+    report(table, who, function, verb, decisions[0], global)
 }
 
 /// Permission to call includes permission to see.
@@ -117,12 +117,12 @@ fn principals(who: &str) -> anyhow::Result<[Option<Identity>; 2]> {
         return Ok([None, None]);
     }
     let known = parse_node(who).map_err(|error| Ended::usage(format!("--who {who}: {error}; or write operator")))?;
-    let role_is_told = ["@m_unit", "@s_unit"].iter().any(|role| who.ends_with(role));
-    let other = if role_is_told { known.clone() } else { Identity::m_unit(known.name(), known.id())? };
+    let role_is_reported = ["@m_unit", "@s_unit"].iter().any(|role| who.ends_with(role));
+    let other = if role_is_reported { known.clone() } else { Identity::m_unit(known.name(), known.id())? };
     Ok([Some(known), Some(other)])
 }
 
-fn tell(
+fn report(
     table: &AccessTable,
     who: &str,
     function: &str,

@@ -106,7 +106,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         priority: arguments.priority,
         best_effort: arguments.best_effort,
         take_over: arguments.take_over,
-        progress: tells_progress(&published),
+        progress: reports_progress(&published),
     };
     let question = CallQuestion { progress: question.progress && question.node.is_some(), ..question };
     // At the end of this command its unit gives up the call, and a manager whose client has gone does so as well.
@@ -149,8 +149,8 @@ fn call(
             worst = if expired { Exit::Failed } else { worst };
             return Ok(show_end(expired, global)?);
         }
-        if let Answer::Progress { node, id, values: told } = answer {
-            return Ok(show_progress(&format!("{node}/{id}"), &told, global)?);
+        if let Answer::Progress { node, id, values: reported } = answer {
+            return Ok(show_progress(&format!("{node}/{id}"), &reported, global)?);
         }
         let Answer::Called { node, id, results, call, error, took_us, .. } = answer else { return Ok(()) };
         // The lease counts from when the call was made, and its end is on its way like any answer.
@@ -247,15 +247,15 @@ fn show(
 }
 
 /// What the call tells while it runs.
-fn show_progress(node: &str, told: &[Argument], global: &Global) -> std::io::Result<()> {
+fn show_progress(node: &str, reported: &[Argument], global: &Global) -> std::io::Result<()> {
     match global.json {
-        true => output::object(&json!({ "node": node, "progress": values(told) })),
-        false => output::line(show_call("…", told)),
+        true => output::object(&json!({ "node": node, "progress": values(reported) })),
+        false => output::line(show_call("…", reported)),
     }
 }
 
 /// Whether its calls tell how far they are.
-fn tells_progress(function: &FunctionInfo) -> bool {
+fn reports_progress(function: &FunctionInfo) -> bool {
     Definition::parse(&function.signature).is_ok_and(|function| function.signature().progress().next().is_some())
 }
 

@@ -40,9 +40,9 @@ pub(crate) fn run(Arguments { node, state, audit }: Arguments, global: &Global) 
         return Err(Ended::failed("NoClaim", format!("{} has no claim that {node} has obeyed", state.display())));
     }
     if global.json {
-        let told = |Forgotten { fleet, manager, claim }: &Forgotten| json!({ "fleet": fleet, "manager": manager.to_string(), "claim": [claim.term, claim.claimant] });
+        let reported = |Forgotten { fleet, manager, claim }: &Forgotten| json!({ "fleet": fleet, "manager": manager.to_string(), "claim": [claim.term, claim.claimant] });
         output::object(
-            &json!({ "node": node.to_string(), "forgotten": forgotten.iter().map(told).collect::<Vec<_>>() }),
+            &json!({ "node": node.to_string(), "forgotten": forgotten.iter().map(reported).collect::<Vec<_>>() }),
         )?;
     } else {
         for Forgotten { fleet, manager, claim } in forgotten {

@@ -93,7 +93,7 @@ impl fmt::Display for Line {
     }
 }
 
-fn left_out((line, Told { left_out, .. }): (Line, Told)) {
+fn left_out((line, Report { left_out, .. }): (Line, Report)) {
     if left_out > 0 {
         tracing::warn!(more = left_out, "{line}");
     }
@@ -101,11 +101,11 @@ fn left_out((line, Told { left_out, .. }): (Line, Told)) {
 
 /// Which lines were logged a short while ago.
 #[derive(Default)]
-struct Sparing(HashMap<Line, Told>);
+struct Sparing(HashMap<Line, Report>);
 
 /// How often a line was logged since `at`, and how often it was not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Told {
+struct Report {
     at: Instant,
     lines: u64,
     left_out: u64,
@@ -115,22 +115,26 @@ impl Sparing {
     /// Whether a line may be logged.
     fn admits(&mut self, line: Line, now: Instant) -> bool {
         let (limit, _) = line.limit();
-        let told = self.0.entry(line).or_insert(Told { at: now, lines: 0, left_out: 0 });
-        let admits = told.lines < limit;
-        *if admits { &mut told.lines } else { &mut told.left_out } += 1;
+        let reported = self.0.entry(line).or_insert(Report { at: now, lines: 0, left_out: 0 });
+        let admits = reported.lines < limit;
+        *if admits { &mut reported.lines } else { &mut reported.left_out } += 1;
         admits
     }
 
     /// Those whose time is over; what was left out of them is to be told now.
-    fn due(&mut self, now: Instant) -> Vec<(Line, Told)> {
-        let over = |line: &Line, told: &Told| now.saturating_duration_since(told.at) >= line.limit().1;
-        let due = self.0.iter().filter(|(line, told)| over(line, told)).map(|(line, told)| (line.clone(), *told));
+    fn due(&mut self, now: Instant) -> Vec<(Line, Report)> {
+        let over = |line: &Line, reported: &Report| now.saturating_duration_since(reported.at) >= line.limit().1;
+        let due = self
+            .0
+            .iter()
+            .filter(|(line, reported)| over(line, reported))
+            .map(|(line, reported)| (line.clone(), *reported));
         let due: Vec<_> = due.collect();
-        for (line, told) in &due {
+        for (line, reported) in &due {
             // The line that tells the number is one too.
-            match told.left_out {
+            match reported.left_out {
                 0 => self.0.remove(line),
-                _ => self.0.insert(line.clone(), Told { at: now, lines: 1, left_out: 0 }),
+                _ => self.0.insert(line.clone(), Report { at: now, lines: 1, left_out: 0 }),
             };
         }
         due
@@ -171,8 +175,8 @@ mod tests {
         assert!(sparing.admits(protocol.clone(), start), "another reason has a line of its own");
         assert_eq!(sparing.due(start), []);
         let mut due = sparing.due(start + SECOND);
-        due.sort_by_key(|(_, told)| told.left_out);
-        let due = due.into_iter().map(|(line, told)| (line, told.left_out)).collect::<Vec<_>>();
+        due.sort_by_key(|(_, reported)| reported.left_out);
+        let due = due.into_iter().map(|(line, reported)| (line, reported.left_out)).collect::<Vec<_>>();
         assert_eq!(due, [(protocol, 0), (reset.clone(), 379)]);
         assert_eq!(admitted(&mut sparing), 0, "the number was a line");
         assert_eq!(sparing.due(start + SECOND * 2).len(), 1);
@@ -193,10 +197,13 @@ mod tests {
             lines += usize::from(sparing.admits(Line::of(&left(&looping)).unwrap(), now));
             let due = sparing.due(now);
             lines += due.len();
-            counted += due.iter().map(|(_, told)| told.left_out).sum::<u64>();
+            counted += due.iter().map(|(_, reported)| reported.left_out).sum::<u64>();
         }
         assert!(lines <= 2 * 4 * 6, "{lines} lines in a minute");
-        assert_eq!(counted + sparing.0.values().map(|told| told.left_out).sum::<u64>(), 24_000 - 2 * (4 + 5 * 3));
+        assert_eq!(
+            counted + sparing.0.values().map(|reported| reported.left_out).sum::<u64>(),
+            24_000 - 2 * (4 + 5 * 3)
+        );
         let admitted = (0..9).filter(|_| sparing.admits(joined(&other), start)).count();
         assert_eq!(admitted, 4, "another node has lines of its own");
     }

@@ -62,12 +62,16 @@ impl Logging {
             }
             (level, _) => filter(level.or(file).unwrap_or(LEVEL))?,
         };
-        let mut told = 0;
+        let mut reported = 0;
         let lines = LineQueue::new("cara-stderr", move |line, lost| {
             let mut stderr = std::io::stderr().lock();
-            if lost > told {
-                writeln!(stderr, "{} lines of the log were lost: they came faster than they were read", lost - told)?;
-                told = lost;
+            if lost > reported {
+                writeln!(
+                    stderr,
+                    "{} lines of the log were lost: they came faster than they were read",
+                    lost - reported
+                )?;
+                reported = lost;
             }
             stderr.write_all(line)
         })?;

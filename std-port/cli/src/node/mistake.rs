@@ -43,12 +43,12 @@ impl Mistakes {
     /// Line and column of each, both from 1; columns count characters.
     #[cfg(test)]
     pub(super) fn places(&self) -> Vec<(usize, usize)> {
-        self.list.iter().map(|mistake| self.source.place(mistake.span.start).line_and_column()).collect()
+        self.list.iter().map(|mistake| self.source.location(mistake.span.start).line_and_column()).collect()
     }
 }
 
 /// A place in a text.
-struct Place<'a> {
+struct Location<'a> {
     /// From 1.
     line: usize,
     /// What stands before the place in its line.
@@ -57,14 +57,14 @@ struct Place<'a> {
     text: &'a str,
 }
 
-impl Place<'_> {
+impl Location<'_> {
     fn line_and_column(&self) -> (usize, usize) {
         (self.line, self.before.chars().count() + 1)
     }
 }
 
 impl Source {
-    fn place(&self, byte: usize) -> Place<'_> {
+    fn location(&self, byte: usize) -> Location<'_> {
         let byte = self.text.floor_char_boundary(byte);
         let (head, tail) = self.text.split_at(byte);
         let start = head.rfind('\n').map_or(0, |end| end + 1);
@@ -72,7 +72,7 @@ impl Source {
         let rest = tail.lines().next().unwrap_or_default();
         let end = byte + if tail.starts_with('\n') { 0 } else { rest.len() };
         let text = self.text.get(start..end).unwrap_or_default();
-        Place { line: head.matches('\n').count() + 1, before, text }
+        Location { line: head.matches('\n').count() + 1, before, text }
     }
 }
 
@@ -90,17 +90,17 @@ impl fmt::Display for Mistakes {
 
 impl Mistakes {
     fn show(&self, f: &mut fmt::Formatter<'_>, mistake: &Mistake) -> fmt::Result {
-        let place = self.source.place(mistake.span.start);
-        let (line, column) = place.line_and_column();
+        let location = self.source.location(mistake.span.start);
+        let (line, column) = location.line_and_column();
         let number = line.to_string();
         let margin = " ".repeat(number.len());
         // Tabs stay tabs, so that the mark stands below its place whatever their width.
-        let indent: String = place.before.chars().map(|c| if c == '\t' { '\t' } else { ' ' }).collect();
+        let indent: String = location.before.chars().map(|c| if c == '\t' { '\t' } else { ' ' }).collect();
         let marked = self.source.text.get(mistake.span.clone()).unwrap_or_default();
         let in_line = marked.lines().next().unwrap_or_default().chars().count();
         writeln!(f, "{}:{line}:{column}: {}", self.source.name, mistake.what)?;
         writeln!(f, "{margin} |")?;
-        writeln!(f, "{number} | {}", place.text)?;
+        writeln!(f, "{number} | {}", location.text)?;
         writeln!(f, "{margin} | {indent}{}", "^".repeat(in_line.max(1)))?;
         write!(f, "{margin} = {}", mistake.help)
     }

@@ -97,7 +97,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         return Err(Ended::usage("--take-over is for an m_unit: an s_unit takes nothing over"));
     }
     if arguments.check {
-        tell_correct(&settings, global)?;
+        report_correct(&settings, global)?;
         return Ok(Exit::Done.into());
     }
     let logging = logging::Logging::start(over.log.as_deref(), settings.file_log.as_deref())?;
@@ -173,7 +173,7 @@ fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| "write an IP address and a port, as 127.0.0.1:9464; names are not looked up".to_owned())
 }
 
-fn tell_correct(settings: &Settings, global: &Global) -> anyhow::Result<()> {
+fn report_correct(settings: &Settings, global: &Global) -> anyhow::Result<()> {
     let role = if settings.manager.is_some() { "s_unit" } else { "m_unit" };
     let (name, id, functions) = (&settings.name, settings.id, settings.services.len());
     if global.json {

@@ -38,9 +38,9 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     offer_all(&node, &settings, &programs)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     let (ending, fenced) = (signals.handle(), Arc::new(OnceLock::new()));
-    let told = fenced.clone();
+    let reported = fenced.clone();
     events::log(node.events(), node.addresses(), move |term| {
-        let _ = told.set(term);
+        let _ = reported.set(term);
         ending.close();
     })?;
     node.start().map_err(Ended::not_started)?;
@@ -48,7 +48,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     if let Some(listener) = metrics {
         http::serve(listener, node.metrics()).context("metrics cannot be served")?;
     }
-    if let Err(error) = tell_up(&settings, &node, served, global) {
+    if let Err(error) = report_up(&settings, &node, served, global) {
         tracing::warn!(%error, "the line that the node is up could not be written");
     }
     let mut settings = settings;
@@ -136,7 +136,7 @@ fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<Tcp
 }
 
 /// One line that says that the node is up, for scripts that wait for it.
-fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
+fn report_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
     let Settings { name, id, fleet, .. } = settings;
     let (mode, discovery) = (node.mode().as_str(), node.discovery_port());
     let metrics = metrics.map(|address| format!("http://{address}/metrics"));

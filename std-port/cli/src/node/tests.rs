@@ -16,8 +16,11 @@ fn settings(text: &str) -> Result<Settings, String> {
 
 #[test]
 fn a_port_of_metrics_without_an_address_is_told_with_both() {
-    let told = super::address(":80").unwrap_err();
-    assert!(told.contains("127.0.0.1:80") && told.contains("0.0.0.0:80") && !told.contains("names"), "{told}");
+    let reported = super::address(":80").unwrap_err();
+    assert!(
+        reported.contains("127.0.0.1:80") && reported.contains("0.0.0.0:80") && !reported.contains("names"),
+        "{reported}"
+    );
     assert!(super::address("localhost:80").unwrap_err().contains("names are not looked up"));
     assert!(super::address("127.0.0.1:80").is_ok());
 }
@@ -37,8 +40,8 @@ fn an_address_at_which_no_manager_can_be_is_a_mistake() {
         "255.255.255.255:17001",
         "224.0.0.1:5",
     ] {
-        let told = of(wrong).err().unwrap_or_else(|| panic!("{wrong} is taken"));
-        assert!(told.contains("no manager can be reached at this address"), "{told}");
+        let reported = of(wrong).err().unwrap_or_else(|| panic!("{wrong} is taken"));
+        assert!(reported.contains("no manager can be reached at this address"), "{reported}");
     }
 }
 

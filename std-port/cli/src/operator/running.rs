@@ -62,7 +62,7 @@ pub(super) fn of_others(wanted: Option<&str>, fleet: Option<u32>) -> String {
         wanted.is_none_or(|wanted| wanted == unit.unit) && fleet.is_none_or(|fleet| fleet == unit.fleet)
     };
     let all = elsewhere().into_iter().filter(is_wanted);
-    let told = all.take(SHOWN).map(|Elsewhere { unit, fleet, path, owner }| {
+    let reported = all.take(SHOWN).map(|Elsewhere { unit, fleet, path, owner }| {
         let folder = path.parent().unwrap_or(&path).display().to_string();
         let (user, sudo) = match owner {
             Some(owner) if owner == rustix::process::getuid().as_raw() => ("this user".to_owned(), String::new()),
@@ -74,7 +74,7 @@ pub(super) fn of_others(wanted: Option<&str>, fleet: Option<u32>) -> String {
              `{sudo}env CARA_CONTROL_DIR={folder} cara …` asks it"
         )
     });
-    told.collect::<Vec<_>>().join("; ")
+    reported.collect::<Vec<_>>().join("; ")
 }
 
 /// Every place where a running unit was looked for.

@@ -139,7 +139,7 @@ fn method(
     let (progress, failure) = (signature.progress(), signature.failure());
     if progress.clone().next().is_some() || failure.clone().next().is_some() {
         arguments.push(String::from("call"));
-        inputs.push(format!("call: &impl TypedCall<{}>", told(structs, name, progress, failure, units)));
+        inputs.push(format!("call: &impl TypedCall<{}>", reported(structs, name, progress, failure, units)));
     }
     let way = |variable: &VariableSpec<'_>| format!("{name} {}", variable.name);
     for argument in signature.arguments() {
@@ -158,7 +158,7 @@ fn method(
 }
 
 /// The types of what a call tells, and of its failures.
-fn told(
+fn reported(
     structs: &mut Structs,
     name: &str,
     progress: VariableSpecs<'_>,

@@ -50,7 +50,7 @@ fn lists_and_records_are_read_in_either_form() {
 #[test]
 fn a_mistake_in_a_list_is_told_with_its_path() {
     let node = r#"{id: "a", x: 1, marks: [true, true], data: []}"#;
-    let told = |last: &str, at: &str, what: &str| {
+    let reported = |last: &str, at: &str, what: &str| {
         let text = format!("order(nodes: [{node}, {node}, {node}, {last}], last: {{n: 1}})");
         let (found, shown) = mistake(&text, ORDER);
         assert!(found == at && shown.starts_with(what), "{found}: {shown}");
@@ -60,15 +60,15 @@ fn a_mistake_in_a_list_is_told_with_its_path() {
         let fields = fields.map(|(name, usual)| format!("{name}: {}", if name == field { value } else { usual }));
         format!("{{{}}}", fields.join(", "))
     };
-    told(&with("x", "\"one\""), "\"one\"", "`nodes[3].x` is a float, and this is not");
-    told(&with("id", "\"12345\""), "\"12345\"", "`nodes[3].id` takes at most 4 bytes, and this has 5");
-    told(&with("marks", "true"), "true", "`nodes[3].marks` has 2 elements, and this has 1");
-    told(&with("data", "[0x00, 7]"), "7", "`nodes[3].data[1]` is of the type bytes, and this is not");
-    told(&with("data", "[0x00, 0x00, 0x00]"), "[0x00, 0x00, 0x00]", "`nodes[3].data` takes at most 2 elements");
-    told("7", "7", "`nodes[3]` is a record, and this is not");
-    told("{id: \"a\", x: 1, data: []}", "}", "`nodes[3].marks` is missing");
-    told("{id: \"a\", y: 1}", "y", "`nodes[3]` has no field `y`");
-    told("{id: \"a\", id: \"b\"}", "id", "`nodes[3].id` is there twice");
+    reported(&with("x", "\"one\""), "\"one\"", "`nodes[3].x` is a float, and this is not");
+    reported(&with("id", "\"12345\""), "\"12345\"", "`nodes[3].id` takes at most 4 bytes, and this has 5");
+    reported(&with("marks", "true"), "true", "`nodes[3].marks` has 2 elements, and this has 1");
+    reported(&with("data", "[0x00, 7]"), "7", "`nodes[3].data[1]` is of the type bytes, and this is not");
+    reported(&with("data", "[0x00, 0x00, 0x00]"), "[0x00, 0x00, 0x00]", "`nodes[3].data` takes at most 2 elements");
+    reported("7", "7", "`nodes[3]` is a record, and this is not");
+    reported("{id: \"a\", x: 1, data: []}", "}", "`nodes[3].marks` is missing");
+    reported("{id: \"a\", y: 1}", "y", "`nodes[3]` has no field `y`");
+    reported("{id: \"a\", id: \"b\"}", "id", "`nodes[3].id` is there twice");
     let deep = format!("order(nodes: {})", "[".repeat(100_000));
     assert_eq!(mistake(&deep, ORDER).0, "[");
 }

@@ -62,8 +62,8 @@ fn a_question_is_answered_with_the_rule_that_decides() {
 fn mistakes_are_told_with_line_and_column() {
     let (_folder, path) = folder("[[allow]]\nwho = \"agv\"\nfunctions = [\"go to\"]\nverbs = \"call\"\n");
     let stage = Stage::empty();
-    let told = stage.ends(2, &["access", "check", &path]);
-    told.says("access.toml:2:7: 'agv' names no node").says("access.toml:3:13: 'go to' is no function's name");
+    let reported = stage.ends(2, &["access", "check", &path]);
+    reported.says("access.toml:2:7: 'agv' names no node").says("access.toml:3:13: 'go to' is no function's name");
     stage.ends(2, &["access", "check", "/no/such.toml"]).says("cannot be read");
     // A node does not start with it, whichever way it is named.
     stage.ends(2, &["node", "--name", "a", "--id", "1", "--access", &path]).says("access.toml:2:7");

@@ -26,8 +26,8 @@ fn with_no_unit_the_two_ways_out_are_named() {
     let stage = Stage::empty();
     for &verb in VERBS {
         stage.ends(3, verb).says("cara node").says("--as NAME/ID");
-        let told = stage.ends(3, &[verb, &["--json"]].concat()).error();
-        assert_eq!((&told["exit"], &told["name"]), (&3.into(), &"NoUnit".into()), "{told}");
+        let reported = stage.ends(3, &[verb, &["--json"]].concat()).error();
+        assert_eq!((&reported["exit"], &reported["name"]), (&3.into(), &"NoUnit".into()), "{reported}");
     }
 }
 
@@ -35,8 +35,8 @@ fn with_no_unit_the_two_ways_out_are_named() {
 #[test]
 fn with_no_unit_a_verb_for_a_running_manager_names_the_one_way_out() {
     let stage = Stage::empty();
-    let told = stage.ends(3, &["retire", "agv-1"]).says("cara node").everything();
-    assert!(!told.contains("--as"), "{told}");
+    let reported = stage.ends(3, &["retire", "agv-1"]).says("cara node").everything();
+    assert!(!reported.contains("--as"), "{reported}");
     stage.ends(2, &["retire", "agv-1", "--as", "x/9", "--insecure"]).says("leave out --as");
 }
 
@@ -92,8 +92,12 @@ fn as_a_manager_the_same_questions_have_the_same_answers() {
     fn own<'v>(verb: &[&'v str]) -> Vec<&'v str> {
         [verb, &["--as", "manager/1", "--wait", "30s"]].concat()
     }
-    let told = stage.ends(0, &own(&["scan", "--json"])).json();
-    assert_eq!((told["nodes"].as_array().unwrap().len(), &told["unit"]["name"]), (2, &"manager".into()), "{told}");
+    let reported = stage.ends(0, &own(&["scan", "--json"])).json();
+    assert_eq!(
+        (reported["nodes"].as_array().unwrap().len(), &reported["unit"]["name"]),
+        (2, &"manager".into()),
+        "{reported}"
+    );
     stage.ends(0, &own(&["functions", "agv-1"])).says("go_to(position: int[2])");
     let called = stage.ends(0, &own(&["call", "agv-2", "go_to(position: [1, 2])", "--timeout", "20s"]));
     assert_eq!(called.out, "go_to(position: [1, 2])\n");

@@ -11,9 +11,9 @@ fn functions_are_shown_as_they_are_called() {
             shown.says(signature);
         });
     }
-    let told = stage.ends(0, &["functions", "agv-1", "--json"]).json();
-    assert_eq!(told["node"], "agv-1/11");
-    assert_eq!(told["functions"].as_array().unwrap().len(), FUNCTIONS.len());
+    let reported = stage.ends(0, &["functions", "agv-1", "--json"]).json();
+    assert_eq!(reported["node"], "agv-1/11");
+    assert_eq!(reported["functions"].as_array().unwrap().len(), FUNCTIONS.len());
 }
 
 #[test]
@@ -22,8 +22,8 @@ fn functions_are_shown_as_the_trait_of_a_typed_program() {
     let shown = stage.ends(0, &["functions", "agv-1", "--rust"]);
     shown.says("#[interface]").says("pub trait Agv1 {");
     shown.says("    fn go_to(&mut self, position: [i64; 2]) -> Result<");
-    let told = stage.ends(0, &["functions", "agv-1", "--rust", "--json"]).json();
-    assert_eq!(told["rust"], shown.out);
+    let reported = stage.ends(0, &["functions", "agv-1", "--rust", "--json"]).json();
+    assert_eq!(reported["rust"], shown.out);
 }
 
 #[test]
@@ -40,10 +40,10 @@ fn results_can_be_pasted_back() {
         assert_eq!(ran.out, format!("{call}\n"));
         assert_eq!(stage.ends(0, &["call", "agv-1", ran.out.trim()]).out, ran.out);
     }
-    let told = stage.ends(0, &["call", "agv-1", "go_to(position: [1, -2])", "--json"]).json();
-    assert_eq!(told["text"], "go_to(position: [1, -2])");
-    assert_eq!(told["node"], "agv-1/11");
-    assert_eq!(told["results"][0]["value"], serde_json::json!([1, -2]));
+    let reported = stage.ends(0, &["call", "agv-1", "go_to(position: [1, -2])", "--json"]).json();
+    assert_eq!(reported["text"], "go_to(position: [1, -2])");
+    assert_eq!(reported["node"], "agv-1/11");
+    assert_eq!(reported["results"][0]["value"], serde_json::json!([1, -2]));
 }
 
 #[test]
@@ -60,8 +60,8 @@ fn all_nodes_are_called_at_once() {
     let stage = Stage::with(&["agv-1", "agv-2"]);
     let shown = stage.ends(0, &["call", "--all", "go_to(position: [1, 2])"]);
     shown.says("agv-1/11  go_to(position: [1, 2])").says("agv-2/12  go_to(position: [1, 2])");
-    let told = stage.ends(0, &["call", "--all", "go_to(position: [1, 2])", "--json"]).lines();
-    assert_eq!(told.len(), 2);
+    let reported = stage.ends(0, &["call", "--all", "go_to(position: [1, 2])", "--json"]).lines();
+    assert_eq!(reported.len(), 2);
     stage.ends(1, &["call", "--all", "fail"]).says("agv-1/11: Service").says("agv-2/12: Service");
     stage.ends(2, &["call", "--all", "goto"]).says("did you mean `go_to`?");
     let none = stage.ends(2, &["call", "--all", "goto"]);
@@ -73,9 +73,9 @@ fn an_asynchronous_call_returns_when_it_is_accepted() {
     let stage = Stage::with(&["agv-1"]);
     stage.ends(0, &["call", "agv-1", "slow", "--async"]).says("accepted as call ");
     stage.ends(0, &["call", "agv-1", "fail", "--async", "--priority", "high"]).says("accepted as call ");
-    let told =
+    let reported =
         stage.ends(0, &["call", "agv-1", "go_to(position: [1, 2])", "--async", "--best-effort", "--json"]).json();
-    assert!(told["call"].is_u64() && told["error"].is_null(), "{told}");
+    assert!(reported["call"].is_u64() && reported["error"].is_null(), "{reported}");
     stage.ends(0, &["call", "--all", "go_to(position: [1, 2])", "--async"]).says("agv-1/11  accepted");
 }
 
@@ -84,8 +84,8 @@ fn a_failure_of_the_node_is_told_by_name() {
     let stage = Stage::with(&["agv-1"]);
     stage.ends(1, &["call", "agv-1", "fail"]).says("agv-1/11: Service").says("code 7");
     stage.ends(1, &["call", "agv-1", "slow", "--timeout", "100ms"]).says("TimedOut");
-    let told = stage.ends(1, &["call", "agv-1", "slow", "--timeout", "100ms", "--json"]).json();
-    assert_eq!((&told["error"]["error"], &told["text"]), (&"TimedOut".into(), &serde_json::Value::Null));
+    let reported = stage.ends(1, &["call", "agv-1", "slow", "--timeout", "100ms", "--json"]).json();
+    assert_eq!((&reported["error"]["error"], &reported["text"]), (&"TimedOut".into(), &serde_json::Value::Null));
 }
 
 #[test]

@@ -8,8 +8,8 @@ fn a_constraint_of_the_unit_is_set_while_it_runs() {
     stage.ends(0, &["set", ".", "request_timeout", "50ms"]).says("request_timeout").says("50 ms");
     stage.ends(1, &["call", "agv-1", "slow"]).says("TimedOut");
     for name in ["manager", "manager/1"] {
-        let told = stage.ends(0, &["set", name, "minimum-interval", "0", "--json"]).json();
-        assert_eq!((&told["minimum_interval_us"], &told["request_timeout_us"]), (&0.into(), &50_000.into()));
+        let reported = stage.ends(0, &["set", name, "minimum-interval", "0", "--json"]).json();
+        assert_eq!((&reported["minimum_interval_us"], &reported["request_timeout_us"]), (&0.into(), &50_000.into()));
     }
     assert_eq!(stage.ends(0, &["set", ".", "message_size", "32KiB", "--json"]).json()["message_size"], 32_768);
     assert_eq!(stage.ends(0, &["set", ".", "calls_per_peer", "64", "--json"]).json()["calls_per_peer"], 64);
@@ -18,8 +18,8 @@ fn a_constraint_of_the_unit_is_set_while_it_runs() {
 #[test]
 fn the_side_towards_one_node_is_set_for_it_alone() {
     let stage = Stage::with(&["agv-1", "agv-2"]);
-    let told = stage.ends(0, &["set", "agv-1", "request_timeout", "100ms", "--json"]).json();
-    assert_eq!(told["request_timeout_us"], 100_000);
+    let reported = stage.ends(0, &["set", "agv-1", "request_timeout", "100ms", "--json"]).json();
+    assert_eq!(reported["request_timeout_us"], 100_000);
     stage.ends(1, &["call", "agv-1", "slow"]).says("TimedOut");
     let own = stage.ends(0, &["scan", "--json"]).json()["unit"]["constraints"]["request_timeout_us"].clone();
     assert_eq!(own, 20_000_000);

@@ -53,10 +53,10 @@ fn a_call_tells_how_far_it_is_and_why_it_fails() {
 fn programs_read_progress_and_failure_as_json() {
     let (stage, agv) = stage();
     let lines = stage.ends(1, &["call", "agv-1", "go(free: false)", "--json"]).lines();
-    let (told, ended) = lines.split_at(lines.len() - 1);
-    let left: Vec<i64> = told.iter().map(|line| line["progress"][0]["value"].as_i64().unwrap()).collect();
+    let (reported, ended) = lines.split_at(lines.len() - 1);
+    let left: Vec<i64> = reported.iter().map(|line| line["progress"][0]["value"].as_i64().unwrap()).collect();
     assert!(left.contains(&12) && left.contains(&5) && left.is_sorted_by(|a, b| a >= b), "{left:?}");
-    assert_eq!(told[0]["node"], "agv-1/11");
+    assert_eq!(reported[0]["node"], "agv-1/11");
     let error = &ended[0]["error"];
     assert_eq!((&error["error"], &error["values"][0]["value"]), (&"Service".into(), &serde_json::json!([3, 4])));
     assert_eq!((&error["code"], &error["reason"]), (&7.into(), &"the way is \u{1b}[2Jblocked".into()));

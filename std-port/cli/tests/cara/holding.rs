@@ -124,11 +124,11 @@ fn who_goes_away_is_noticed_among_many_events() {
     let driver = Driver::join(&stage);
     let held = driver.held(&stage);
     let (unit, busy) = (driver.unit.clone(), Arc::new(AtomicBool::new(true)));
-    let goes_on = busy.clone();
+    let continues = busy.clone();
     let events = std::thread::spawn(move || {
         let functions = unit.my_function_list();
         let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
-        while goes_on.load(Ordering::SeqCst) {
+        while continues.load(Ordering::SeqCst) {
             functions.add_service(&Definition::parse("news()").unwrap(), ServiceOptions::new(), nothing).unwrap();
             unit.publish_my_function_list().unwrap();
             std::thread::sleep(Duration::from_millis(5));

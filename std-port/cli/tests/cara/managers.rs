@@ -95,8 +95,8 @@ fn who_is_missing_is_shown_until_it_is_retired() {
     let mut stage = Stage::with(&["agv-1", "agv-2"]);
     stage.know("agv-9", 19);
     let state = |stage: &Stage, name: &str| {
-        let told = stage.ends(0, &["scan", "--json"]).json();
-        let nodes = told["nodes"].as_array().unwrap().clone();
+        let reported = stage.ends(0, &["scan", "--json"]).json();
+        let nodes = reported["nodes"].as_array().unwrap().clone();
         nodes.into_iter().find(|node| node["name"] == name)
     };
     let expected = |node: &Value| (node["connected"].as_bool().unwrap(), node["expected"].as_bool().unwrap());
@@ -110,13 +110,13 @@ fn who_is_missing_is_shown_until_it_is_retired() {
     let none = stage.ends(1, &["call", "--all", "fly"]);
     none.says("agv-1/11: UnknownFunction").says("agv-2/12: UnknownFunction").says("agv-9/19: NotConnected");
     none.says("no connected node has published `fly`");
-    let told = stage.ends(1, &["call", "--all", "fly", "--json"]).lines();
-    let mut told: Vec<_> =
-        told.iter().map(|line| (line["node"].to_string(), line["error"]["error"].to_string())).collect();
-    told.sort();
+    let reported = stage.ends(1, &["call", "--all", "fly", "--json"]).lines();
+    let mut reported: Vec<_> =
+        reported.iter().map(|line| (line["node"].to_string(), line["error"]["error"].to_string())).collect();
+    reported.sort();
     let of = |node: &str, error: &str| (format!("\"{node}\""), format!("\"{error}\""));
     let unknown = ["agv-1/11", "agv-2/12"].map(|node| of(node, "UnknownFunction"));
-    assert_eq!(told, [&unknown[..], &[of("agv-9/19", "NotConnected")]].concat());
+    assert_eq!(reported, [&unknown[..], &[of("agv-9/19", "NotConnected")]].concat());
     stage.ends(1, &["functions", "agv-9"]).says("has not joined");
     stage.ends(2, &["retire", "agv-1"]).says("is connected");
     stage.ends(1, &["retire", "agv-70"]).says("no node `agv-70`");
@@ -176,8 +176,8 @@ fn idle_connections_take_no_descriptor_from_the_operator_and_from_vehicles() {
             until("the manager has its list", || stage.ready() == 1);
             std::thread::sleep(Duration::from_secs(2));
             assert!(vehicle.is_connected() && start.elapsed() < PATIENCE * 3);
-            let (told, seconds) = (lines.load(Ordering::Relaxed) - lines_before, start.elapsed().as_secs() + 1);
-            assert!(told <= 6 * seconds as usize, "{told} lines in {seconds} s");
+            let (reported, seconds) = (lines.load(Ordering::Relaxed) - lines_before, start.elapsed().as_secs() + 1);
+            assert!(reported <= 6 * seconds as usize, "{reported} lines in {seconds} s");
             vehicle.stop();
         }));
         over.store(true, Ordering::Relaxed);
@@ -258,8 +258,8 @@ fn what_a_vehicle_has_obeyed_is_forgotten_while_it_does_not_run() {
     // What is kept counts at its next start, until it is forgotten.
     stage.kill_manager();
     assert_eq!(start(&stage).claim(), obeyed);
-    let told = stage.ends(0, &["forget-claim", "agv-1/11", "--state", folder]);
-    told.says(&format!("agv-1/11 (fleet {}) has forgotten claim {obeyed} of manager/1", stage.fleet));
+    let reported = stage.ends(0, &["forget-claim", "agv-1/11", "--state", folder]);
+    reported.says(&format!("agv-1/11 (fleet {}) has forgotten claim {obeyed} of manager/1", stage.fleet));
     let audit = std::fs::read_to_string(state.path().join("audit.log")).unwrap();
     assert!(audit.contains("\"ask\":\"forget-claim\"") && audit.contains("agv-1/11"), "{audit}");
     assert_eq!(start(&stage).claim(), Claim::NONE);

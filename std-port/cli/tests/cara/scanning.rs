@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Stdio;
 
 use cara_std::control::Control;
-use cara_std::keys::{FleetKeys, Store, place};
+use cara_std::keys::{FleetKeys, Store, location};
 use cara_std::{Fleet, Identity, Interfaces, Unit};
 
 use crate::support::{Ran, Stage};
@@ -16,11 +16,12 @@ fn a_scan_shows_who_is_there() {
     let stage = Stage::with(&["agv-1", "agv-2"]);
     let shown = stage.ends(0, &["scan"]);
     shown.says("agv-1").says("11").says("s_unit").says("connected").says("127.0.0.1").says("message");
-    let told = stage.ends(0, &["scan", "--json"]).json();
-    assert_eq!(told["unit"]["name"], "manager");
-    let names: Vec<_> = told["nodes"].as_array().unwrap().iter().map(|node| node["name"].as_str().unwrap()).collect();
+    let reported = stage.ends(0, &["scan", "--json"]).json();
+    assert_eq!(reported["unit"]["name"], "manager");
+    let names: Vec<_> =
+        reported["nodes"].as_array().unwrap().iter().map(|node| node["name"].as_str().unwrap()).collect();
     assert!(names.len() == 2 && names.contains(&"agv-1") && names.contains(&"agv-2"), "{names:?}");
-    let link = &told["nodes"][0]["link"];
+    let link = &reported["nodes"][0]["link"];
     let numbers = ["silent_ms", "calls", "calls_here", "queued_bytes"].map(|number| link[number].as_u64());
     assert!(numbers.iter().all(Option::is_some) && numbers[0] < Some(30_000), "{link}");
     assert_eq!(stage.ends(0, &["scan", "--offering", "go_to", "--json"]).json()["nodes"].as_array().unwrap().len(), 2);
@@ -36,11 +37,11 @@ fn a_scan_shows_who_was_refused_and_why() {
     duplicate.start().unwrap();
     let start = std::time::Instant::now();
     loop {
-        let told = stage.ends(0, &["scan", "--json"]).json();
-        if told["refused"][0]["reason"] == "DuplicateIdentity" {
+        let reported = stage.ends(0, &["scan", "--json"]).json();
+        if reported["refused"][0]["reason"] == "DuplicateIdentity" {
             break;
         }
-        assert!(start.elapsed() < crate::support::PATIENCE, "{told}");
+        assert!(start.elapsed() < crate::support::PATIENCE, "{reported}");
         std::thread::sleep(std::time::Duration::from_millis(100));
     }
     stage.ends(0, &["scan"]).says("DuplicateIdentity").says("give each node its own");
@@ -53,13 +54,13 @@ fn without_a_manager_a_scan_surveys_the_network() {
     let agv = Unit::builder("lost-agv", 5, "nobody", 9).unwrap().fleet(stage.fleet).interfaces(Interfaces::Loopback);
     let agv = agv.insecure().build().unwrap();
     agv.start().unwrap();
-    let told = stage.ends(0, &["scan", "--listen", "10s", "--json"]).json();
+    let reported = stage.ends(0, &["scan", "--listen", "10s", "--json"]).json();
     agv.stop();
-    let heard = told["heard"].as_array().unwrap();
-    let found = heard.iter().find(|heard| heard["name"] == "lost-agv").unwrap_or_else(|| panic!("{told}"));
+    let heard = reported["heard"].as_array().unwrap();
+    let found = heard.iter().find(|heard| heard["name"] == "lost-agv").unwrap_or_else(|| panic!("{reported}"));
     assert_eq!((&found["id"], &found["role"]), (&5.into(), &"s_unit".into()));
     assert!(found["looks_for"].as_str().unwrap().contains("nobody"), "{found}");
-    assert!(told["unit"].is_null());
+    assert!(reported["unit"].is_null());
     stage.ends(0, &["scan", "--listen", "10ms"]).says("A survey hears");
     stage.ends(3, &["scan", "--offering", "go_to"]).says("--as NAME/ID");
 }
@@ -67,8 +68,8 @@ fn without_a_manager_a_scan_surveys_the_network() {
 #[test]
 fn a_survey_can_be_had_beside_a_manager() {
     let stage = Stage::with(&[]);
-    let told = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json"]).json();
-    assert!(told["heard"].as_array().unwrap().iter().any(|heard| heard["name"] == "manager"), "{told}");
+    let reported = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json"]).json();
+    assert!(reported["heard"].as_array().unwrap().iter().any(|heard| heard["name"] == "manager"), "{reported}");
 }
 
 #[test]
@@ -76,17 +77,17 @@ fn what_is_published_is_read() {
     let stage = Stage::with(&["agv-1"]);
     stage.ends(0, &["publish", "agv-1", "--timeout", "20s"]).says("published to agv-1/11");
     stage.ends(0, &["publish", "--timeout", "20s"]).says("published to all nodes");
-    let told = stage.ends(0, &["publish", "--json", "--timeout", "20s"]).json();
-    assert_eq!(told["unread"], serde_json::json!([]));
+    let reported = stage.ends(0, &["publish", "--json", "--timeout", "20s"]).json();
+    assert_eq!(reported["unread"], serde_json::json!([]));
     stage.ends(1, &["publish", "agv-2"]).says("agv-1/11");
 }
 
 #[test]
 fn counters_are_shown() {
     let stage = Stage::with(&["agv-1"]);
-    let told = stage.ends(0, &["counters", "--json"]).json();
-    assert!(told["unit"].as_object().is_some_and(|unit| !unit.is_empty()), "{told}");
-    assert!(told["nodes"]["agv-1/11"].as_object().is_some_and(|link| !link.is_empty()), "{told}");
+    let reported = stage.ends(0, &["counters", "--json"]).json();
+    assert!(reported["unit"].as_object().is_some_and(|unit| !unit.is_empty()), "{reported}");
+    assert!(reported["nodes"]["agv-1/11"].as_object().is_some_and(|link| !link.is_empty()), "{reported}");
     stage.ends(0, &["counters"]).says("unit").says("link to agv-1/11");
     let (few, all) = (stage.ends(0, &["counters", "agv-1"]), stage.ends(0, &["counters", "agv-1", "--zeros"]));
     assert!(few.out.lines().count() < all.out.lines().count(), "{}", all.out);
@@ -163,9 +164,9 @@ impl Modes {
 }
 
 /// Name, mode and proof of those of the fleet: other tests are on the same ports.
-fn proofs(fleet: u32, told: &serde_json::Value) -> Vec<(String, String, String)> {
+fn proofs(fleet: u32, reported: &serde_json::Value) -> Vec<(String, String, String)> {
     let text = |value: &serde_json::Value| value.as_str().unwrap_or("-").to_owned();
-    let heard = told["heard"].as_array().unwrap().iter().filter(|heard| heard["fleet"] == fleet);
+    let heard = reported["heard"].as_array().unwrap().iter().filter(|heard| heard["fleet"] == fleet);
     let mut heard: Vec<_> =
         heard.map(|heard| (text(&heard["name"]), text(&heard["mode"]), text(&heard["proof"]))).collect();
     heard.sort();
@@ -180,16 +181,16 @@ fn three(heard: [[&str; 3]; 3]) -> Vec<(String, String, String)> {
 #[test]
 fn a_survey_tells_whose_datagrams_are_proven() {
     let modes = Modes::new();
-    let told = modes.scan(modes.keys.path(), &["--json"]).json();
+    let reported = modes.scan(modes.keys.path(), &["--json"]).json();
     let expected =
         three([["boss", "secured", "fleet"], ["open", "plain", "none"], ["stranger", "secured", "other_keys"]]);
-    assert_eq!(proofs(modes.stage.fleet, &told), expected, "{told}");
+    assert_eq!(proofs(modes.stage.fleet, &reported), expected, "{reported}");
     // Of the same test beside it there is another one.
     let own = |heard: &&serde_json::Value| heard["name"] == "boss" && heard["fleet"] == modes.stage.fleet;
-    let boss = told["heard"].as_array().unwrap().iter().find(own).unwrap();
+    let boss = reported["heard"].as_array().unwrap().iter().find(own).unwrap();
     // The manager answered the survey's question.
-    assert!(boss["answers"].as_u64() > Some(0) && boss["generation"] == 1, "{told}");
-    assert_eq!(told["keys_of"], serde_json::json!([modes.stage.fleet]));
+    assert!(boss["answers"].as_u64() > Some(0) && boss["generation"] == 1, "{reported}");
+    assert_eq!(reported["keys_of"], serde_json::json!([modes.stage.fleet]));
     modes.scan(modes.keys.path(), &[]).says("secured, proven").says("secured, other keys").says("do not meet");
 }
 
@@ -197,25 +198,25 @@ fn a_survey_tells_whose_datagrams_are_proven() {
 fn without_keys_a_survey_hears_secured_units_and_tells_how_to_get_keys() {
     let modes = Modes::new();
     let empty = crate::support::private_folder();
-    let told = modes.scan(empty.path(), &["--json"]).json();
+    let reported = modes.scan(empty.path(), &["--json"]).json();
     let expected =
         three([["boss", "secured", "unchecked"], ["open", "plain", "none"], ["stranger", "secured", "unchecked"]]);
-    assert_eq!(proofs(modes.stage.fleet, &told), expected, "{told}");
+    assert_eq!(proofs(modes.stage.fleet, &reported), expected, "{reported}");
     let command = format!("`cara keys new-fleet --fleet {} ", modes.stage.fleet);
     modes.scan(empty.path(), &[]).says("secured, not checked").says(&command).says("--key-file");
     // In plain mode the survey hears plain units only.
-    let told = modes.scan(modes.keys.path(), &["--json", "--insecure"]).json();
+    let reported = modes.scan(modes.keys.path(), &["--json", "--insecure"]).json();
     assert!(
-        proofs(modes.stage.fleet, &told).iter().all(|(_, mode, _)| mode == "plain")
-            && told["keys_of"] == serde_json::json!([])
+        proofs(modes.stage.fleet, &reported).iter().all(|(_, mode, _)| mode == "plain")
+            && reported["keys_of"] == serde_json::json!([])
     );
     // A file of the fleet's is enough.
-    let file = place::file_name(&Identity::m_unit("boss", 1).unwrap(), Fleet(modes.stage.fleet));
+    let file = location::file_name(&Identity::m_unit("boss", 1).unwrap(), Fleet(modes.stage.fleet));
     let file = modes.keys.path().join(file);
-    let told = modes.scan(empty.path(), &["--json", "--key-file", file.to_str().unwrap()]).json();
+    let reported = modes.scan(empty.path(), &["--json", "--key-file", file.to_str().unwrap()]).json();
     assert!(
-        proofs(modes.stage.fleet, &told).iter().any(|(name, _, proof)| name == "boss" && proof == "fleet"),
-        "{told}"
+        proofs(modes.stage.fleet, &reported).iter().any(|(name, _, proof)| name == "boss" && proof == "fleet"),
+        "{reported}"
     );
     std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).unwrap();
     let ran = modes.scan(empty.path(), &["--key-file", file.to_str().unwrap()]);

@@ -85,10 +85,13 @@ fn all_are_stopped_whatever_their_functions_are_called_until_they_are_reset() {
     reset(&stage, "lift");
     stage.ends(0, &["call", "lift", "go"]);
     is_stopped(&stage, "agv", 1);
-    let told = stage.ends(0, &["stop", "lift", "--json"]).lines();
-    assert_eq!((told.len(), &told[0]["node"], &told[0]["error"]), (2, &"lift/22".into(), &serde_json::Value::Null));
-    assert_eq!((&told[1]["nodes"], &told[1]["acknowledged"]), (&1.into(), &1.into()));
-    assert!(told[0]["took_us"].is_u64() && told[1]["last_us"] == told[0]["took_us"], "{told:?}");
+    let reported = stage.ends(0, &["stop", "lift", "--json"]).lines();
+    assert_eq!(
+        (reported.len(), &reported[0]["node"], &reported[0]["error"]),
+        (2, &"lift/22".into(), &serde_json::Value::Null)
+    );
+    assert_eq!((&reported[1]["nodes"], &reported[1]["acknowledged"]), (&1.into(), &1.into()));
+    assert!(reported[0]["took_us"].is_u64() && reported[1]["last_us"] == reported[0]["took_us"], "{reported:?}");
     is_stopped(&stage, "lift", 1);
     reset(&stage, "--all");
     stage.ends(0, &["call", "--all", "go"]);
@@ -111,10 +114,11 @@ fn who_was_not_reached_and_who_cannot_be_stopped_is_told_by_name() {
     shown.says("agv/21  acknowledged").says("gone/31: not reached: it was not connected").says("depot/30: NoStop: ");
     shown.says("1 of 3 acknowledged, the last after ").says("; not acknowledged: depot/30, gone/31");
     is_stopped(&stage, "agv", 1);
-    let told = stage.ends(1, &["reset", "--all", "--json"]).lines();
-    let error = |node: &str| told.iter().find(|line| line["node"] == node).map(|line| line["error"]["error"].clone());
+    let reported = stage.ends(1, &["reset", "--all", "--json"]).lines();
+    let error =
+        |node: &str| reported.iter().find(|line| line["node"] == node).map(|line| line["error"]["error"].clone());
     assert_eq!((error("depot/30"), error("gone/31")), (Some("NoReset".into()), Some("NotConnected".into())));
-    assert_eq!(told.last().unwrap()["nodes"], 3);
+    assert_eq!(reported.last().unwrap()["nodes"], 3);
     stage.ends(1, &["stop", "depot"]).says("NoStop");
     stage.ends(1, &["stop", "gone"]).says("not reached");
     drop(vehicle);
@@ -199,9 +203,9 @@ fn who_moves_what_is_shown_with_what_inhibits_it() {
     until("it runs", || row() == "agv/21 go runs 1 - -");
     stage.ends(0, &["stop", "agv"]);
     until("it is stopped", || row() == "agv/21 go stopped 1 - by unit 1");
-    let told = &stage.ends(0, &["orders", "--json"]).lines()[0]["orders"][0];
+    let reported = &stage.ends(0, &["orders", "--json"]).lines()[0]["orders"][0];
     assert_eq!(
-        (&told["node"], &told["order"], &told["inhibited"]["by"]),
+        (&reported["node"], &reported["order"], &reported["inhibited"]["by"]),
         (&"agv".into(), &"stopped".into(), &1.into())
     );
     reset(&stage, "agv");
@@ -217,10 +221,10 @@ fn a_stop_that_is_not_answered_is_sent_one_way_as_well_and_says_so() {
     let unit = stage.vehicle("agv", 21).build().unwrap();
     let count = Arc::<AtomicU32>::default();
     let (counted, hangs) = (count.clone(), Arc::<AtomicBool>::new(true.into()));
-    let goes_on = hangs.clone();
+    let continues = hangs.clone();
     let halt = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
         counted.fetch_add(1, Ordering::SeqCst);
-        while goes_on.load(Ordering::SeqCst) {
+        while continues.load(Ordering::SeqCst) {
             std::thread::sleep(std::time::Duration::from_millis(10));
         }
         Ok(())

@@ -62,8 +62,8 @@ fn without_a_name_each_stream_is_listed_once() {
 #[test]
 fn what_is_no_stream_is_said() {
     let (stage, agv, _) = stage();
-    let told = stage.cara(&["stream", "agv-1", "speed", "--json"]).error();
-    assert_eq!(told["name"], "UnknownFunction", "{told}");
+    let reported = stage.cara(&["stream", "agv-1", "speed", "--json"]).error();
+    assert_eq!(reported["name"], "UnknownFunction", "{reported}");
     stage.ends(2, &["stream", "agv-1", "pose", "--rate", "0"]);
     stage.ends(2, &["stream", "agv-1", "--rate", "1"]);
     agv.stop();

@@ -232,8 +232,8 @@ impl Ran {
     /// The error that it printed as JSON.
     #[track_caller]
     pub(crate) fn error(&self) -> Value {
-        let told: Value = serde_json::from_str(self.err.trim()).unwrap_or_else(|_| panic!("{}", self.everything()));
-        told["error"].clone()
+        let reported: Value = serde_json::from_str(self.err.trim()).unwrap_or_else(|_| panic!("{}", self.everything()));
+        reported["error"].clone()
     }
 
     #[track_caller]

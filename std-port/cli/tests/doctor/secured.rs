@@ -28,17 +28,20 @@ fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
     let clinic = Clinic::new();
     let secured = manager(&clinic, |boss| boss);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").insecure());
-    for told in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
-        told.is(&["mode-mismatch"], 4);
-        assert!(told.found(0).contains("agv/7 at ") && told.found(0).contains("boss/1 is secured"), "{told:?}");
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+        reported.is(&["mode-mismatch"], 4);
+        assert!(
+            reported.found(0).contains("agv/7 at ") && reported.found(0).contains("boss/1 is secured"),
+            "{reported:?}"
+        );
     }
     secured.stop();
     let clinic = Clinic::new();
     let _plain = manager(&clinic, |boss| boss.insecure());
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
-    for told in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
-        told.is(&["mode-mismatch"], 4);
-        assert!(told.found(0).contains("boss/1 is in plain mode"), "{told:?}");
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+        reported.is(&["mode-mismatch"], 4);
+        assert!(reported.found(0).contains("boss/1 is in plain mode"), "{reported:?}");
     }
 }
 
@@ -46,9 +49,9 @@ fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
 fn without_keys_of_the_fleet_the_doctor_says_so_with_the_command() {
     let clinic = Clinic::new();
     let nothing = private_directory();
-    let told = clinic.doctor_with_keys(nothing.path(), &["agv", "--listen", "3s"]);
-    told.is(&["keys-missing", "not-heard"], 4);
-    assert!(told.advice(0).contains(&format!("`cara keys new-fleet --fleet {} ", clinic.fleet)), "{told:?}");
+    let reported = clinic.doctor_with_keys(nothing.path(), &["agv", "--listen", "3s"]);
+    reported.is(&["keys-missing", "not-heard"], 4);
+    assert!(reported.advice(0).contains(&format!("`cara keys new-fleet --fleet {} ", clinic.fleet)), "{reported:?}");
     clinic.doctor_with_keys(nothing.path(), &["--listen", "3s"]).is(&["keys-missing", "no-manager"], 4);
     // Plain mode needs no keys.
     clinic.doctor_with_keys(nothing.path(), &["agv", "--listen", "3s", "--insecure"]).is(&["not-heard"], 4);
@@ -61,12 +64,12 @@ fn keys_of_another_root_are_told_of_the_node_and_of_its_manager() {
     let others = draw(clinic.fleet);
     let ours = manager(&clinic, |boss| boss);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(others.ring(&agv()).unwrap()));
-    for told in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
-        told.is(&["wrong-keys"], 4);
-        assert!(told.found(0).starts_with("agv/7 at "), "{told:?}");
-        let advice = told.advice(0);
-        assert!(advice.contains(&format!("`cara keys show --fleet {}`", clinic.fleet)), "{told:?}");
-        assert!(advice.contains("do nothing") && !advice.contains("derive"), "it may have been revoked: {told:?}");
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
+        reported.is(&["wrong-keys"], 4);
+        assert!(reported.found(0).starts_with("agv/7 at "), "{reported:?}");
+        let advice = reported.advice(0);
+        assert!(advice.contains(&format!("`cara keys show --fleet {}`", clinic.fleet)), "{reported:?}");
+        assert!(advice.contains("do nothing") && !advice.contains("derive"), "it may have been revoked: {reported:?}");
     }
     ours.stop();
     let clinic = Clinic::new();
@@ -74,9 +77,9 @@ fn keys_of_another_root_are_told_of_the_node_and_of_its_manager() {
     let others = draw(clinic.fleet).ring(&boss()).unwrap();
     let _far = manager(&clinic, |boss| boss.keys(others).control(Control::Off));
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
-    let told = clinic.doctor(&["agv"]);
-    told.is(&["wrong-keys"], 4);
-    assert!(told.found(0).starts_with("boss/1 at "), "{told:?}");
+    let reported = clinic.doctor(&["agv"]);
+    reported.is(&["wrong-keys"], 4);
+    assert!(reported.found(0).starts_with("boss/1 at "), "{reported:?}");
 }
 
 #[test]
@@ -87,9 +90,9 @@ fn a_node_that_the_managers_file_does_not_have_is_told() {
     let manager = manager(&clinic, |system| system.keys(without.ring(&boss()).unwrap()));
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
     until("it was refused", || !manager.findings().is_empty());
-    for told in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
-        told.is(&["no-pair-key"], 4);
-        assert!(told.found(0).contains("agv/7"), "{told:?}");
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+        reported.is(&["no-pair-key"], 4);
+        assert!(reported.found(0).contains("agv/7"), "{reported:?}");
     }
 }
 
@@ -105,9 +108,12 @@ fn a_change_of_keys_that_left_a_node_behind_is_told() {
     drop(store);
     let _manager = manager(&clinic, |boss| boss);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(old));
-    for told in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
-        told.is(&["key-generations"], 4);
-        assert!(told.found(0).contains("with generation 1 ") && told.found(0).contains("generation 2:"), "{told:?}");
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
+        reported.is(&["key-generations"], 4);
+        assert!(
+            reported.found(0).contains("with generation 1 ") && reported.found(0).contains("generation 2:"),
+            "{reported:?}"
+        );
     }
     // As on another host: both were heard, and neither takes the other.
     clinic.doctor_elsewhere(&["agv"]).is(&["key-generations"], 4);
@@ -120,14 +126,14 @@ fn a_key_file_that_others_can_read_is_told_with_the_command() {
     until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
     let file = clinic.key_file("boss");
     set_permissions(&file, Permissions::from_mode(0o644)).unwrap();
-    let told = clinic.doctor(&["--listen", "3s"]);
-    told.is(&["key-file-refused"], 4);
-    assert!(told.found(0).contains("chmod 600"), "{told:?}");
+    let reported = clinic.doctor(&["--listen", "3s"]);
+    reported.is(&["key-file-refused"], 4);
+    assert!(reported.found(0).contains("chmod 600"), "{reported:?}");
     // With this key file only, and no other node: the file explains why nothing is heard.
     let clinic = Clinic::new();
     set_permissions(clinic.key_file("boss"), Permissions::from_mode(0o644)).unwrap();
-    let told = clinic.doctor_with_keys(&clinic.key_file("boss"), &["agv", "--listen", "3s"]);
-    told.is(&["key-file-refused", "not-heard"], 4);
+    let reported = clinic.doctor_with_keys(&clinic.key_file("boss"), &["agv", "--listen", "3s"]);
+    reported.is(&["key-file-refused", "not-heard"], 4);
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
-use cara_std::keys::{FleetKeys, KeyRing, Store, place};
+use cara_std::keys::{FleetKeys, KeyRing, Store, location};
 use cara_std::{Builder, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, MUnit, SUnit, Unit};
 use serde_json::Value;
 
@@ -96,7 +96,7 @@ impl Clinic {
 
     /// The file with the keys of the m_unit `name/1`.
     pub(crate) fn key_file(&self, name: &str) -> PathBuf {
-        self.keys.path().join(place::file_name(&Identity::m_unit(name, 1).unwrap(), Fleet(self.fleet)))
+        self.keys.path().join(location::file_name(&Identity::m_unit(name, 1).unwrap(), Fleet(self.fleet)))
     }
 
     pub(crate) fn started(&self, unit: Builder<(), SUnit>) -> Unit {
@@ -117,24 +117,24 @@ impl Clinic {
     }
 
     /// What the doctor says on this host.
-    pub(crate) fn doctor(&self, arguments: &[&str]) -> Told {
-        self.told(arguments, self.sockets.path(), self.keys.path())
+    pub(crate) fn doctor(&self, arguments: &[&str]) -> Report {
+        self.reported(arguments, self.sockets.path(), self.keys.path())
     }
 
     /// What it says where only these keys are.
-    pub(crate) fn doctor_with_keys(&self, keys: &Path, arguments: &[&str]) -> Told {
-        self.told(arguments, self.sockets.path(), keys)
+    pub(crate) fn doctor_with_keys(&self, keys: &Path, arguments: &[&str]) -> Report {
+        self.reported(arguments, self.sockets.path(), keys)
     }
 
     /// What it says where no unit can be asked.
-    pub(crate) fn doctor_elsewhere(&self, arguments: &[&str]) -> Told {
-        self.told(arguments, private_directory().path(), self.keys.path())
+    pub(crate) fn doctor_elsewhere(&self, arguments: &[&str]) -> Report {
+        self.reported(arguments, private_directory().path(), self.keys.path())
     }
 
-    fn told(&self, arguments: &[&str], sockets: &Path, keys: &Path) -> Told {
+    fn reported(&self, arguments: &[&str], sockets: &Path, keys: &Path) -> Report {
         let (code, output, errors) = self.run(arguments, sockets, keys);
-        let told = serde_json::from_str(&output).unwrap_or_else(|_| panic!("{output}{errors}"));
-        Told { told, code }
+        let reported = serde_json::from_str(&output).unwrap_or_else(|_| panic!("{output}{errors}"));
+        Report { reported, code }
     }
 
     /// From then on no unit can be asked.
@@ -185,12 +185,12 @@ impl Drop for Killed {
 
 /// What the doctor said.
 #[derive(Debug)]
-pub(crate) struct Told {
-    told: Value,
+pub(crate) struct Report {
+    reported: Value,
     pub(crate) code: i32,
 }
 
-impl Told {
+impl Report {
     /// The names of the findings, in their order.
     pub(crate) fn ids(&self) -> Vec<&str> {
         self.findings().iter().map(|finding| finding["id"].as_str().unwrap()).collect()
@@ -199,7 +199,7 @@ impl Told {
     /// These findings and no others, in this order.
     #[track_caller]
     pub(crate) fn is(&self, ids: &[&str], code: i32) {
-        assert_eq!((self.ids(), self.code), (ids.to_vec(), code), "{}", self.told);
+        assert_eq!((self.ids(), self.code), (ids.to_vec(), code), "{}", self.reported);
         assert!(self.findings().iter().all(|finding| !finding["advice"].as_str().unwrap().is_empty()));
     }
 
@@ -214,7 +214,7 @@ impl Told {
     }
 
     fn findings(&self) -> &Vec<Value> {
-        self.told["findings"].as_array().unwrap()
+        self.reported["findings"].as_array().unwrap()
     }
 }
 

@@ -107,12 +107,12 @@ pub fn code_of(outcome: anyhow::Result<ExitCode>, global: &Global) -> ExitCode {
     match outcome {
         Ok(code) => code,
         Err(error) if is_closed_pipe(&error) => Exit::Done.into(),
-        Err(error) => tell(&error, global.json),
+        Err(error) => report(&error, global.json),
     }
 }
 
 /// Prints an error and tells its exit code.
-pub fn tell(error: &anyhow::Error, json: bool) -> ExitCode {
+pub fn report(error: &anyhow::Error, json: bool) -> ExitCode {
     let (exit, name) = match error.downcast_ref::<Ended>() {
         Some(ended) => (ended.exit, ended.name.as_str()),
         None => (Exit::Failed, "Failed"),
@@ -121,8 +121,8 @@ pub fn tell(error: &anyhow::Error, json: bool) -> ExitCode {
     let _ = if json {
         let text = format!("{error:#}");
         let text = text.strip_prefix("error: ").unwrap_or(&text);
-        let told = json!({ "error": { "name": name, "exit": exit as u8, "text": text } });
-        writeln!(std::io::stderr(), "{}", escaped(&told).unwrap_or_default())
+        let reported = json!({ "error": { "name": name, "exit": exit as u8, "text": text } });
+        writeln!(std::io::stderr(), "{}", escaped(&reported).unwrap_or_default())
     } else {
         writeln!(anstream::stderr(), "{BAD}error:{BAD:#} {}", harmless(&format!("{error:#}")))
     };

@@ -42,7 +42,7 @@ pub fn open(global: &Global, keys: SurveyKeys) -> anyhow::Result<Survey> {
 
 /// How a user comes to keys with which a fleet can be asked.
 pub fn how_to_get_keys(fleet: Fleet) -> String {
-    let folder = cara_std::keys::place::own_folder();
+    let folder = cara_std::keys::location::own_folder();
     let folder = folder.map_or_else(|| "the folder of CARA_KEYS".to_owned(), |folder| folder.display().to_string());
     let fleet = fleet.0;
     format!(

@@ -23,7 +23,7 @@ mod tests {
 
     #[test]
     fn what_a_shell_would_read_otherwise_is_quoted() {
-        let told = ["agv-17/17", "#7", "$(reboot)", "it's"].map(quoted);
-        assert_eq!(told, ["agv-17/17", "'#7'", "'$(reboot)'", r"'it'\''s'"]);
+        let reported = ["agv-17/17", "#7", "$(reboot)", "it's"].map(quoted);
+        assert_eq!(reported, ["agv-17/17", "'#7'", "'$(reboot)'", r"'it'\''s'"]);
     }
 }

@@ -93,8 +93,8 @@ pub(crate) async fn call(State(shared): Asked, body: Body) -> Response {
 
 /// Asks, and gives up when the page is gone.
 fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mpsc::Sender<Bytes>) {
-    let told = |line: &Value| to.blocking_send(piece(line)).is_ok();
-    if !hold.is_none_or(|hold| told(&json!({ "answer": "held", "hold": hold }))) {
+    let reported = |line: &Value| to.blocking_send(piece(line)).is_ok();
+    if !hold.is_none_or(|hold| reported(&json!({ "answer": "held", "hold": hold }))) {
         return;
     }
     let opened = shared.unit.connect(false).and_then(|mut way| {
@@ -107,7 +107,7 @@ fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mp
     let (cancel, mut way) = match opened {
         Ok(opened) => opened,
         Err(error) => {
-            told(&failed(&failure(&error)));
+            reported(&failed(&failure(&error)));
             return;
         }
     };
@@ -118,16 +118,16 @@ fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mp
     let mut has_ended = false;
     let outcome = way.ask(&question, &mut |answer| {
         has_ended |= matches!(answer, Answer::Done | Answer::Failed(_));
-        if told(&shown(&answer)) { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        if reported(&shown(&answer)) { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });
     watch.abort();
     if unattended.load(Ordering::Acquire) {
         let text = "the page said nothing any more, as one that is hidden or asleep: what it held was released";
-        told(&failed(&Failure::configuration("Unattended", text)));
+        reported(&failed(&Failure::configuration("Unattended", text)));
     } else if let Err(error) = outcome {
-        told(&failed(&failure(&error)));
+        reported(&failed(&failure(&error)));
     } else if !has_ended {
-        told(&json!({ "answer": "done" }));
+        reported(&json!({ "answer": "done" }));
     }
 }
 
@@ -250,9 +250,9 @@ pub(crate) async fn doctor(State(shared): Asked, body: Body) -> Response {
     let line = match found {
         Ok(Ok(found)) => {
             let mut picture = shared.picture();
-            let told =
+            let reported =
                 json!({ "at": picture.now(), "findings": found["findings"], "listened_ms": found["listened_ms"] });
-            picture.put(Section::Doctor, "", &told);
+            picture.put(Section::Doctor, "", &reported);
             json!({ "answer": "done" })
         }
         Ok(Err(error)) => failed(&failure(&error)),
@@ -276,13 +276,13 @@ fn ask(shared: &Shared, for_a_stop: bool, question: &Question, mut each: impl Fn
 
 /// An answer in the form of the page.
 fn shown(answer: &Answer) -> Value {
-    let mut told = json!(answer);
+    let mut reported = json!(answer);
     match answer {
-        Answer::Called { results, .. } => told["results"] = results.iter().map(form::shown).collect(),
-        Answer::Function(info) => told["function"] = form::function(info),
+        Answer::Called { results, .. } => reported["results"] = results.iter().map(form::shown).collect(),
+        Answer::Function(info) => reported["function"] = form::function(info),
         _ => {}
     }
-    told
+    reported
 }
 
 fn failed(failure: &Failure) -> Value {

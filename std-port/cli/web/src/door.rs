@@ -118,7 +118,7 @@ impl Connection {
     }
 
     /// An error once it has to end: for another connection, or since its phase has taken too long.
-    fn goes_on(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
+    fn continues(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
         if self.entry.line.gives_way(cx) {
             return Err(io::ErrorKind::ConnectionAborted.into());
         }
@@ -139,7 +139,7 @@ impl Connection {
 
     /// Passes on what became of writing, and gives up where the browser takes nothing for too long.
     fn taken<T>(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
-        self.goes_on(cx)?;
+        self.continues(cx)?;
         if written.is_ready() {
             self.is_blocked = false;
             return written;
@@ -156,7 +156,7 @@ impl Connection {
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        self.goes_on(cx)?;
+        self.continues(cx)?;
         let before = buffer.filled().len();
         let read = Pin::new(&mut self.stream).poll_read(cx, buffer);
         if buffer.filled().len() > before {

@@ -8,9 +8,9 @@ use serde_json::{Value, json};
 
 /// A function with what it takes and returns, each with name, type and size; null where its signature cannot be read.
 pub(crate) fn function(info: &FunctionInfo) -> Value {
-    let mut told = json!(info);
+    let mut reported = json!(info);
     if !info.help.is_empty() {
-        told["help"] = Shown(&info.help).to_string().into();
+        reported["help"] = Shown(&info.help).to_string().into();
     }
     let definition = Definition::parse(&info.signature).ok();
     let variables = |results: bool| {
@@ -28,20 +28,20 @@ pub(crate) fn function(info: &FunctionInfo) -> Value {
                 .collect::<Value>(),
         )
     };
-    told["inputs"] = variables(false).into();
-    told["outputs"] = variables(true).into();
-    told
+    reported["inputs"] = variables(false).into();
+    reported["outputs"] = variables(true).into();
+    reported
 }
 
 /// A variable as the page shows it.
 pub(crate) fn shown(argument: &Argument) -> Value {
-    let mut told = json!(argument);
+    let mut reported = json!(argument);
     match &argument.value {
-        ArgumentValue::Int(numbers) => told["value"] = numbers.iter().map(ToString::to_string).collect(),
-        ArgumentValue::List(value) | ArgumentValue::Record(value) => told["value"] = format!("{value:#}").into(),
+        ArgumentValue::Int(numbers) => reported["value"] = numbers.iter().map(ToString::to_string).collect(),
+        ArgumentValue::List(value) | ArgumentValue::Record(value) => reported["value"] = format!("{value:#}").into(),
         _ => {}
     }
-    told
+    reported
 }
 
 /// The value of a stream's variable: its name, the value, and whether that is JSON as text.
@@ -126,8 +126,8 @@ mod tests {
 
     #[test]
     fn what_is_no_call_is_told() {
-        let told = call(asked(json!(["1.5", "2"]))).unwrap_err();
-        assert!(told.contains("position") && told.contains("`1.5`"), "{told}");
+        let reported = call(asked(json!(["1.5", "2"]))).unwrap_err();
+        assert!(reported.contains("position") && reported.contains("`1.5`"), "{reported}");
         assert!(call(asked(json!("x"))).unwrap_err().starts_with("that is no call"));
         assert!(call(json!([])).is_err() && call(json!({ "arguments": 1 })).is_err());
         assert!(call(json!({ "arguments": "[" })).unwrap_err().contains("no JSON"));
@@ -140,12 +140,12 @@ mod tests {
         let info =
             serde_json::from_value(json!({ "name": "f", "signature": "f(a: int[2]) -> (b: string[8])", "help": "Does.", "units": { "a": "m" } }))
                 .unwrap();
-        let told = function(&info);
+        let reported = function(&info);
         assert_eq!(
-            (&told["help"], &told["inputs"]),
+            (&reported["help"], &reported["inputs"]),
             (&json!("Does."), &json!([{ "name": "a", "type": "int", "size": 2, "unit": "m" }]))
         );
-        assert_eq!(told["outputs"], json!([{ "name": "b", "type": "string", "size": 8 }]));
+        assert_eq!(reported["outputs"], json!([{ "name": "b", "type": "string", "size": 8 }]));
         let later = serde_json::from_value(json!({ "name": "f", "signature": "f(a: tree)" })).unwrap();
         assert_eq!(function(&later)["inputs"], Value::Null);
     }

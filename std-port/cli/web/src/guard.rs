@@ -139,8 +139,8 @@ impl Guard {
 
     fn is_from_here(&self, method: &Method, headers: &HeaderMap, host: &str) -> bool {
         let origin = text(headers, header::ORIGIN);
-        let is_told = |origin: &str| self.origins.iter().any(|told| told == origin);
-        let is_own = |origin: &str| origin == format!("{}://{host}", self.scheme) || is_told(origin);
+        let is_reported = |origin: &str| self.origins.iter().any(|reported| reported == origin);
+        let is_own = |origin: &str| origin == format!("{}://{host}", self.scheme) || is_reported(origin);
         if method == Method::GET || method == Method::HEAD {
             return origin.is_none_or(is_own);
         }
@@ -150,9 +150,10 @@ impl Guard {
     }
 
     fn has_token(&self, headers: &HeaderMap) -> bool {
-        let told =
-            text(headers, header::AUTHORIZATION).and_then(|told| told.strip_prefix("Bearer ")).unwrap_or_default();
-        told.as_bytes().ct_eq(self.token.as_bytes()).into()
+        let reported = text(headers, header::AUTHORIZATION)
+            .and_then(|reported| reported.strip_prefix("Bearer "))
+            .unwrap_or_default();
+        reported.as_bytes().ct_eq(self.token.as_bytes()).into()
     }
 }
 
@@ -305,9 +306,9 @@ mod tests {
 
     #[test]
     fn data_needs_the_token_and_all_of_it() {
-        let get = |told: Option<&str>| {
+        let get = |reported: Option<&str>| {
             let mut all = headers(&[("host", "localhost")]);
-            told.map(|told| all.insert(header::AUTHORIZATION, HeaderValue::from_str(told).unwrap()));
+            reported.map(|reported| all.insert(header::AUTHORIZATION, HeaderValue::from_str(reported).unwrap()));
             guard().check(&Method::GET, &all, true)
         };
         assert_eq!(get(Some(&bearer())), Ok(()));

@@ -78,15 +78,15 @@ mod tests {
 
     #[test]
     fn what_is_wrong_is_told_with_its_line() {
-        let told = |text: &str| Map::parse(text).unwrap_err();
-        assert!(told("").contains("before `type`"));
-        assert!(told("typo octile").starts_with("line 1: `type`"));
-        assert!(told("type tile").contains("`octile`"));
-        assert!(told("type octile\nheight x\n").starts_with("line 2"));
-        assert!(told("type octile\nheight 0\n").starts_with("line 2"));
-        assert!(told("type octile\nheight 1\nwidth 2\nmap\n.\n").starts_with("line 5: the row has 1 cells"));
-        assert!(told("type octile\nheight 1\nwidth 2\nmap\n.x\n").starts_with("line 5, column 2"));
-        assert!(told("type octile\nheight 2\nwidth 1\nmap\n.\n").contains("has 1 rows"));
-        assert!(told("type octile\nheight 99999999\nwidth 99999999\nmap\n").contains("cut the map"));
+        let reported = |text: &str| Map::parse(text).unwrap_err();
+        assert!(reported("").contains("before `type`"));
+        assert!(reported("typo octile").starts_with("line 1: `type`"));
+        assert!(reported("type tile").contains("`octile`"));
+        assert!(reported("type octile\nheight x\n").starts_with("line 2"));
+        assert!(reported("type octile\nheight 0\n").starts_with("line 2"));
+        assert!(reported("type octile\nheight 1\nwidth 2\nmap\n.\n").starts_with("line 5: the row has 1 cells"));
+        assert!(reported("type octile\nheight 1\nwidth 2\nmap\n.x\n").starts_with("line 5, column 2"));
+        assert!(reported("type octile\nheight 2\nwidth 1\nmap\n.\n").contains("has 1 rows"));
+        assert!(reported("type octile\nheight 99999999\nwidth 99999999\nmap\n").contains("cut the map"));
     }
 }

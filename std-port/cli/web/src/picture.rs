@@ -259,9 +259,12 @@ mod tests {
     fn a_slow_page_gets_the_newest_value_and_the_count_of_all() {
         let (mut picture, mut seen, limits) = (Picture::new(), Seen::default(), Limits::new());
         (0..50).for_each(|x| picture.value("a/1", "pose(x: int)", &json!([["x", [x]]]), 0, &limits));
-        let told = news(&picture, &mut seen);
-        assert_eq!(told["streams"]["rows"]["1"], json!({ "node": "a/1", "name": "pose", "signature": "pose(x: int)" }));
-        let value = &told["values"]["rows"]["1"];
+        let reported = news(&picture, &mut seen);
+        assert_eq!(
+            reported["streams"]["rows"]["1"],
+            json!({ "node": "a/1", "name": "pose", "signature": "pose(x: int)" })
+        );
+        let value = &reported["values"]["rows"]["1"];
         assert_eq!((&value[0], &value[2]), (&json!(50), &json!([["x", [49]]])));
     }
 
@@ -272,8 +275,8 @@ mod tests {
         let streams = |limits: &Limits| limits.json().as_array().unwrap()[6].clone();
         assert_eq!((&streams(&limits)["used"], &streams(&limits)["refused"]), (&json!(STREAMS), &json!(1)));
         picture.only_streams_of(|node| node == "a/7");
-        let told = news(&picture, &mut Seen::default());
-        assert_eq!(told["values"]["rows"].as_object().unwrap().len(), 1);
+        let reported = news(&picture, &mut Seen::default());
+        assert_eq!(reported["values"]["rows"].as_object().unwrap().len(), 1);
         picture.value("b/1", "s()", &json!([]), 0, &limits);
         assert_eq!(streams(&limits)["used"], 2);
     }
@@ -284,8 +287,8 @@ mod tests {
         picture.event(&json!(0));
         picture.news(&mut seen, &limits);
         (1..=EVENTS + 5).for_each(|number| assert!(picture.event(&json!(number)) <= EVENTS));
-        let told: Value = serde_json::from_str(&picture.news(&mut seen, &limits)).unwrap();
-        assert_eq!(told["events"].as_array().unwrap().len(), EVENTS);
+        let reported: Value = serde_json::from_str(&picture.news(&mut seen, &limits)).unwrap();
+        assert_eq!(reported["events"].as_array().unwrap().len(), EVENTS);
         assert_eq!(limits.json().as_array().unwrap()[7]["refused"], 5);
     }
 

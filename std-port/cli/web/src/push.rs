@@ -31,7 +31,7 @@ pub(crate) async fn stream(State(shared): State<Arc<Shared>>) -> Response {
     };
     // One message waits at most: the next is made when that has been taken, of what is the newest then.
     let (to, messages) = mpsc::channel(1);
-    tokio::spawn(tell(shared, to, place));
+    tokio::spawn(notify(shared, to, place));
     piecewise("text/event-stream", messages)
 }
 
@@ -41,7 +41,7 @@ pub(crate) fn piecewise(kind: &'static str, pieces: mpsc::Receiver<Bytes>) -> Re
     (headers, Body::from_stream(Pieces(pieces))).into_response()
 }
 
-async fn tell(shared: Arc<Shared>, to: mpsc::Sender<Bytes>, _place: Place) {
+async fn notify(shared: Arc<Shared>, to: mpsc::Sender<Bytes>, _place: Place) {
     let mut seen = Seen::default();
     let mut last: Option<Instant> = None;
     while let Ok(permit) = to.reserve().await {

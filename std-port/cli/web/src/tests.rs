@@ -360,9 +360,9 @@ fn pages_are_told_what_is_known_up_to_their_number() {
 
 /// Waits until something is so.
 fn soon(mut is_so: impl FnMut() -> bool) {
-    let begun = std::time::Instant::now();
+    let started = std::time::Instant::now();
     while !is_so() {
-        assert!(begun.elapsed() < PATIENCE);
+        assert!(started.elapsed() < PATIENCE);
         std::thread::sleep(Duration::from_millis(20));
     }
 }
@@ -392,8 +392,8 @@ fn calls_have_a_limit_and_a_call_whose_page_goes_is_given_up() {
 #[test]
 fn a_hold_ends_when_its_page_says_nothing() {
     let stage = stage();
-    let told = stage.post("/api/call", &call("wait", true));
-    assert!(told.contains("\"answer\":\"held\"") && told.contains("Unattended"), "{told}");
+    let reported = stage.post("/api/call", &call("wait", true));
+    assert!(reported.contains("\"answer\":\"held\"") && reported.contains("Unattended"), "{reported}");
     assert!(matches!(stage.asked.recv_timeout(PATIENCE), Ok(Question::Hold(_))));
 }
 
@@ -404,9 +404,9 @@ fn a_hold_goes_on_while_its_page_is_there() {
     stage.asked.recv_timeout(PATIENCE).unwrap();
     assert_eq!(stage.unit.beats.load(Ordering::Acquire), 0, "the server makes no sign of life up");
     // Twice as long as an unattended one lasts. A host that holds this test up for longer ends it, which is right as well.
-    let begun = std::time::Instant::now();
+    let started = std::time::Instant::now();
     let (mut beaten, mut gap, mut count) = (std::time::Instant::now(), Duration::ZERO, 0);
-    while begun.elapsed() < crate::asking::ATTENDED * 2 {
+    while started.elapsed() < crate::asking::ATTENDED * 2 {
         count += usize::from(starts(&stage.post("/api/beat", &json!({ "hold": 1 })), 204));
         gap = gap.max(beaten.elapsed());
         beaten = std::time::Instant::now();
@@ -422,13 +422,16 @@ fn a_hold_goes_on_while_its_page_is_there() {
 #[test]
 fn functions_and_findings_come_in_the_pages_form() {
     let stage = stage();
-    let told = stage.post("/api/functions", &json!({ "node": "agv/1" }));
+    let reported = stage.post("/api/functions", &json!({ "node": "agv/1" }));
     assert!(
-        told.contains("\"inputs\":[{\"name\":\"a\",\"size\":1,\"type\":\"int\"}]")
-            || told.contains("\"inputs\":[{\"name\":\"a\",\"type\":\"int\",\"size\":1}]"),
-        "{told}"
+        reported.contains("\"inputs\":[{\"name\":\"a\",\"size\":1,\"type\":\"int\"}]")
+            || reported.contains("\"inputs\":[{\"name\":\"a\",\"type\":\"int\",\"size\":1}]"),
+        "{reported}"
     );
-    assert!(told.trim_end().ends_with("{\"answer\":\"done\"}") || told.contains("\"answer\":\"done\""), "{told}");
+    assert!(
+        reported.trim_end().ends_with("{\"answer\":\"done\"}") || reported.contains("\"answer\":\"done\""),
+        "{reported}"
+    );
     assert!(stage.post("/api/doctor", &json!({})).contains("done"));
     stage.follow(|message| message["doctor"]["rows"][""]["findings"][0]["id"] == "full");
 }

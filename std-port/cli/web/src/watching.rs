@@ -36,18 +36,18 @@ pub(crate) fn start(shared: &Arc<Shared>) -> std::io::Result<()> {
     keep("web-streams", shared, false, streams)
 }
 
-/// Runs `work` on a connection, again and again. Where `tells` is set, pages are told when that is impossible.
+/// Runs `work` on a connection, again and again. Where `reports` is set, pages are told when that is impossible.
 fn keep(
     name: &str,
     shared: &Arc<Shared>,
-    tells: bool,
+    reports: bool,
     work: fn(&Shared, &mut dyn Connection) -> anyhow::Result<()>,
 ) -> std::io::Result<()> {
     let shared = shared.clone();
     thread::Builder::new().name(name.to_owned()).spawn(move || {
         loop {
             let outcome = shared.unit.connect(false).and_then(|mut way| work(&shared, &mut *way));
-            if tells {
+            if reports {
                 let error = outcome.err().map_or_else(|| "the unit has ended".to_owned(), |error| format!("{error:#}"));
                 shared.picture().lost(&error);
             }
@@ -124,12 +124,12 @@ fn of_nodes(answers: &[Answer], now: u64, since: &mut Map<String, Value>) -> Vec
             let kept = since.get(&key).and_then(Value::as_i64);
             let at = kept.filter(|kept| at.is_some_and(|at| at.abs_diff(*kept) < SAME)).or(at);
             since.insert(key.clone(), at.into());
-            let mut told = json!(node);
-            if let Some(told) = told.as_object_mut() {
-                ["connected_ms", "left_ms"].iter().for_each(|name| drop(told.remove(*name)));
-                told.insert("since".to_owned(), at.into());
+            let mut reported = json!(node);
+            if let Some(reported) = reported.as_object_mut() {
+                ["connected_ms", "left_ms"].iter().for_each(|name| drop(reported.remove(*name)));
+                reported.insert("since".to_owned(), at.into());
             }
-            (key, told)
+            (key, reported)
         })
         .collect()
 }
@@ -147,12 +147,12 @@ fn of_orders(answers: Vec<Answer>, now: u64) -> Vec<(String, Value)> {
     orders
         .map(|order| {
             let key = format!("{}/{} {}", order.node, order.id, order.function);
-            let mut told = json!(order);
-            if let (Some(left), Some(told)) = (order.left_ms, told.as_object_mut()) {
-                told.insert("ends".to_owned(), (now + left).into());
-                told.remove("left_ms");
+            let mut reported = json!(order);
+            if let (Some(left), Some(reported)) = (order.left_ms, reported.as_object_mut()) {
+                reported.insert("ends".to_owned(), (now + left).into());
+                reported.remove("left_ms");
             }
-            (key, told)
+            (key, reported)
         })
         .collect()
 }

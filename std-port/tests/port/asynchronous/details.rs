@@ -45,13 +45,13 @@ fn a_task_awaits_what_a_typed_call_tells() {
     let (peer, _) = meet(&manager, &agv);
     runtime().block_on(async {
         let client = DockClient::at(&peer).with(patient());
-        let mut told = None;
+        let mut reported = None;
         let on_progress = |left| {
-            told = told.or(Some(left));
+            reported = reported.or(Some(left));
             ControlFlow::Continue(())
         };
         let failed = client.dock(11).watch(on_progress).await.unwrap_err();
-        assert_eq!(told, Some(Left { left: 10 }));
+        assert_eq!(reported, Some(Left { left: 10 }));
         assert_eq!((failed.text(), failed.values()), ("the way is blocked", Some(Blocked { at: [3, -4] })));
         let failed = client.dock(500).watch(|_| ControlFlow::Break(())).await.unwrap_err();
         assert_eq!(failed, Error::Cancelled);
@@ -109,7 +109,7 @@ fn a_task_hears_progress_and_gives_its_call_up() {
         (0..3).try_for_each(|metres| call.progress(&left(metres))).map_err(|_| ServiceError::Failed(1))?;
         parameters.set_value("number", 10 * value(parameters)).map_err(|_| ServiceError::BadResults)
     });
-    let is_told = |call: Served, parameters: Parameters| async move {
+    let is_reported = |call: Served, parameters: Parameters| async move {
         call.progress(&left(5)).map_err(|_| ServiceError::Failed(1))?;
         call.given_up().await;
         assert!(call.is_cancelled());
@@ -117,13 +117,13 @@ fn a_task_hears_progress_and_gives_its_call_up() {
     };
     let definition: Definition = "waits(number: int) -> (number: int) progress (left: int)".parse().unwrap();
     let options = ServiceOptions::new().runs_to_its_end();
-    agv.my_function_list().add_service(&definition, options, is_told).unwrap();
+    agv.my_function_list().add_service(&definition, options, is_reported).unwrap();
     let (peer, _) = meet(&manager, &agv);
     runtime().block_on(async {
         let mut parameters = number(1);
         let mut last = -1;
-        let rises = |told: &ParametersView| {
-            let metres: i64 = told.variable("left").unwrap();
+        let rises = |reported: &ParametersView| {
+            let metres: i64 = reported.variable("left").unwrap();
             assert!(metres > last, "{metres} behind {last}");
             last = metres;
             ControlFlow::Continue(())
@@ -132,8 +132,8 @@ fn a_task_hears_progress_and_gives_its_call_up() {
         assert_eq!(value(&parameters), 10);
         let heard = Cell::new(None);
         let mut parameters = number(1);
-        let call = peer.call("waits", &mut parameters).with(patient()).watch(|told| {
-            heard.set(Some(told.variable::<i64>("left")));
+        let call = peer.call("waits", &mut parameters).with(patient()).watch(|reported| {
+            heard.set(Some(reported.variable::<i64>("left")));
             ControlFlow::Continue(())
         });
         let mut call = call.into_future();

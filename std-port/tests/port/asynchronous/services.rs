@@ -18,7 +18,7 @@ struct Seen {
     inside: AtomicUsize,
     most: AtomicUsize,
     dropped: AtomicUsize,
-    told: AtomicUsize,
+    reported: AtomicUsize,
 }
 
 /// A handler that is inside.
@@ -138,16 +138,16 @@ fn handlers_that_wait_hold_no_thread() {
 }
 
 /// A vehicle whose `drive` moves under a lease and whose `wait` does not; both wait for ever.
-fn waiting(agv: &Unit, told: bool) -> Arc<Seen> {
+fn waiting(agv: &Unit, reported: bool) -> Arc<Seen> {
     let seen: Arc<Seen> = Arc::default();
-    let options = || if told { ServiceOptions::new().runs_to_its_end() } else { ServiceOptions::new() };
+    let options = || if reported { ServiceOptions::new().runs_to_its_end() } else { ServiceOptions::new() };
     let handler = |seen: &Arc<Seen>| {
         let seen = seen.clone();
         move |call: Served, parameters: Parameters| {
             let guard = Inside::new(&seen);
             async move {
                 call.given_up().await;
-                guard.0.told.fetch_add(1, Ordering::SeqCst);
+                guard.0.reported.fetch_add(1, Ordering::SeqCst);
                 guard.end();
                 Ok(parameters)
             }
@@ -162,16 +162,16 @@ fn waiting(agv: &Unit, told: bool) -> Arc<Seen> {
 
 #[test]
 fn a_handler_whose_call_is_given_up_is_dropped_or_told() {
-    for told in [false, true] {
+    for reported in [false, true] {
         let (manager, agv) = pair();
         let runtime = runtime();
         run_on(&agv, &runtime);
-        let seen = waiting(&agv, told);
+        let seen = waiting(&agv, reported);
         let (peer, _) = meet(&manager, &agv);
         let ended = |count: usize| {
             until("the handler has ended", || seen.inside.load(Ordering::SeqCst) == 0);
-            let counts = [&seen.dropped, &seen.told].map(|seen| seen.load(Ordering::SeqCst));
-            assert_eq!(counts, if told { [0, count] } else { [count, 0] });
+            let counts = [&seen.dropped, &seen.reported].map(|seen| seen.load(Ordering::SeqCst));
+            assert_eq!(counts, if reported { [0, count] } else { [count, 0] });
         };
         let inside = || until("it is inside", || seen.inside.load(Ordering::SeqCst) == 1);
         // Its caller's time is over.
@@ -181,7 +181,7 @@ fn a_handler_whose_call_is_given_up_is_dropped_or_told() {
         });
         // One that is told may answer before its caller has looked at the time.
         assert!(
-            matches!(outcome, Err(CallError { error: Error::TimedOut | Error::Expired, .. })) || told,
+            matches!(outcome, Err(CallError { error: Error::TimedOut | Error::Expired, .. })) || reported,
             "{outcome:?}"
         );
         ended(1);

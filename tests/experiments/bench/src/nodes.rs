@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use cara_bench_ends::{Place, answer_all, clock, pin, text};
-use cara_std::keys::{FleetKeys, Store, place::file_name};
+use cara_std::keys::{FleetKeys, Store, location::file_name};
 use cara_std::{
     Builder, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, Parameters, ParametersView, Peer,
     RequestOptions, Served, ServiceError, Threads, Unit,

@@ -83,14 +83,14 @@ fn one_that_breaks_is_told_and_the_others_go_on() {
     ];
     let (is_fine, all) = run(&scripts, "response");
     assert!(is_fine, "a run does not fail for another system");
-    let told = [
+    let reported = [
         ("ends", "out of order"),
         ("ends_later", "no more"),
         ("silent_server", "no answer for 3 s"),
         ("silent_client", "no answer for 3 s"),
         ("babbles", "something else"),
     ];
-    for (peer, reason) in told {
+    for (peer, reason) in reported {
         assert_eq!(report(&all, peer)["state"], "broken", "{peer}");
         let notes = report(&all, peer)["notes"].as_array().unwrap();
         assert!(notes.iter().any(|note| note.as_str().unwrap().contains(reason)), "{peer}: {notes:?}");

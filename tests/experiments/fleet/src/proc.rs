@@ -85,10 +85,10 @@ pub(crate) struct ThreadWatch {
 impl ThreadWatch {
     pub(crate) fn new(pid: u32) -> Self {
         let (most, over) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicBool::new(false)));
-        let (noted, ended) = (most.clone(), over.clone());
+        let (recorded, ended) = (most.clone(), over.clone());
         let watch = std::thread::spawn(move || {
             while let (false, Ok(count)) = (ended.load(Ordering::Relaxed), threads(pid)) {
-                noted.fetch_max(count, Ordering::Relaxed);
+                recorded.fetch_max(count, Ordering::Relaxed);
                 std::thread::sleep(LOOK);
             }
         });

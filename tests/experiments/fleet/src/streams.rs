@@ -100,8 +100,8 @@ pub(crate) fn run(plan: &Plan) -> Result<()> {
     let cable = Cable::lay(Wire { mbit, loss_percent: 0 })?;
     let place = &Place::new(vehicles)?;
     place.add_m_units(&READERS)?;
-    let told = [vehicles.to_string(), rate.to_string()];
-    let load = ["--vehicles", &told[0], "--rate", &told[1]];
+    let reported = [vehicles.to_string(), rate.to_string()];
+    let load = ["--vehicles", &reported[0], "--rate", &reported[1]];
     let [here, there] = &cable.hosts;
     let mut manager = here.within(|| Child::start("streams-manager", place, &load))?;
     let mut units = there.within(|| Child::start("streams-units", place, &load))?;
@@ -244,8 +244,8 @@ pub(crate) fn units(part: &Part) -> Result<()> {
     let on = Arc::new(AtomicBool::new(false));
     let (publishes, rate) = (on.clone(), part.rate);
     let late = Arc::new(Mutex::new(BTreeSet::new()));
-    let noted = late.clone();
-    std::thread::spawn(move || publish(&streams, rate, &publishes, &noted));
+    let recorded = late.clone();
+    std::thread::spawn(move || publish(&streams, rate, &publishes, &recorded));
     child::serve(|question| {
         Ok(match question {
             Question::Publish { on: wanted } => {
@@ -317,8 +317,8 @@ impl Reading {
                 found.push((made, now - made, sample.age().as_micros() as i64));
             }
             let ages = &mut *held(&self.ages);
-            for (made, truth, told) in found {
-                let margin = told - truth;
+            for (made, truth, reported) in found {
+                let margin = reported - truth;
                 if margin < -GAP_US {
                     ages.too_young.insert(made);
                 }

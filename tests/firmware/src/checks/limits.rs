@@ -37,7 +37,7 @@ const CLOSED_FOR_LENGTH: [u8; 4] = [2, 0, 0x03, 6];
 
 /// Links on which the board's last words are waited for, of which so many must arrive.
 const LINKS: usize = 12;
-const TOLD: usize = 3;
+const REPORTED: usize = 3;
 
 /// The board ends every link, with a code, and dials again. It has one socket: when it dials again before the network has
 /// taken its last words, they are lost with the link that they end.
@@ -45,18 +45,18 @@ pub(super) fn breaks_its_limit(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
     let listener = TcpListener::bind(FALSE_MANAGER)?;
     let _board = bench.board(&cable, &Who { manager_address: Some(FALSE_MANAGER), ..Who::agv(17) })?;
-    let (mut told, mut cut) = (0, 0);
-    while told < TOLD {
-        ensure!(told + cut < LINKS, "{told} of {LINKS} links ended with the code");
+    let (mut reported, mut cut) = (0, 0);
+    while reported < REPORTED {
+        ensure!(reported + cut < LINKS, "{reported} of {LINKS} links ended with the code");
         let (stream, _) = listener.accept()?;
         match answered(stream).context("the link does not end")? {
-            Ending::Closed(said) if said.ends_with(&CLOSED_FOR_LENGTH) => told += 1,
+            Ending::Closed(said) if said.ends_with(&CLOSED_FOR_LENGTH) => reported += 1,
             Ending::Closed(said) => bail!("the board's last words are {said:?}"),
-            Ending::Reset(said) if said.ends_with(&CLOSED_FOR_LENGTH) => told += 1,
+            Ending::Reset(said) if said.ends_with(&CLOSED_FOR_LENGTH) => reported += 1,
             Ending::Reset(_) => cut += 1,
         }
     }
-    Ok(format!("with code 6, {told} times; {cut} times cut short"))
+    Ok(format!("with code 6, {reported} times; {cut} times cut short"))
 }
 
 /// How the board ended a link, and everything that it said before.

@@ -68,15 +68,15 @@ pub(super) fn large_order(bench: &Bench, _: u32) -> Result<String> {
     let _board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet_offering(&Who::agv(17), "follow")?;
     let follows = |nodes, expected: Followed| {
-        let mut told = None;
+        let mut reported = None;
         patiently(|| match follow(&agv, nodes) {
             Err(failed) if failed.mismatch().is_none() => Err(failed.error),
             followed => {
-                told = Some(followed);
+                reported = Some(followed);
                 Ok(())
             }
         })?;
-        ensure!(told == Some(Ok(expected)), "of {nodes} nodes it tells {told:?}");
+        ensure!(reported == Some(Ok(expected)), "of {nodes} nodes it tells {reported:?}");
         Ok(())
     };
     follows(2, Followed { length: 1.75, actions: 3, last: "node-01".into() })?;

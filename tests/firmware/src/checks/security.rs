@@ -123,11 +123,11 @@ fn said(bench: &Bench, heard: &Receiver<Vec<u8>>) -> Result<Vec<Said>> {
 /// Passes on what is said on each connection; when it has ended, tells what the board has said.
 fn listen_between() -> Result<Receiver<Vec<u8>>> {
     let listener = TcpListener::bind(BETWEEN)?;
-    let (tell, heard) = channel();
+    let (notify, heard) = channel();
     thread::spawn(move || {
         for board in listener.incoming().map_while(Result::ok) {
-            let told = tell.send(passed_on(board).unwrap_or_default());
-            if told.is_err() {
+            let reported = notify.send(passed_on(board).unwrap_or_default());
+            if reported.is_err() {
                 return;
             }
         }

@@ -29,18 +29,18 @@ impl EmulatedBoard {
             let (agv, ends) = (manager.meet(&self.who)?, AtomicBool::new(false));
             let (held, is_held) = sync_channel(1);
             let line = self.board.line();
-            let (stop, goes_on) = std::thread::scope(|scope| {
-                let other = scope.spawn(|| goes_on(&manager, &agv, &held, &ends));
+            let (stop, continues) = std::thread::scope(|scope| {
+                let other = scope.spawn(|| continues(&manager, &agv, &held, &ends));
                 let held = is_held.recv_timeout(LONG).context("the other loop holds nothing");
                 let stop = held.and_then(|()| self.hangs(&manager, &agv, line, dice));
                 ends.store(true, Ordering::Release);
-                let goes_on = other.join().ok().context("the other loop panicked")??;
-                Ok::<_, anyhow::Error>((stop?, goes_on))
+                let continues = other.join().ok().context("the other loop panicked")??;
+                Ok::<_, anyhow::Error>((stop?, continues))
             })?;
             let lost = self.has_logged(line, LEFT);
             ensure!(!lost, "the link was lost with the loop; the board logged{}", self.log(line));
             // A busy host may let the other lease end as well.
-            let Some((behind, stop)) = stop.filter(|_| goes_on) else { continue };
+            let Some((behind, stop)) = stop.filter(|_| continues) else { continue };
             self.stands(&agv, line, behind)?;
             return Ok(stop);
         }
@@ -73,9 +73,9 @@ impl EmulatedBoard {
         }
         let stopped = self.stopped(line)?;
         let ends = |event: &UnitEvent| matches!(event, UnitEvent::LeaseEnded { function, .. } if function == "go_to");
-        let told = manager.event("end of the lease", ends)?;
-        let expired = matches!(told, UnitEvent::LeaseEnded { why: LeaseEnd::Expired, .. });
-        ensure!(expired, "the manager was told {told:?}; the board logged{}", self.log(line));
+        let reported = manager.event("end of the lease", ends)?;
+        let expired = matches!(reported, UnitEvent::LeaseEnded { why: LeaseEnd::Expired, .. });
+        ensure!(expired, "the manager was told {reported:?}; the board logged{}", self.log(line));
         // In which the other call would have ended as well.
         std::thread::sleep(STANDS);
         Ok(Some(stopped))
@@ -110,7 +110,7 @@ impl EmulatedBoard {
 }
 
 /// A loop that holds another call of the board until it is told to end, and whether the board holds it still.
-fn goes_on(manager: &Manager, agv: &Peer, is_held: &SyncSender<()>, ends: &AtomicBool) -> Result<bool> {
+fn continues(manager: &Manager, agv: &Peer, is_held: &SyncSender<()>, ends: &AtomicBool) -> Result<bool> {
     let (mut heart, deadline) = (manager.system.heart(PERIOD), Instant::now() + LONG);
     let held = loop {
         heart.beat();

@@ -212,8 +212,8 @@ impl EmulatedBoard {
         if reason == OVERFLOW {
             self.board.logs_behind(behind, "the lease's words are as they were")?;
         }
-        let told = format!("started because of {reason}, with the motors off");
-        let started = self.board.logs_behind(behind, &told)?;
+        let reported = format!("started because of {reason}, with the motors off");
+        let started = self.board.logs_behind(behind, &reported)?;
         let left = manager.event("loss", |event| matches!(event, UnitEvent::Left { .. }))?;
         let restarted = matches!(left, UnitEvent::Left { reason: CloseReason::PeerRestarted | CloseReason::Reset, .. });
         ensure!(restarted || reason == "Watchdog", "the manager was told {left:?}; the board logged{}", self.log(line));

@@ -165,7 +165,7 @@ impl LinuxWorld {
                 let _ = stream.read_to_end(&mut heard);
             }
         }
-        if client.is_told().is_some_and(|told| heard.ends_with(&told)) {
+        if client.is_reported().is_some_and(|reported| heard.ends_with(&reported)) {
             self.reached("client was told");
         }
         if let UnknownClient::Silent(count) = client {
@@ -435,14 +435,14 @@ fn serve(
     while let Some(pause) = service.moves_on(call.lease.as_ref().is_some_and(LeaseWatch::is_live), parameters) {
         thread::sleep(pause.into());
     }
-    if service.tells > 0 {
-        let mut told = 0;
-        while told < service.tells && !call.is_cancelled() {
-            told += 1;
-            call.progress(&number("left", told)).map_err(|_| ServiceError::BadResults)?;
+    if service.reports > 0 {
+        let mut reported = 0;
+        while reported < service.reports && !call.is_cancelled() {
+            reported += 1;
+            call.progress(&number("left", reported)).map_err(|_| ServiceError::BadResults)?;
             thread::sleep(LOOK);
         }
-        service.log().note(told);
+        service.log().note(reported);
     }
     if service.takes > Duration::ZERO {
         thread::sleep(service.takes.into());
@@ -555,14 +555,14 @@ impl Node for Handle {
 
     fn begin_publish(&self) -> Pending<Vec<Identity>> {
         let pending = Pending::new();
-        let (node, told) = (Arc::clone(&self.node), pending.share());
+        let (node, reported) = (Arc::clone(&self.node), pending.share());
         thread::spawn(move || {
             let missing = match node.machine().as_deref() {
                 Ok(Machine::Manager(system)) => system.publish_and_wait(Duration::from_secs(10)),
                 Ok(Machine::Agv(unit)) => unit.publish_my_function_list().map(|()| Vec::new()),
                 Err(error) => Err(*error),
             };
-            told.end(missing, node.now());
+            reported.end(missing, node.now());
         });
         pending
     }
@@ -611,19 +611,19 @@ impl Node for Handle {
 
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
         let pending = Pending::new();
-        let (node, told, mut parameters) = (Arc::clone(&self.node), pending.share(), boxed(parameters));
+        let (node, reported, mut parameters) = (Arc::clone(&self.node), pending.share(), boxed(parameters));
         let (peer, function) = (peer.to_owned(), function.to_owned());
         thread::spawn(move || {
             let asked = node.peer(&peer);
             let result = asked.and_then(|peer| Ok(peer.call(&function, &mut parameters).with(options).wait()?));
-            told.end(result.map(|()| parameters), node.now());
+            reported.end(result.map(|()| parameters), node.now());
         });
         pending
     }
 
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll {
         let pending = Pending::new();
-        let (node, told, function) = (Arc::clone(&self.node), pending.share(), function.to_owned());
+        let (node, reported, function) = (Arc::clone(&self.node), pending.share(), function.to_owned());
         let mut copy = Parameters::<512>::sized();
         copy.copy_from(parameters).expect("what is asked of all is short");
         let system = self.system();
@@ -633,7 +633,7 @@ impl Node for Handle {
             let short = |(peer, outcome): (Peer, Result<_, CallError>)| {
                 (peer.identity().clone(), outcome.map(drop).map_err(Error::from))
             };
-            told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
+            reported.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
         });
         pending
     }
@@ -650,10 +650,10 @@ impl Node for Handle {
         let (node, ended, mut parameters) = (Arc::clone(&self.node), pending.share(), boxed(parameters));
         let (peer, function) = (peer.to_owned(), function.to_owned());
         thread::spawn(move || {
-            let mut told = Vec::new();
+            let mut reported = Vec::new();
             let mut listen = |progress: &ParametersView| {
                 let left = progress.variable("left").expect("it is declared so");
-                told.push(left);
+                reported.push(left);
                 if left < enough { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
             };
             let call = |peer: Peer| peer.call(&function, &mut parameters).with(options).watch(&mut listen).wait();
@@ -662,7 +662,7 @@ impl Node for Handle {
                 let failure = failed.failure().cloned();
                 cara_sim::CallError::new(failed.error, failure.map(Detail::Service))
             };
-            ended.end(Ok(Watched { told, outcome: outcome.map_err(kept) }), node.now());
+            ended.end(Ok(Watched { reported, outcome: outcome.map_err(kept) }), node.now());
         });
         pending
     }

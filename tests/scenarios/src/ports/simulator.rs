@@ -153,13 +153,13 @@ impl World for SimWorld {
             None => new,
         };
         let orders = Orders::default();
-        let begun = Rc::clone(&orders);
+        let started = Rc::clone(&orders);
         let program = move |unit: &UnitHandle| {
             // Of this life alone.
-            begun.borrow_mut().clear();
+            started.borrow_mut().clear();
             for service in &services {
                 unit.my_function_list()
-                    .add_service(&service.signature, simulated(service, &begun))
+                    .add_service(&service.signature, simulated(service, &started))
                     .expect("a unit has room for its services");
             }
             for stream in &streams {
@@ -171,10 +171,10 @@ impl World for SimWorld {
         };
         let handle = new.program(program).start();
         let losses = Rc::new(RefCell::new(Vec::new()));
-        let noted = Rc::clone(&losses);
+        let recorded = Rc::clone(&losses);
         handle.on_event(move |unit, event| {
             if matches!(event, UnitEvent::Left { .. }) {
-                noted.borrow_mut().push(unit.now());
+                recorded.borrow_mut().push(unit.now());
             }
         });
         if self.profile == FaultProfile::Rough {
@@ -263,7 +263,7 @@ impl SimWorld {
                 self.hear(stream, &mut heard);
             }
         }
-        if client.is_told().is_some_and(|told| heard.ends_with(&told)) {
+        if client.is_reported().is_some_and(|reported| heard.ends_with(&reported)) {
             self.reached("client was told");
         }
         if let UnknownClient::Silent(count) = client {
@@ -383,14 +383,14 @@ fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
                 {
                     call.unit.sleep(pause).await;
                 }
-                if kept.tells > 0 {
-                    let mut told = 0;
-                    while told < kept.tells && !call.is_cancelled() {
-                        told += 1;
-                        call.progress(&number("left", told)).map_err(|_| ServiceError::BadResults)?;
+                if kept.reports > 0 {
+                    let mut reported = 0;
+                    while reported < kept.reports && !call.is_cancelled() {
+                        reported += 1;
+                        call.progress(&number("left", reported)).map_err(|_| ServiceError::BadResults)?;
                         call.unit.sleep(millis(1)).await;
                     }
-                    kept.log().note(told);
+                    kept.log().note(reported);
                 }
                 call.unit.sleep(kept.takes).await;
                 while kept.is_held() {
@@ -455,8 +455,8 @@ impl Node for SimNode {
 
     fn begin_publish(&self) -> Pending<Vec<Identity>> {
         let pending = Pending::new();
-        let (unit, told) = (self.handle.clone(), pending.share());
-        self.handle.spawn(async move { told.end(unit.publish_and_wait().await, unit.now()) });
+        let (unit, reported) = (self.handle.clone(), pending.share());
+        self.handle.spawn(async move { reported.end(unit.publish_and_wait().await, unit.now()) });
         pending
     }
 
@@ -496,23 +496,23 @@ impl Node for SimNode {
 
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
         let pending = Pending::new();
-        let (unit, told, mut parameters) = (self.handle.clone(), pending.share(), boxed(parameters));
+        let (unit, reported, mut parameters) = (self.handle.clone(), pending.share(), boxed(parameters));
         let (peer, function) = (peer.to_owned(), function.to_owned());
         self.handle.spawn(async move {
             let result = unit.block_request_with(peer.as_str(), &function, &mut parameters, options).await;
-            told.end(result.map(|()| parameters), unit.now());
+            reported.end(result.map(|()| parameters), unit.now());
         });
         pending
     }
 
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll {
         let pending = Pending::new();
-        let (unit, told, parameters) = (self.handle.clone(), pending.share(), boxed(parameters));
+        let (unit, reported, parameters) = (self.handle.clone(), pending.share(), boxed(parameters));
         let function = function.to_owned();
         self.handle.spawn(async move {
             let outcomes = unit.block_request_all(&function, &parameters).await;
             let outcomes = outcomes.into_iter().map(|(peer, outcome)| (peer, outcome.map(drop))).collect();
-            told.end(Ok(outcomes), unit.now());
+            reported.end(Ok(outcomes), unit.now());
         });
         pending
     }
@@ -535,11 +535,11 @@ impl Node for SimNode {
             }
         };
         self.handle.spawn(async move {
-            let (mut call, mut told) = (call, Vec::new());
+            let (mut call, mut reported) = (call, Vec::new());
             let mut is_enough = false;
             while !is_enough && let Some(progress) = call.progress().await {
                 let left = progress.variable("left").expect("it is declared so");
-                told.push(left);
+                reported.push(left);
                 is_enough = left >= enough;
             }
             let outcome = if is_enough {
@@ -548,7 +548,7 @@ impl Node for SimNode {
             } else {
                 call.results().await.map(drop).map_err(|failed| *failed)
             };
-            ended.end(Ok(Watched { told, outcome }), unit.now());
+            ended.end(Ok(Watched { reported, outcome }), unit.now());
         });
         pending
     }
@@ -615,7 +615,7 @@ impl Node for SimNode {
         self.handle
             .log()
             .into_iter()
-            .filter_map(|(at, event)| Some((at, Seen::of(event.told()?.clone(), |up| *up)?)))
+            .filter_map(|(at, event)| Some((at, Seen::of(event.reported()?.clone(), |up| *up)?)))
             .collect()
     }
 

@@ -33,7 +33,7 @@ fn frozen(world: &mut dyn World, service: &Service, options: RequestOptions) -> 
     manager.request_with("agv", "go", &number("n", 1), options).expect("it is accepted");
     for _ in 0..12 {
         world.run_for(secs(1));
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
     }
     assert!(agv.is_connected("manager"), "keep-alives passed");
     (manager, agv)

@@ -52,9 +52,9 @@ fn bad_arguments_harm_nobody_else(world: &mut dyn World) {
     ];
     for (function, mut parameters, error) in cases {
         assert_eq!(manager.request("agv", function, &parameters), Err(error));
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
         assert_eq!(world.ask(&manager, "agv", function, &mut parameters), Err(error));
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
     }
     assert_eq!(service.log().runs(), 0);
     assert_eq!(world.ask(&manager, "agv", "go_to", &mut position()), Ok(()));
@@ -77,20 +77,20 @@ fn what_is_too_long_is_an_error_in_either_direction(world: &mut dyn World) {
     let too_large = Error::TooLarge { limit: 12_000 };
     assert_eq!(world.ask(&manager, "agv", "store", &mut text(13_000)), Err(too_large));
     assert_eq!(manager.request("agv", "store", &text(13_000)), Err(too_large));
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     // A result for which the caller has no room is not even asked for.
     let mut small = Parameters::<64>::sized();
     let refused = world.ask(&manager, "agv", "dump", &mut small);
     assert!(matches!(refused, Err(Error::ResultWouldNotFit { need, have }) if need > have), "{refused:?}");
     assert_eq!((store.log().runs(), dump.log().runs()), (0, 0));
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     // A result that is longer than the caller takes is not sent.
     manager.change(|limits| limits.message_size = 1_024);
     asked_until(world, &manager, Err(Error::TooLarge { limit: 1_024 }));
     let mut roomy = text(9_000);
     assert_eq!(world.ask(&manager, "agv", "dump", &mut roomy), Err(Error::TooLarge { limit: 1_024 }));
     assert_eq!(roomy, text(9_000), "an error leaves the parameters as they are");
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     // What the text says helps, once the AGV has been told.
     manager.change(|limits| limits.message_size = 16_384);
     asked_until(world, &manager, Ok(()));
@@ -120,7 +120,7 @@ fn a_full_list_of_functions_names_its_limit(world: &mut dyn World) {
     };
     assert!(matches!(full, Error::Full(Limit::Functions | Limit::SignatureBytes)), "{full:?} after {added}");
     assert_eq!(agv.add_service(&Service::numbered("note")), Err(Error::NameTaken));
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
     agv.remove_service("f0").expect("it is there");
     assert_eq!(agv.add_service(&Service::numbered("other")), Ok(()), "what the text says helps");
@@ -134,7 +134,7 @@ fn full_tables_of_calls_name_their_limit(world: &mut dyn World) {
     let mut bystander = Bystander::add(world, &manager);
     let options = RequestOptions { timeout: Some(secs(1)), ..RequestOptions::default() };
     let calls: Vec<_> = (0..100).map(|n| manager.begin("agv", "slow", &number("n", n), options)).collect();
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     let outcomes: Vec<_> = calls.iter().map(|call| world.finish(call).map(drop)).collect();
     let named = |outcome: &&Result<(), Error>| matches!(outcome, Err(Error::Busy | Error::Full(Limit::Calls)));
     assert!(outcomes.iter().filter(named).count() > 0, "{outcomes:?}");
@@ -142,7 +142,7 @@ fn full_tables_of_calls_name_their_limit(world: &mut dyn World) {
         matches!(outcome, Ok(()) | Err(Error::Busy | Error::Full(_) | Error::TimedOut | Error::Expired))
     };
     assert!(outcomes.iter().all(expected), "{outcomes:?}");
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     world.run_for(millis(700));
     assert_eq!(world.ask(&manager, "agv", "slow", &mut number("n", 0)), Ok(()), "every slot is free again");
 }
@@ -189,17 +189,17 @@ fn a_second_manager_of_a_name_is_told_on_its_own_side(world: &mut dyn World) {
     let (manager, agv, mut bystander) = three(world, &Service::numbered("note"));
     world.run_for(secs(1));
     let second = world.add(Spec::manager("manager", 1).beside_another());
-    let told = |unit: &Unit| unit.count(|event| *event == Seen::NotJoined(DUPLICATE));
+    let reported = |unit: &Unit| unit.count(|event| *event == Seen::NotJoined(DUPLICATE));
     let fenced = |unit: &Unit| unit.count(|event| matches!(event, Seen::Fenced(_)));
-    world.wait("the second is told", || told(&second) > 0, secs(40));
-    world.wait("so is the first", || told(&manager) > 0, secs(40));
+    world.wait("the second is told", || reported(&second) > 0, secs(40));
+    world.wait("so is the first", || reported(&manager) > 0, secs(40));
     world.wait("one steps down", || fenced(&manager) + fenced(&second) > 0, secs(40));
     let (stays, leaves) = if fenced(&second) > 0 { (&manager, &second) } else { (&second, &manager) };
     met(world, stays, "agv", "note");
     met(world, stays, "bystander", "count");
-    bystander.goes_on(world, stays);
+    bystander.continues(world, stays);
     world.run_for(secs(3));
-    assert_eq!((told(&manager), told(&second)), (1, 1), "once");
+    assert_eq!((reported(&manager), reported(&second)), (1, 1), "once");
     assert_eq!((fenced(stays), stays.count(|event| matches!(event, Seen::Left(..)))), (0, 0), "it keeps what it has");
     assert!(agv.is_connected("manager") && leaves.peers().is_empty());
     assert_eq!(world.ask(stays, "agv", "note", &mut number("n", 1)), Ok(()));
@@ -211,14 +211,14 @@ fn another_fleet_that_dials_is_refused_by_name(world: &mut dyn World) {
     let refused = Seen::NotJoined(CloseReason::Refused(Refusal::Fleet));
     world.wait("this side shows it", || manager.count(|event| *event == refused) == 1, secs(20));
     assert_eq!(manager.node_counted(NodeCounter::RefusedFleet), 1);
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
 }
 
 fn garbage_on_every_port_harms_nobody(world: &mut dyn World) {
     let (manager, agv, mut bystander) = three(world, &Service::numbered("note"));
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     world.fault(Fault::UnknownClient(&manager, UnknownClient::Garbage));
-    bystander.goes_on(world, &manager);
+    bystander.continues(world, &manager);
     let counted = || manager.node_counted(NodeCounter::DatagramMagic) > 0;
     world.wait("datagrams are counted", counted, secs(20));
     let typed = |event: &Seen| {
@@ -236,7 +236,7 @@ fn a_peer_that_closes_in_mid_chunk_harms_nobody_else(world: &mut dyn World) {
         world.fault(Fault::UnknownClient(&manager, UnknownClient::ClosesInMidChunk));
         let left = |event: &Seen| matches!(event, Seen::Left(peer, CloseReason::Reset) if peer.name() == "stranger");
         world.wait("it has left", || manager.count(left) == visit, secs(20));
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
     }
     world.reached("left");
     assert_eq!(manager.number_of_s_units(), 2);
@@ -257,7 +257,7 @@ fn a_thousand_silent_connections_keep_nobody_out(world: &mut dyn World) {
     world.fault(Fault::UnknownClient(&manager, UnknownClient::Silent(1_000)));
     newcomer.start();
     for _ in 0..10 {
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
         world.run_for(millis(20));
     }
     met(world, &manager, "newcomer", "note");
@@ -283,7 +283,7 @@ fn a_reader_of_one_byte_a_second_harms_nobody_else(world: &mut dyn World) {
             }
         }
         if round % 10 == 0 {
-            bystander.goes_on(world, &manager);
+            bystander.continues(world, &manager);
         }
     }
     assert!(matches!(full, Some(Error::Full(Limit::SendQueue))), "{full:?} after {accepted}");
@@ -292,7 +292,7 @@ fn a_reader_of_one_byte_a_second_harms_nobody_else(world: &mut dyn World) {
     let asked = world.ask_with(&manager, "agv", "store", &mut text(900), options);
     assert!(matches!(asked, Err(Error::TimedOut | Error::Full(Limit::SendQueue))), "{asked:?}");
     for _ in 0..20 {
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
     }
 }
 
@@ -305,7 +305,7 @@ fn a_unit_without_an_interface_finds_its_manager_when_it_has_one(world: &mut dyn
     // Pauses between searches grow meanwhile.
     for _ in 0..10 {
         world.run_for(secs(6));
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
     }
     assert!(agv.node_counted(NodeCounter::SendFailed) > 0);
     world.reached("unplugged");

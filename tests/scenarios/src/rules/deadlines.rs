@@ -36,7 +36,7 @@ fn a_time_out_frees_its_slot_and_the_late_reply_is_dropped(world: &mut dyn World
             assert!(world.now().since(start) <= millis(20) + slack);
         }
         world.run_for(millis(25));
-        bystander.goes_on(world, &manager);
+        bystander.continues(world, &manager);
     }
     world.wait("late replies are counted", || manager.counted(LinkCounter::RepliesLate) > 0, secs(10));
     let mut parameters = number("n", 1);

@@ -50,23 +50,23 @@ fn a_failure_brings_its_text_and_its_values(world: &mut dyn World) {
 }
 
 fn progress_that_waited_is_the_newest(world: &mut dyn World) {
-    let service = go().tells(200).takes(secs(4));
+    let service = go().reports(200).takes(secs(4));
     let (manager, _) = pair(world, &service);
     let call = watch(&manager, ALL);
-    let Watched { told, outcome } = finish(world, &call);
+    let Watched { reported, outcome } = finish(world, &call);
     assert!(outcome.is_ok(), "{outcome:?}");
     assert_eq!(service.log().values(), [200], "its handler waits for nothing");
-    assert!(told.is_sorted_by(|a, b| a < b) && told.last() == Some(&200), "{told:?}");
-    assert!(told.len() < 100, "the others need not come: {told:?}");
+    assert!(reported.is_sorted_by(|a, b| a < b) && reported.last() == Some(&200), "{reported:?}");
+    assert!(reported.len() < 100, "the others need not come: {reported:?}");
 }
 
 fn what_a_call_moves_ends_when_it_is_given_up(world: &mut dyn World) {
-    let service = go().tells(20_000).lease(secs(60));
+    let service = go().reports(20_000).lease(secs(60));
     let (manager, agv) = pair(world, &service);
     let call = watch(&manager, 50);
-    let Watched { told, outcome } = finish(world, &call);
+    let Watched { reported, outcome } = finish(world, &call);
     assert_eq!(outcome.map_err(|failed| failed.error), Err(Error::Cancelled));
-    assert!(told.iter().rev().skip(1).all(|left| *left < 50), "it was given up at once: {told:?}");
+    assert!(reported.iter().rev().skip(1).all(|left| *left < 50), "it was given up at once: {reported:?}");
     world.wait("what it moves is safe", || service.log().stops().len() == 1, secs(10));
     world.wait("its handler has seen it", || service.log().values().len() == 1, secs(10));
     assert!(service.log().values()[0] < 20_000);
@@ -75,7 +75,7 @@ fn what_a_call_moves_ends_when_it_is_given_up(world: &mut dyn World) {
 }
 
 fn a_call_that_is_given_up_leaves_a_newer_order_alone(world: &mut dyn World) {
-    let service = go().tells(20_000).lease(secs(60));
+    let service = go().reports(20_000).lease(secs(60));
     let (manager, agv) = pair(world, &service);
     // Seconds, so that the newer one runs before the older one is given up, also where its request is lost and sent again.
     let older = watch(&manager, 5_000);

@@ -78,9 +78,9 @@ fn the_callee_tells_its_interval(world: &mut dyn World) {
     met(world, &manager, "agv", "note");
     assert!(five(world, &manager) >= millis(4 * INTERVAL_MILLIS));
     agv.change(|limits| limits.minimum_interval = secs(5));
-    let told =
+    let reported =
         || matches!(manager.request("agv", "note", &number("n", 9)), Err(Error::TooSoon { wait }) if wait > secs(1));
-    world.wait("the change is told", told, secs(10));
+    world.wait("the change is told", reported, secs(10));
 }
 
 fn a_wait_beyond_the_deadline_is_refused(world: &mut dyn World) {

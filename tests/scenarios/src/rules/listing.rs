@@ -41,9 +41,9 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     assert!(go_to.log().ended().is_empty(), "it returns at once");
     assert_eq!(variable(&pos, "position"), [1, 2]);
     world.wait("go_to has run", || go_to.log().ended().len() == 1, secs(10));
-    let mut told = position();
-    assert_eq!(world.ask(&manager, "agv", "pos_info", &mut told), Ok(()));
-    assert_eq!(variable(&told, "position"), [1, 2]);
+    let mut reported = position();
+    assert_eq!(world.ask(&manager, "agv", "pos_info", &mut reported), Ok(()));
+    assert_eq!(variable(&reported, "position"), [1, 2]);
 
     let call_mechanic = Service::new("call_mechanic(place: int[2])");
     manager.add_service(&call_mechanic).expect("there is room");

@@ -70,8 +70,8 @@ fn the_message_size_can_be_changed_while_running(world: &mut dyn World) {
     met(world, &manager, "agv", "echo");
     assert_eq!(ask(world, &manager, 900), Ok(()));
     agv.change(|limits| limits.message_size = 600);
-    let told = || manager.request("agv", "echo", &text(900)) == Err(Error::TooLarge { limit: 600 });
-    world.wait("the change is told", told, secs(10));
+    let reported = || manager.request("agv", "echo", &text(900)) == Err(Error::TooLarge { limit: 600 });
+    world.wait("the change is told", reported, secs(10));
     assert_eq!(ask_behind_others(world, &manager, 500), Ok(()));
     agv.change(|limits| limits.message_size = 1_024);
     world.wait("the change is told", || manager.request("agv", "echo", &text(900)).is_ok(), secs(10));

@@ -69,9 +69,9 @@ pub fn all() -> Vec<Scenario> {
 /// The listing's services: `pos_info` tells the position that `go_to` sets.
 fn paper_services() -> (Service, Service) {
     let position = Arc::new(Mutex::new([3_i64, 4]));
-    let told = Arc::clone(&position);
+    let reported = Arc::clone(&position);
     let pos_info = Service::new("pos_info(position: int[2]) -> (position: int[2])").does(move |_, parameters| {
-        let value = *told.lock().map_err(|_| ServiceError::Panicked)?;
+        let value = *reported.lock().map_err(|_| ServiceError::Panicked)?;
         parameters.set_value("position", value).map_err(|_| ServiceError::BadResults)
     });
     let go_to = Service::new("go_to(position: int[2])").does(move |_, parameters| {
@@ -104,7 +104,7 @@ impl Bystander {
     }
 
     /// Calls it.
-    fn goes_on(&mut self, world: &mut dyn World, manager: &Unit) {
+    fn continues(&mut self, world: &mut dyn World, manager: &Unit) {
         self.calls += 1;
         let asked = world.ask(manager, "bystander", "count", &mut number("n", self.calls as i64));
         assert_eq!(asked, Ok(()), "another node's calls go on{}", world.story());

@@ -151,8 +151,8 @@ fn only_the_newest_moves(world: &mut dyn World, released: bool) {
     assert!(log.values()[moved..].iter().all(|n| *n == 2), "the first has moved again: {:?}", log.values());
     assert!(agv.lease_is_live("drive") && !second.is_over());
     let replaced = Seen::LeaseEnded("drive".to_owned(), LeaseEnd::Replaced);
-    let (stops, told) = if released { (1, 0) } else { (0, 1) };
-    assert_eq!((log.stops().len(), manager.count(|event| *event == replaced)), (stops, told));
+    let (stops, reported) = if released { (1, 0) } else { (0, 1) };
+    assert_eq!((log.stops().len(), manager.count(|event| *event == replaced)), (stops, reported));
     manager.release("agv", "drive").expect("it is connected");
     world.wait("the safe hook runs", || log.stops().len() == stops + 1, secs(20));
     assert_eq!(world.finish(&second).map(drop), Ok(()));
@@ -199,7 +199,7 @@ fn a_release_ends_the_renewals_of_an_operators_call_too(world: &mut dyn World) {
     let lease = millis(if world.is_virtual() { 400 } else { 1_600 });
     let service = Service::new("drive(n: int[1])").lease(lease);
     let (manager, agv) = pair(world, &service);
-    let told = |event: &Seen| matches!(event, Seen::LeaseEnded(..));
+    let reported = |event: &Seen| matches!(event, Seen::LeaseEnded(..));
     for operator in [false, true] {
         let options = RequestOptions { operator, ..PATIENT };
         let mut asked = Err(Error::Expired);
@@ -212,11 +212,11 @@ fn a_release_ends_the_renewals_of_an_operators_call_too(world: &mut dyn World) {
         }
         assert_eq!(asked, Ok(()));
         manager.release("agv", "drive").expect("it is connected");
-        let before = manager.count(told);
+        let before = manager.count(reported);
         world.run_for(lease);
         assert!(!agv.lease_is_live("drive"));
         // A renewal of a call that has ended is answered, and what is still renewed is told.
-        assert_eq!(manager.count(told), before, "it was renewed behind its release, operator: {operator}");
+        assert_eq!(manager.count(reported), before, "it was renewed behind its release, operator: {operator}");
     }
     world.reached("stopped");
 }

@@ -73,8 +73,8 @@ fn publishing_waits_until_everybody_has_read(world: &mut dyn World) {
     let agvs = [world.add(Spec::agv("one", 1)), world.add(Spec::agv("two", 2))];
     world.wait("both have joined", || manager.number_of_s_units() == 2, secs(40));
     manager.add_service(&Service::new("late()")).expect("there is room");
-    let told = manager.begin_publish();
-    let missing = world.finish(&told).expect("the manager can publish");
+    let reported = manager.begin_publish();
+    let missing = world.finish(&reported).expect("the manager can publish");
     // An AGV that has not read the list is named, which needs a link that ended meanwhile, as on a rough network.
     for agv in &agvs {
         let knows = agv.knows("manager", "late");
@@ -97,10 +97,10 @@ fn publishing_returns_at_once_or_waits_as_asked(world: &mut dyn World) {
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(6)));
     manager.publish().expect("it can be published");
     assert!(!agv.knows("manager", "late"), "it has returned before the AGV has read");
-    let told = manager.begin_publish();
+    let reported = manager.begin_publish();
     world.run_for(secs(1));
-    assert!(!told.is_over() && !agv.knows("manager", "late"), "it waits for the AGV");
-    assert_eq!(world.finish(&told), Ok(vec![]));
+    assert!(!reported.is_over() && !agv.knows("manager", "late"), "it waits for the AGV");
+    assert_eq!(world.finish(&reported), Ok(vec![]));
     assert!(agv.knows("manager", "late"));
 }
 

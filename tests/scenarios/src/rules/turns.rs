@@ -22,9 +22,9 @@ fn two(world: &mut dyn World, manager: &Unit, agv: &Unit, service: &Service, opt
     let call = |n| manager.begin("agv", service.name(), &number("n", n), options);
     let first = call(1);
     world.wait("the first one runs", || log.runs() == before + 1, secs(20));
-    let begun = agv.counted(LinkCounter::RequestsRun);
+    let started = agv.counted(LinkCounter::RequestsRun);
     let second = call(2);
-    world.wait("the second one has begun", || agv.counted(LinkCounter::RequestsRun) > begun, secs(20));
+    world.wait("the second one has begun", || agv.counted(LinkCounter::RequestsRun) > started, secs(20));
     [first, second]
 }
 
@@ -73,9 +73,9 @@ fn a_call_whose_caller_goes_while_it_waits_does_not_begin(world: &mut dyn World)
     met(world, &manager, "agv", "work");
     met(world, &manager, "agv", "other");
     two(world, &manager, &agv, &service, PATIENT);
-    let begun = agv.counted(LinkCounter::RequestsRun);
+    let started = agv.counted(LinkCounter::RequestsRun);
     (1..WAITING).for_each(|n| drop(manager.begin("agv", "work", &number("n", n), PATIENT)));
-    world.wait("all wait", || agv.counted(LinkCounter::RequestsRun) + 1 == begun + WAITING as u64, secs(20));
+    world.wait("all wait", || agv.counted(LinkCounter::RequestsRun) + 1 == started + WAITING as u64, secs(20));
     manager.stop();
     world.wait("it has gone", || !agv.is_connected("manager"), secs(20));
     manager.start();

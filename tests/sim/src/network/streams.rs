@@ -181,7 +181,7 @@ impl Network {
         let host = self.end(reader).host;
         let pipe = &mut self.end_mut(reader.peer()).outgoing;
         if pipe.end == PipeEnd::Arrived && pipe.unseen() == 0 {
-            pipe.end = PipeEnd::Told;
+            pipe.end = PipeEnd::Report;
             self.ready.push_back(NetEvent::Closed { host, stream: reader });
         }
     }

@@ -170,7 +170,7 @@ impl Network {
     fn stray_arrives(&mut self, reader: StreamId, end: bool) {
         let closing = self.end(reader).state == State::Closing;
         if closing && end {
-            self.end_mut(reader.peer()).outgoing.end = PipeEnd::Told;
+            self.end_mut(reader.peer()).outgoing.end = PipeEnd::Report;
             return self.bury_if_finished(reader);
         }
         if closing {

@@ -277,7 +277,7 @@ impl Inner {
     fn act(&mut self, shared: &Rc<Shared>, host: HostId, command: Command<SocketAddr>) {
         match command {
             Command::Dial { to, identity } => self.dial(host, to, identity.as_ref()),
-            Command::Tell(LinkId(index), directive) => {
+            Command::Notify(LinkId(index), directive) => {
                 let Some(machine) = &mut self.units[host.index()].machine else { return };
                 let happened = machine.links.direct(&mut self.network, index, directive);
                 self.happened(shared, host, index, happened);
@@ -314,10 +314,10 @@ impl Inner {
         let Some(machine) = &mut unit.machine else { return };
         let Some(link) = machine.links.remove(&mut self.network, index) else { return };
         unit.counters.merge(link.session.counters());
-        let told = UnitEvent::of(Event::Closed(reason), &link.session, &machine.links.functions, str::to_owned);
+        let reported = UnitEvent::of(Event::Closed(reason), &link.session, &machine.links.functions, str::to_owned);
         Link::abandon(link, Error::Interrupted);
         machine.links.hub.node.left(now, LinkId(index), reason);
-        told.into_iter().for_each(|event| self.log(shared, host, event));
+        reported.into_iter().for_each(|event| self.log(shared, host, event));
     }
 
     /// Starts the service of a call.
@@ -341,7 +341,7 @@ impl Inner {
         let (failure, cancelled) = (RefCell::default(), Promise::new());
         let running = Rc::new(Serving { stream, ticket, failure, cancelled });
         machine.links.runs(index, &running);
-        let told = Served {
+        let reported = Served {
             running: running.clone(),
             caller: caller.clone(),
             priority: call.priority,
@@ -352,7 +352,7 @@ impl Inner {
         };
         let owner = Owner { host, life: unit.life };
         let job = async move {
-            let outcome = service.run(told, parameters).await;
+            let outcome = service.run(reported, parameters).await;
             let failure = running.failure.take();
             let failed = |error| Box::new(CallError::new(Error::Service(error), failure.map(Detail::Service)));
             handle.answer(stream, ticket, outcome.map_err(failed));
@@ -379,8 +379,8 @@ impl Inner {
     fn log_of(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, event: Event) {
         let Some(machine) = &self.units[host.index()].machine else { return };
         let Some(link) = machine.links.link(index) else { return };
-        let told = UnitEvent::of(event, &link.session, &machine.links.functions, str::to_owned);
-        told.into_iter().for_each(|event| self.log(shared, host, event));
+        let reported = UnitEvent::of(event, &link.session, &machine.links.functions, str::to_owned);
+        reported.into_iter().for_each(|event| self.log(shared, host, event));
     }
 
     fn log(&mut self, shared: &Rc<Shared>, host: HostId, event: impl Into<LogEvent>) {
@@ -388,7 +388,7 @@ impl Inner {
         let now = self.network.now();
         self.network.note(host, event.words().as_bytes());
         let unit = &mut self.units[host.index()];
-        for (hook, event) in unit.hooks.iter().filter_map(|hook| Some((hook, event.told()?))) {
+        for (hook, event) in unit.hooks.iter().filter_map(|hook| Some((hook, event.reported()?))) {
             let (hook, event, handle) = (Rc::clone(hook), event.clone(), UnitHandle::new(Rc::downgrade(shared), host));
             self.urgent.push_back(Box::new(move || hook(&handle, &event)));
         }

@@ -23,19 +23,19 @@ pub enum LogEvent {
         caller: Identity,
     },
     /// What the unit told its program.
-    Told(UnitEvent),
+    Report(UnitEvent),
 }
 
 impl From<UnitEvent> for LogEvent {
     fn from(event: UnitEvent) -> Self {
-        Self::Told(event)
+        Self::Report(event)
     }
 }
 
 impl LogEvent {
     /// What the program was told, if it was.
-    pub const fn told(&self) -> Option<&UnitEvent> {
-        if let Self::Told(event) = self { Some(event) } else { None }
+    pub const fn reported(&self) -> Option<&UnitEvent> {
+        if let Self::Report(event) = self { Some(event) } else { None }
     }
 
     /// What the trace of a run has of it: the same text whatever types and variants are called.
@@ -44,7 +44,7 @@ impl LogEvent {
             Self::Started => "started".to_owned(),
             Self::Stopped => "stopped".to_owned(),
             Self::Called { function, caller } => format!("{caller} called {function}"),
-            Self::Told(event) => words_of(event),
+            Self::Report(event) => words_of(event),
         }
     }
 }

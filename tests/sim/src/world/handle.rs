@@ -307,13 +307,13 @@ impl UnitHandle {
     // --- helpers
 
     pub(super) fn progress(&self, stream: StreamId, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
-        let told = self.machine(|machine, network| {
+        let reported = self.machine(|machine, network| {
             let index = machine.links.of_stream(stream)?;
             Some((index, machine.links.progress(network, index, ticket, values)))
         })?;
-        let Some((index, told)) = told else { return Ok(()) };
+        let Some((index, reported)) = reported else { return Ok(()) };
         self.work(index);
-        told
+        reported
     }
 
     pub(super) fn is_cancelled(&self, stream: StreamId, ticket: Ticket) -> bool {

@@ -260,10 +260,10 @@ impl Links {
         ticket: Ticket,
         values: &ParametersView,
     ) -> Result<(), Error> {
-        let told = self.with(network, index, |session, cx| session.progress(cx, ticket, values)).unwrap_or(Ok(()));
-        let Some(link) = self.link_mut(index) else { return told };
+        let reported = self.with(network, index, |session, cx| session.progress(cx, ticket, values)).unwrap_or(Ok(()));
+        let Some(link) = self.link_mut(index) else { return reported };
         let waiting = link.progress.iter().position(|(known, _)| *known == ticket);
-        match told {
+        match reported {
             Err(Error::Full(_)) => {}
             Ok(()) => {
                 waiting.map(|place| link.progress.remove(place));

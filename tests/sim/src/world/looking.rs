@@ -90,7 +90,7 @@ impl UnitHandle {
 
     /// How many of the events that its program was told match.
     pub fn count(&self, matches: impl Fn(&UnitEvent) -> bool) -> usize {
-        let matches = |(_, event): &&(_, LogEvent)| event.told().is_some_and(&matches);
+        let matches = |(_, event): &&(_, LogEvent)| event.reported().is_some_and(&matches);
         self.with(|inner| inner.units[self.host().index()].log.iter().filter(matches).count())
     }
 

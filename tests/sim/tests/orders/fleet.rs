@@ -115,7 +115,7 @@ pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
             });
             let unit = unit.start();
             let (watch, vehicles, process) = (Rc::clone(&watch), Rc::clone(&vehicles), Rc::clone(&current));
-            unit.on_event(move |unit, event| told(unit, event, &mut watch.borrow_mut(), process.get(), &vehicles));
+            unit.on_event(move |unit, event| reported(unit, event, &mut watch.borrow_mut(), process.get(), &vehicles));
             if number > 1 {
                 unit.stop();
             }
@@ -417,7 +417,7 @@ fn caller(unit: &UnitHandle, watch: &Shared, current: &Cell<usize>, vehicles: &R
 }
 
 /// What a caller is told of its calls.
-fn told(unit: &UnitHandle, event: &UnitEvent, watch: &mut Watch, process: usize, vehicles: &[Identity]) {
+fn reported(unit: &UnitHandle, event: &UnitEvent, watch: &mut Watch, process: usize, vehicles: &[Identity]) {
     let number = |peer: &Identity| vehicles.iter().position(|vehicle| vehicle == peer);
     match event {
         UnitEvent::Left { peer, .. } => {
@@ -544,9 +544,9 @@ impl Caller {
 
     fn release(&mut self, vehicle: usize) {
         let (function, _) = FUNCTIONS[self.one_of(&MOVES)];
-        let told = self.unit.release(&self.vehicles[vehicle], function).is_ok();
+        let reported = self.unit.release(&self.vehicles[vehicle], function).is_ok();
         let mut watch = self.watch.borrow_mut();
-        watch.give_up_all(self.process, self.unit.now(), told, |made| {
+        watch.give_up_all(self.process, self.unit.now(), reported, |made| {
             made.vehicle == vehicle && made.function == function
         });
         watch.reach("released");

@@ -55,7 +55,7 @@ struct Call {
     /// When its caller no longer wanted it.
     ended: Option<Instant>,
     /// Calls from this number on were made after the vehicle was told that.
-    told: Option<usize>,
+    reported: Option<usize>,
     has_started: bool,
     /// Its order has ended: it moves nothing any more, ever.
     is_dead: bool,
@@ -193,7 +193,7 @@ impl Watch {
     }
 
     pub(crate) fn make(&mut self, made: Made) -> usize {
-        self.calls.push(Call { made, ended: None, told: None, has_started: false, is_dead: false });
+        self.calls.push(Call { made, ended: None, reported: None, has_started: false, is_dead: false });
         self.calls.len() - 1
     }
 
@@ -208,13 +208,13 @@ impl Watch {
         self.named.get(&(by, vehicle, id)).copied()
     }
 
-    /// The caller does not want a call any more, and has said so if it was `told`.
-    pub(crate) fn give_up(&mut self, n: usize, now: Instant, told: bool) {
-        let told = told && !self.may_be_forgotten(n);
+    /// The caller does not want a call any more, and has said so if it was `reported`.
+    pub(crate) fn give_up(&mut self, n: usize, now: Instant, reported: bool) {
+        let reported = reported && !self.may_be_forgotten(n);
         let next = self.calls.len();
         let call = &mut self.calls[n];
         call.ended = call.ended.or(Some(now));
-        call.told = call.told.or(told.then_some(next));
+        call.reported = call.reported.or(reported.then_some(next));
     }
 
     /// Whether a newer call of the same function follows it. Where a session holds no more calls, such a one takes the place
@@ -226,10 +226,10 @@ impl Watch {
     }
 
     /// The same for all calls of a process that match.
-    pub(crate) fn give_up_all(&mut self, by: usize, now: Instant, told: bool, matches: impl Fn(&Made) -> bool) {
+    pub(crate) fn give_up_all(&mut self, by: usize, now: Instant, reported: bool, matches: impl Fn(&Made) -> bool) {
         for n in 0..self.calls.len() {
             if self.calls[n].made.by == by && matches(&self.calls[n].made) {
-                self.give_up(n, now, told);
+                self.give_up(n, now, reported);
             }
         }
     }
@@ -331,8 +331,8 @@ impl Watch {
         // The handler of the order that has taken its place may be still to start.
         assert!(is_live || moves, "call {n} runs before the safe hook of {open}, which has ended");
         // An emergency overtakes what was sent before it.
-        let was_told = other.told.is_some_and(|told| told <= n) && !is_emergency;
-        assert!(!(was_told && is_live), "call {open} was released before {n} was made, and still moves");
+        let was_reported = other.reported.is_some_and(|reported| reported <= n) && !is_emergency;
+        assert!(!(was_reported && is_live), "call {open} was released before {n} was made, and still moves");
     }
 
     fn order_begins(&mut self, n: usize, actuator: usize, order: &LeaseWatch, seen: Seen) {

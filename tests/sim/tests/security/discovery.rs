@@ -264,8 +264,8 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
     running.hear(at(2_000), host(1), &question);
     running.run(at(2_001));
     let answer = running.outbox.sent.last().expect("it answers").1.clone();
-    let told = asking.hear(host(1), &answer, &own, &mut out);
-    assert_eq!(told, Heard::Running { at: SocketAddr::from(([10, 0, 0, 1], 7_000)), claim: None });
+    let reported = asking.hear(host(1), &answer, &own, &mut out);
+    assert_eq!(reported, Heard::Running { at: SocketAddr::from(([10, 0, 0, 1], 7_000)), claim: None });
     assert!(answer.len() <= question.len());
     // The next start has another nonce, and that answer is an old one.
     let next = Presence::new(depot(), FLEET, Epoch(600), 78);

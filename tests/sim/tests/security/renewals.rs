@@ -30,7 +30,7 @@ fn before() -> Ends {
 }
 
 /// The same, with the renewal begun: its first message is on its way.
-fn begun() -> Ends {
+fn started() -> Ends {
     let mut ends = before();
     ends.agv.wait(STEP);
     ends
@@ -236,7 +236,7 @@ fn a_renewal_waits_for_room_in_the_stream() {
 #[test]
 fn calls_go_on_at_every_step_of_a_renewal() {
     for at in 0..8 {
-        let mut ends = begun();
+        let mut ends = started();
         let mut number = 0;
         while let Some(carried) = ends.next() {
             if number == at {

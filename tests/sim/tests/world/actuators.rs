@@ -72,7 +72,7 @@ impl Yard {
         *self.hooks.borrow()
     }
 
-    fn is_told(&self, caller: usize, end: LeaseEnd) -> bool {
+    fn is_reported(&self, caller: usize, end: LeaseEnd) -> bool {
         self.callers[caller].count(|event| matches!(event, UnitEvent::LeaseEnded { why, .. } if *why == end)) == 1
     }
 }
@@ -85,7 +85,7 @@ fn an_order_is_replaced_by_its_own_caller_and_held_against_others_unless_taken_o
     yard.request("dock", WANTED);
     yard.world.run_for(millis(500));
     assert_eq!(*yard.committed.borrow(), [true, true, false, true], "the first was replaced");
-    assert!(yard.is_told(0, LeaseEnd::Replaced));
+    assert!(yard.is_reported(0, LeaseEnd::Replaced));
     assert_eq!(yard.call(1, "go", WANTED), Err(Error::Held { by: 1, operator: false }));
     assert_eq!(yard.call(1, "go", RequestOptions { take_over: true, ..WANTED }), Ok(()));
     assert_eq!((yard.is_live(), yard.hooks()), (true, 0));
@@ -98,7 +98,7 @@ fn what_the_program_of_a_unit_moves_is_held_against_its_operator_and_the_reverse
     assert_eq!(yard.call(0, "go", WANTED), Ok(()));
     assert_eq!(yard.call(0, "dock", operators), Err(Error::Held { by: 1, operator: false }));
     assert_eq!(yard.call(0, "dock", RequestOptions { take_over: true, ..operators }), Ok(()));
-    assert!(yard.is_told(0, LeaseEnd::Replaced));
+    assert!(yard.is_reported(0, LeaseEnd::Replaced));
     for caller in [0, 1] {
         assert_eq!(yard.call(caller, "go", WANTED), Err(Error::Held { by: 1, operator: true }));
     }
@@ -114,7 +114,7 @@ fn a_stop_of_another_unit_has_the_hook_run_before_its_handler_and_a_reset_undoes
     assert!(yard.is_live() && yard.call(1, "halt", RequestOptions::new()).is_ok());
     assert_eq!((yard.is_live(), yard.hooks()), (false, 1), "at once, though it is the order of another link");
     yard.world.run_for(millis(10));
-    assert!(yard.is_told(0, LeaseEnd::Stopped));
+    assert!(yard.is_reported(0, LeaseEnd::Stopped));
     assert_eq!(yard.call(0, "go", WANTED), Err(Error::Inhibited { by: 2, reason: 0 }));
     assert_eq!(yard.call(0, "go_on", RequestOptions::new()), Ok(()));
     assert_eq!(yard.call(0, "go", WANTED), Ok(()));

@@ -21,9 +21,9 @@ fn the_papers_listing() {
     pos.set_value("position", [1, 2]).unwrap();
     manager.request("agv", "go_to", &pos).unwrap();
 
-    let mut told = position();
-    world.block_request(&manager, "agv", "pos_info", &mut told).unwrap();
-    assert_eq!(told, pos);
+    let mut reported = position();
+    world.block_request(&manager, "agv", "pos_info", &mut reported).unwrap();
+    assert_eq!(reported, pos);
 
     manager.my_function_list().add_service("call_mechanic(place: int[2])", Service::new(|_, _| Ok(()))).unwrap();
     manager.publish_my_function_list_to("agv").unwrap();

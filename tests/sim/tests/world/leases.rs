@@ -82,9 +82,9 @@ fn without_renewal_the_lease_ends_by_itself() {
 #[test]
 fn what_is_finished_is_one_order_and_ends_without_the_safe_hook() {
     let (mut world, manager, agv, _, stopped) = driving(4);
-    let ((begun, orders), (stops, lifted)) = (shared(Vec::<LeaseWatch>::new()), shared(0));
+    let ((started, orders), (stops, lifted)) = (shared(Vec::<LeaseWatch>::new()), shared(0));
     let lift = Service::new(move |call, _| {
-        begun.borrow_mut().extend(call.lease.clone());
+        started.borrow_mut().extend(call.lease.clone());
         Ok(())
     });
     agv.my_function_list().add_service("lift()", lift.lease(LEASE, move |_| *stops.borrow_mut() += 1)).unwrap();

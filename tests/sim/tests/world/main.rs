@@ -35,9 +35,9 @@ fn start_agv(world: &World, name: &str, id: u32) -> UnitHandle {
 }
 
 fn agv(unit: &UnitHandle) {
-    let (position, told) = shared([0_i64, 0]);
+    let (position, reported) = shared([0_i64, 0]);
     let pos_info = Service::new(move |_, parameters| {
-        parameters.set_value("position", *told.borrow()).expect("the signature declares it");
+        parameters.set_value("position", *reported.borrow()).expect("the signature declares it");
         Ok(())
     });
     let go_to = Service::new(move |_, parameters| {

@@ -36,7 +36,7 @@ fn options(priority: Priority) -> RequestOptions {
 fn fleet(seed: u64) -> Fleet {
     let mut world = World::secured(seed);
     let manager = world.m_unit("manager", 1).start();
-    let ((ran, noted), (stops, stopped)) = (shared(Vec::new()), shared(0));
+    let ((ran, recorded), (stops, stopped)) = (shared(Vec::new()), shared(0));
     let program = move |unit: &UnitHandle| {
         let (ran, stops) = (Rc::clone(&ran), Rc::clone(&stops));
         let note = Service::new(move |_, parameters| {
@@ -57,7 +57,7 @@ fn fleet(seed: u64) -> Fleet {
         .program(program)
         .start();
     assert!(world.run_until(|_| manager.knows("agv", "drive"), secs(20)));
-    Fleet { world, manager, agv, ran: noted, stops: stopped }
+    Fleet { world, manager, agv, ran: recorded, stops: stopped }
 }
 
 fn renewed(unit: &UnitHandle) -> u64 {

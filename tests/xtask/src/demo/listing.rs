@@ -93,7 +93,7 @@ impl Listing<'_> {
 
     fn join(&mut self, number: u32) -> Result<Process> {
         let agv = self.stage.agv(number)?;
-        self.stage.tell(&format!("agv-{number} starts"));
+        self.stage.show(&format!("agv-{number} starts"));
         let joined = format!("joined agv-{number}/1{number}");
         self.stage.heard(&self.manager.seen(&joined, STEP)?, self.manager);
         Ok(agv)
@@ -116,8 +116,8 @@ impl Listing<'_> {
 
 /// The example's code by the paper's line numbers, which stand in its comments.
 fn code(source: &str) -> Result<BTreeMap<u32, String>> {
-    let begun = source.split_once("// README begins.").with_context(|| format!("no listing begins in {SOURCE}"))?.1;
-    let listing = begun.split_once("// README ends.").with_context(|| format!("no listing ends in {SOURCE}"))?.0;
+    let started = source.split_once("// README begins.").with_context(|| format!("no listing begins in {SOURCE}"))?.1;
+    let listing = started.split_once("// README ends.").with_context(|| format!("no listing ends in {SOURCE}"))?.0;
     let mut code = BTreeMap::<u32, String>::new();
     let mut pending = String::new();
     for line in listing.lines().map(str::trim).filter(|line| !line.starts_with("transcript.")) {

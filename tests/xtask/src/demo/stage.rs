@@ -38,7 +38,7 @@ impl Stage {
         command.args(["keys", "new-fleet", "--fleet", &self.fleet]).args(NODES).env("CARA_KEYS", self.keys.path());
         let made = command.output().context("cannot start cara")?;
         ensure!(made.status.success(), "no keys were made: {}", String::from_utf8_lossy(&made.stderr));
-        self.tell(&format!("cara keys new-fleet --fleet {} {}", self.fleet, NODES.join(" ")));
+        self.show(&format!("cara keys new-fleet --fleet {} {}", self.fleet, NODES.join(" ")));
         Ok(())
     }
 
@@ -76,7 +76,7 @@ impl Stage {
         println!("\n== {title}");
     }
 
-    pub(super) fn tell(&self, what: &str) {
+    pub(super) fn show(&self, what: &str) {
         println!("{:>6.1} s  {what}", self.seconds());
     }
 

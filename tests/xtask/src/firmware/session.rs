@@ -36,8 +36,8 @@ pub(crate) fn session(board: Option<&str>, options: &SessionOptions) -> Result<E
     install::program("qemu-system-arm", "qemu-system-arm").map_err(anyhow::Error::msg)?;
     let image = tested_image()?;
     let (id, fleet) = (options.id.to_string(), options.fleet.to_string());
-    let told = ["session", "--name", &options.name, "--id", &id, "--manager", &options.manager, "--fleet", &fleet];
-    match tests(&image)?.args(told).interactive().code()? {
+    let reported = ["session", "--name", &options.name, "--id", &id, "--manager", &options.manager, "--fleet", &fleet];
+    match tests(&image)?.args(reported).interactive().code()? {
         Some(0) => Ok(ExitCode::SUCCESS),
         Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
         Some(_) => bail!("the session ended, for the reason above"),

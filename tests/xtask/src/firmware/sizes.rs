@@ -117,8 +117,8 @@ fn print_resources() -> Result<()> {
     }
     let machine = ["-M", TESTED, "-display", "none", "-monitor", "none", "-serial", "none", "-nic", "none"];
     let semihosting = ["-semihosting-config", "enable=on,target=native", "-kernel"];
-    let told = Run::new("qemu-system-arm").args(machine).args(semihosting).args([image]).text()?;
-    println!("\nBytes of static RAM, and what more of each capacity adds:\n{}", told.trim());
+    let reported = Run::new("qemu-system-arm").args(machine).args(semihosting).args([image]).text()?;
+    println!("\nBytes of static RAM, and what more of each capacity adds:\n{}", reported.trim());
     Ok(())
 }
 

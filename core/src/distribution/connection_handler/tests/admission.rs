@@ -118,14 +118,14 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
             // It is decided whatever is answered.
             node.challenge_answered(at(101), LinkId(1));
             let reason = CloseReason::Refused(Refusal::AlreadyConnected);
-            let decided = [tell(1, Directive::Challenge), tell(1, Directive::Close(reason))];
+            let decided = [notify(1, Directive::Challenge), notify(1, Directive::Close(reason))];
             let commands = due(node, at(101));
             assert!(commands.is_empty() || commands == decided, "{commands:?}");
             node.left(at(101), LinkId(1), reason);
             let admitted = due(node, at(101));
             assert!(
                 admitted.is_empty() == commands.is_empty()
-                    && admitted.iter().all(|told| *told == tell(0, Directive::Admit))
+                    && admitted.iter().all(|reported| *reported == notify(0, Directive::Admit))
             );
             let link = node.nodes().next().unwrap().link();
             assert_eq!(link, Some(LinkId(0)), "first: {}", if small_first { "small" } else { "large" });

@@ -95,7 +95,7 @@ impl Port {
                     (_, Some(_)) => {}
                 }
             }
-            Command::Tell(link, directive) => {
+            Command::Notify(link, directive) => {
                 assert!(self.open.contains(&link.0), "{link:?} is told {directive:?}");
                 match directive {
                     Directive::Challenge | Directive::Yield => {}

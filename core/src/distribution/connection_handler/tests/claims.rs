@@ -328,18 +328,18 @@ fn a_connected_vehicle_gives_way_to_a_higher_claim_that_is_proven() {
             Datagram::WhoHas(who_has) => Some(who_has),
             _ => None,
         });
-        let told = outbox.sent.iter().find_map(|(_, bytes)| match read(bytes) {
+        let reported = outbox.sent.iter().find_map(|(_, bytes)| match read(bytes) {
             Datagram::Announce(announce) => Some(announce),
             _ => None,
         });
-        assert_eq!(told.expect("it says whom it obeys").obeyed, report(claim(5), 0));
+        assert_eq!(reported.expect("it says whom it obeys").obeyed, report(claim(5), 0));
         let asked = asked.expect("it asks");
         let replayed = Announce { claim: report(claim(6), 0), ..announce_of(&newer, 1, asked.nonce ^ 2) };
         node.hear(at(5_201), address(9, 7_001), &announce_bytes(&replayed));
         assert_eq!(due(&mut node, at(5_202)), []);
         let announce = Announce { claim: heard, ..announce_of(&newer, 1, asked.nonce) };
         node.hear(at(5_203), address(9, 7_001), &announce_bytes(&announce));
-        let expected = if gives_way { vec![tell(0, Directive::Yield)] } else { vec![] };
+        let expected = if gives_way { vec![notify(0, Directive::Yield)] } else { vec![] };
         assert_eq!(due(&mut node, at(5_204)), expected);
         if gives_way {
             node.left(at(5_400), LinkId(0), CloseReason::PeerRestarted);
@@ -357,17 +357,17 @@ fn a_newcomer_with_a_higher_claim_waits_or_is_told_that_the_vehicle_drives() {
         assert_eq!(admit(&mut door, 0, &of_claim(claim(5))), Admission::Accept);
         let newer = Hello { epoch: Epoch(7), ..of_claim(claim(6)) };
         assert_eq!(admit(&mut door, 1, &newer), Admission::Wait);
-        assert_eq!(due(&mut door, at(1_000)), [tell(0, Directive::Yield)]);
+        assert_eq!(due(&mut door, at(1_000)), [notify(0, Directive::Yield)]);
         door
     };
     let mut silent = joined();
-    assert_eq!(due(&mut silent, at(1_300)), [tell(0, Directive::Close(CloseReason::PeerRestarted))]);
+    assert_eq!(due(&mut silent, at(1_300)), [notify(0, Directive::Close(CloseReason::PeerRestarted))]);
     silent.left(at(1_301), LinkId(0), CloseReason::PeerRestarted);
-    assert!(due(&mut silent, at(1_301)).contains(&tell(1, Directive::Admit)));
+    assert!(due(&mut silent, at(1_301)).contains(&notify(1, Directive::Admit)));
     let manager = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
     assert_eq!(silent.obeyed(&manager), claim(6));
     let mut alive = joined();
     alive.challenge_answered(at(1_100), LinkId(0));
-    assert_eq!(due(&mut alive, at(1_100)), [tell(1, Directive::Refuse(Refusal::Driving))]);
+    assert_eq!(due(&mut alive, at(1_100)), [notify(1, Directive::Refuse(Refusal::Driving))]);
     assert_eq!(alive.obeyed(&manager), claim(5));
 }

@@ -243,10 +243,10 @@ fn a_manager_expects_no_more_nodes_than_it_knows_of() {
         as_who_has(&outbox.broadcasts[0]).expected
     };
     assert_eq!(expected(&mut depot()), Constraints::M_UNIT.maximum_nodes);
-    for (known, told) in [(0, 1), (3, 3), (u16::MAX, Constraints::M_UNIT.maximum_nodes)] {
+    for (known, reported) in [(0, 1), (3, 3), (u16::MAX, Constraints::M_UNIT.maximum_nodes)] {
         let mut node = depot();
         node.expect(known);
-        assert_eq!(expected(&mut node), told);
+        assert_eq!(expected(&mut node), reported);
     }
 }
 
@@ -315,13 +315,13 @@ fn own_datagrams_are_ignored_and_a_double_is_told() {
 fn doubles_are_told_now_and_then_only() {
     let mut node = depot();
     let own = m_unit(MANAGER, MANAGER_ID);
-    let mut told = 0;
+    let mut reported = 0;
     for life in 0..1_000 {
         let double = NodeConfig { epoch: Epoch(1_000 + life), ..own.clone() };
         node.hear(at(life * 20), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
-        told += u32::from(node.take_duplicate().is_some());
+        reported += u32::from(node.take_duplicate().is_some());
     }
-    assert_eq!(told, 3, "in 20 s");
+    assert_eq!(reported, 3, "in 20 s");
 }
 
 #[test]

@@ -136,11 +136,11 @@ impl Port {
                     None => self.node.dial_failed(self.now, identity.as_ref()),
                 }
             }
-            Command::Tell(link, directive) => self.told(link.0, directive),
+            Command::Notify(link, directive) => self.reported(link.0, directive),
         }
     }
 
-    fn told(&mut self, link: u16, directive: Directive) {
+    fn reported(&mut self, link: u16, directive: Directive) {
         let open = self.open.get_mut(&link).unwrap();
         match directive {
             Directive::Challenge | Directive::Yield => assert_eq!(open.1, Open::Joined),

@@ -213,8 +213,8 @@ pub(super) fn due(node: &mut Node<InMemory>, now: Instant) -> Vec<Command<Socket
 }
 
 /// What a link is told.
-pub(super) fn tell(link: u16, directive: Directive) -> Command<SocketAddr> {
-    Command::Tell(LinkId(link), directive)
+pub(super) fn notify(link: u16, directive: Directive) -> Command<SocketAddr> {
+    Command::Notify(LinkId(link), directive)
 }
 
 /// Lets a unit join.

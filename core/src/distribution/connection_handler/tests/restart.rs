@@ -16,7 +16,7 @@ fn challenged() -> Node<InMemory> {
     join(&mut node, at(1), 0, &agv);
     let admission = node.admit(at(1_000), LinkId(1), address(1, 41_000), &reborn(&agv));
     assert_eq!(admission, Admission::Wait);
-    assert_eq!(due(&mut node, at(1_000)), [tell(0, Directive::Challenge)]);
+    assert_eq!(due(&mut node, at(1_000)), [notify(0, Directive::Challenge)]);
     node
 }
 
@@ -24,7 +24,7 @@ fn challenged() -> Node<InMemory> {
 fn an_old_link_that_answers_stays_and_the_newcomer_is_a_duplicate() {
     let mut node = challenged();
     node.challenge_answered(at(1_100), LinkId(0));
-    assert_eq!(due(&mut node, at(1_100)), [tell(1, Directive::Refuse(Refusal::DuplicateIdentity))]);
+    assert_eq!(due(&mut node, at(1_100)), [notify(1, Directive::Refuse(Refusal::DuplicateIdentity))]);
     node.challenge_answered(at(1_101), LinkId(0));
     assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
     node.left(at(2_001), LinkId(1), CloseReason::Reset);
@@ -40,11 +40,11 @@ fn an_old_link_that_is_silent_is_superseded_in_time() {
     let mut node = challenged();
     let commands = run(&mut node, at(2_000), &mut Outbox::default());
     let (when, reason) = (at(1_000) + CHALLENGE_TIMEOUT, CloseReason::PeerRestarted);
-    assert_eq!(commands, [(when, tell(0, Directive::Close(reason)))]);
+    assert_eq!(commands, [(when, notify(0, Directive::Close(reason)))]);
     node.challenge_answered(at(2_000), LinkId(0));
     assert_eq!(due(&mut node, at(2_000)), [], "too late");
     node.left(at(2_001), LinkId(0), reason);
-    assert_eq!(due(&mut node, at(2_001)), [tell(1, Directive::Admit)]);
+    assert_eq!(due(&mut node, at(2_001)), [notify(1, Directive::Admit)]);
     assert_eq!(node.node_of(LinkId(1)).map(|known| known.epoch), Some(Epoch(999)));
     assert_eq!((node.connected(), node.counters.value(NodeCounter::Restarted)), (1, 1));
     node.challenge_answered(at(2_002), LinkId(0));
@@ -55,7 +55,7 @@ fn an_old_link_that_is_silent_is_superseded_in_time() {
 fn an_old_link_that_breaks_lets_the_newcomer_in_at_once() {
     let mut node = challenged();
     node.left(at(1_001), LinkId(0), CloseReason::Reset);
-    assert_eq!(due(&mut node, at(1_001)), [tell(1, Directive::Admit)]);
+    assert_eq!(due(&mut node, at(1_001)), [notify(1, Directive::Admit)]);
     assert_eq!(node.node_of(LinkId(1)).map(Known::link), Some(Some(LinkId(1))));
     assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
     assert_eq!(node.connected(), 1);
@@ -79,7 +79,7 @@ fn the_link_of_a_refused_newcomer_is_no_nodes_link() {
         assert_eq!(node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello), Admission::Wait);
         assert!(node.node_of(LinkId(1)).is_none() && node.table.of_link(LinkId(1)).is_some());
         node.challenge_answered(at(1_001), LinkId(0));
-        assert!(matches!(due(&mut node, at(1_001))[..], [Command::Tell(LinkId(1), Directive::Refuse(_))]));
+        assert!(matches!(due(&mut node, at(1_001))[..], [Command::Notify(LinkId(1), Directive::Refuse(_))]));
         assert_eq!(node.table.of_link(LinkId(1)), None);
         assert!(node.node_of(LinkId(0)).is_some());
     }
@@ -92,7 +92,7 @@ fn a_second_newcomer_is_refused() {
     assert_eq!(third, Admission::Refuse(Refusal::DuplicateIdentity));
     node.left(at(1_002), LinkId(2), CloseReason::Reset);
     let commands = run(&mut node, at(2_000), &mut Outbox::default());
-    assert!(matches!(commands[..], [(_, Command::Tell(LinkId(0), Directive::Close(_)))]), "{commands:?}");
+    assert!(matches!(commands[..], [(_, Command::Notify(LinkId(0), Directive::Close(_)))]), "{commands:?}");
 }
 
 #[test]
@@ -102,13 +102,13 @@ fn a_peer_that_dials_again_in_one_life_waits_for_its_old_link_to_show_itself() {
     join(&mut node, at(1), 0, &agv);
     let again = |node: &mut Node<InMemory>| node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello_of(&agv));
     assert_eq!(again(&mut node), Admission::Wait);
-    assert_eq!(due(&mut node, at(1_000)), [tell(0, Directive::Challenge)]);
+    assert_eq!(due(&mut node, at(1_000)), [notify(0, Directive::Challenge)]);
     node.challenge_answered(at(1_001), LinkId(0));
-    assert_eq!(due(&mut node, at(1_001)), [tell(1, Directive::Refuse(Refusal::AlreadyConnected))]);
+    assert_eq!(due(&mut node, at(1_001)), [notify(1, Directive::Refuse(Refusal::AlreadyConnected))]);
     assert_eq!(again(&mut node), Admission::Wait);
     let commands = run(&mut node, at(1_500), &mut Outbox::default());
     let superseded =
-        [(at(1_000), tell(0, Directive::Challenge)), (at(1_300), tell(0, Directive::Close(CloseReason::Reset)))];
+        [(at(1_000), notify(0, Directive::Challenge)), (at(1_300), notify(0, Directive::Close(CloseReason::Reset)))];
     assert_eq!(commands, superseded);
     assert_eq!(node.counters.value(NodeCounter::Restarted), 0);
 }

@@ -133,7 +133,7 @@ fn a_request_is_refused_before_its_arguments_are_looked_at() {
 #[test]
 fn an_asynchronous_request_is_refused_too_and_in_a_datagram_as_well() {
     let mut pair = under(table([row(MANAGER, &["go"], Verbs::LIST)]));
-    let id = pair.manager.tell("go", &x(1)).unwrap();
+    let id = pair.manager.notify("go", &x(1)).unwrap();
     pair.run(Duration::from_millis(1));
     assert!(pair.manager.has(&Event::Failed(id, Error::NotAllowed)));
     let emergency = RequestOptions { priority: Some(Priority::Emergency), ..RequestOptions::default() };
@@ -190,7 +190,7 @@ fn a_lease_ends_with_the_permission() {
     assert!(!pair.agv.is_live(slots[0]), "at once");
     pair.settle();
     assert!(pair.agv.has(&Event::LeaseExpired(slots[0])));
-    assert!(pair.manager.is_told(CallId(1), LeaseEnd::Expired));
+    assert!(pair.manager.is_reported(CallId(1), LeaseEnd::Expired));
     pair.run(Duration::from_secs(2));
     assert!(!pair.agv.is_live(slots[0]) && pair.agv.is_live(slots[1]));
 }

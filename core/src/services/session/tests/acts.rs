@@ -7,7 +7,7 @@ use std::vec::Vec;
 
 use super::super::{Event, Incoming, RequestOptions};
 use super::setup::{self, Handler, Run};
-use super::side::{Arguments, Begun, Side, Table, context};
+use super::side::{Arguments, Side, Started, Table, context};
 use crate::config::{Constraints, Priority};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::function::{Attributes, Definition};
@@ -131,7 +131,7 @@ impl Side {
     }
 
     /// A request that wants no reply.
-    pub(super) fn tell(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+    pub(super) fn notify(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
         self.request_with(function, parameters, &WANTED, false)
     }
 
@@ -168,7 +168,7 @@ impl Side {
     }
 
     /// Whether an order of a function may go on, by its own look.
-    pub(super) fn goes_on(&self, call: &Incoming) -> bool {
+    pub(super) fn continues(&self, call: &Incoming) -> bool {
         let lease = &self.functions.function(call.slot).unwrap().handler.lease;
         lease.as_ref().unwrap().is_live_for(call.order.unwrap(), self.now)
     }
@@ -262,11 +262,11 @@ impl Side {
 
     /// The functions whose handlers were begun, in order.
     pub(super) fn ran(&self) -> Vec<&str> {
-        self.begun().map(|begun| begun.function.as_str()).collect()
+        self.started().map(|started| started.function.as_str()).collect()
     }
 
     /// The handlers that were begun, in order.
-    pub(super) fn begun(&self) -> impl Iterator<Item = &Begun> {
+    pub(super) fn started(&self) -> impl Iterator<Item = &Started> {
         self.ran.iter()
     }
 
@@ -279,7 +279,7 @@ impl Side {
     }
 
     /// It has been told that a lease of this call of it ended, and why.
-    pub(super) fn is_told(&self, wanted: CallId, reason: LeaseEnd) -> bool {
+    pub(super) fn is_reported(&self, wanted: CallId, reason: LeaseEnd) -> bool {
         self.count(|event| matches!(*event, Event::LeaseEnded { call, why, .. } if (call, why) == (wanted, reason))) > 0
     }
 }

@@ -63,8 +63,8 @@ fn outcome(pair: &Pair, id: CallId) -> Result<(), Error> {
 
 /// What the manager was told last of what a function of the vehicle moves.
 fn state(pair: &Pair, slot: Slot) -> Option<ActuatorState> {
-    let told = pair.manager.happened.iter().rev();
-    told.copied().find_map(|event| match event {
+    let reported = pair.manager.happened.iter().rev();
+    reported.copied().find_map(|event| match event {
         Event::Actuator { slot: of, state } => (of == slot).then_some(state),
         _ => None,
     })
@@ -84,7 +84,7 @@ fn a_newer_order_of_the_same_actuator_takes_the_place_of_the_older_one_without_t
     let (first, other) = (call(&mut pair, "go"), call(&mut pair, "lift"));
     let second = call(&mut pair, "dock");
     assert_eq!((outcome(&pair, first), outcome(&pair, second)), (Ok(()), Ok(())));
-    assert!(pair.manager.is_told(first, LeaseEnd::Replaced) && hooks(&pair) == 0);
+    assert!(pair.manager.is_reported(first, LeaseEnd::Replaced) && hooks(&pair) == 0);
     pair.run(Duration::from_secs(2));
     assert!(pair.agv.is_live(go) && pair.agv.is_live(dock) && pair.agv.is_live(lift), "{other:?} goes on as well");
     assert!(pair.manager.session.holds(second) && !pair.manager.session.holds(first));
@@ -152,10 +152,10 @@ fn an_operator_and_the_program_of_one_unit_hold_for_themselves() {
         // Its own one replaces it, without a word.
         let newer = call_of(&mut pair, operator, false, "dock");
         assert_eq!(outcome(&pair, newer), Ok(()));
-        assert!(pair.manager.is_told(first, LeaseEnd::Replaced));
+        assert!(pair.manager.is_reported(first, LeaseEnd::Replaced));
         let taken = call_of(&mut pair, !operator, true, "go");
         assert_eq!(outcome(&pair, taken), Ok(()));
-        assert!(pair.manager.is_told(newer, LeaseEnd::Replaced) && !pair.manager.session.holds(newer));
+        assert!(pair.manager.is_reported(newer, LeaseEnd::Replaced) && !pair.manager.session.holds(newer));
         let refused = call_of(&mut pair, operator, false, "go");
         assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 1, operator: !operator }));
         pair.run(Duration::from_secs(2));
@@ -177,7 +177,7 @@ fn a_stop_ends_the_order_of_an_operator_and_of_the_program_alike() {
         let options = RequestOptions { operator: !operator, ..RequestOptions::new() };
         pair.manager.request_with("halt", &none(), &options, true).unwrap();
         pair.settle();
-        assert!(!pair.agv.is_live(go) && pair.manager.is_told(driving, LeaseEnd::Stopped));
+        assert!(!pair.agv.is_live(go) && pair.manager.is_reported(driving, LeaseEnd::Stopped));
         let refused = call_of(&mut pair, operator, true, "go");
         assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 1, reason: 0 }));
     }
@@ -213,7 +213,9 @@ fn a_stop_ends_all_orders_before_its_handler_runs_and_lets_none_begin() {
     let before = &pair.agv.happened[..pair.agv.ran.last().unwrap().happened];
     let expired = before.iter().filter(|event| matches!(event, Event::LeaseExpired(_)));
     assert_eq!(expired.count(), 2, "both hooks have run when the handler does");
-    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && pair.manager.is_told(lifting, LeaseEnd::Stopped));
+    assert!(
+        pair.manager.is_reported(driving, LeaseEnd::Stopped) && pair.manager.is_reported(lifting, LeaseEnd::Stopped)
+    );
     let refused = call(&mut pair, "dock");
     assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 1, reason: 0 }));
     // It lasts until a reset, whatever becomes of the link and of the stop's own handler.
@@ -283,7 +285,7 @@ fn the_vehicles_own_latch_is_told_with_its_reason() {
     pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
     assert!(!pair.agv.is_live(go), "at once");
     pair.run(LEASE);
-    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
+    assert!(pair.manager.is_reported(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
     let refused = call(&mut pair, "go");
     assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 0, reason: 9 }));
 }
@@ -298,7 +300,7 @@ fn a_stop_is_noticed_on_a_link_that_has_nothing_to_do() {
     pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
     // A keep-alive later.
     pair.run(Duration::from_millis(1_001));
-    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
+    assert!(pair.manager.is_reported(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
 }
 
 #[test]
@@ -362,11 +364,11 @@ fn what_is_finished_is_an_order_of_the_actuator_that_was_named() {
     assert!(pair.agv.end_order(lift, lifting) && !pair.agv.end_order(lift, driving));
     pair.run(LEASE);
     assert!(pair.agv.is_live(go) && !pair.agv.is_live(lift));
-    assert!(pair.manager.is_told(lifts, LeaseEnd::Finished) && pair.manager.session.holds(drives));
+    assert!(pair.manager.is_reported(lifts, LeaseEnd::Finished) && pair.manager.session.holds(drives));
     // Whichever function moves it: the order is the actuator's.
     assert!(pair.agv.end_order(dock, driving));
     pair.run(LEASE);
-    assert!(pair.manager.is_told(drives, LeaseEnd::Finished) && hooks(&pair) == 0);
+    assert!(pair.manager.is_reported(drives, LeaseEnd::Finished) && hooks(&pair) == 0);
 }
 
 /// What was stopped was not finished, even if its program says so before anything has looked.
@@ -379,7 +381,7 @@ fn what_was_stopped_is_made_safe_and_not_finished() {
     let order = pair.agv.order_of(driving);
     assert!(!pair.agv.end_order(go, order));
     pair.run(LEASE);
-    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
+    assert!(pair.manager.is_reported(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
 }
 
 #[test]
@@ -448,7 +450,7 @@ fn the_caller_is_told_the_state_of_what_it_moves() {
 #[test]
 fn what_its_caller_gave_up_is_told_as_released() {
     let (mut pair, [go, dock, _]) = vehicle();
-    let ended = |pair: &Pair| state(pair, dock).and_then(|told| told.last).and_then(|last| last.end);
+    let ended = |pair: &Pair| state(pair, dock).and_then(|reported| reported.last).and_then(|last| last.end);
     let moves = call(&mut pair, "go");
     pair.manager.cancel(moves);
     pair.run(Duration::from_secs(1));
@@ -472,9 +474,9 @@ fn a_latch_and_its_end_are_told_at_once() {
     let lifts = call(&mut pair, "lift");
     control(&mut pair, "halt", Ok(()));
     let latch = Some(Latch { by: 1, reason: 0 });
-    let told = state(&pair, lift).unwrap();
-    assert_eq!((told.latch, state(&pair, go).unwrap().latch), (latch, latch));
-    let last = told.last.unwrap();
+    let reported = state(&pair, lift).unwrap();
+    assert_eq!((reported.latch, state(&pair, go).unwrap().latch), (latch, latch));
+    let last = reported.last.unwrap();
     assert_eq!((last.call, last.end), (lifts.0, Some(LeaseEnd::Stopped)));
     pair.run(MOMENT);
     control(&mut pair, "free", Ok(()));

@@ -150,7 +150,7 @@ fn recover(pair: &mut Pair, asked: &mut [Asked; 2]) {
 /// The calls of `caller` against what `callee` ran.
 fn check(caller: &Side, callee: &Side, calls: &BTreeMap<CallId, i64>) {
     let mut ran: BTreeMap<i64, usize> = BTreeMap::new();
-    for x in callee.begun().filter_map(|begun| begun.x) {
+    for x in callee.started().filter_map(|started| started.x) {
         *ran.entry(x).or_default() += 1;
     }
     assert!(ran.values().all(|count| *count == 1), "something ran twice: {ran:?}");
@@ -171,7 +171,7 @@ fn check(caller: &Side, callee: &Side, calls: &BTreeMap<CallId, i64>) {
 fn check_order(callee: &Side) {
     for class in [Priority::High, Priority::Normal, Priority::Low] {
         let of_class: Vec<i64> =
-            callee.begun().filter(|begun| begun.priority == class).filter_map(|begun| begun.x).collect();
+            callee.started().filter(|started| started.priority == class).filter_map(|started| started.x).collect();
         assert!(of_class.is_sorted(), "{class:?} calls ran as {of_class:?}");
     }
 }

@@ -70,14 +70,14 @@ fn what_a_frozen_link_held_back_is_not_run() {
     pair.publish();
     pair.manager.net.frozen = true;
     let call = pair.manager.call("go", &none()).unwrap();
-    let told = pair.manager.tell("go", &none()).unwrap();
+    let reported = pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_secs(8));
     assert!(pair.agv.session.is_live(), "datagrams keep it alive");
     pair.manager.net.frozen = false;
     pair.settle();
     assert!(pair.agv.ran().is_empty());
     assert_eq!(pair.manager.outcome(call).unwrap().unwrap_err(), Error::TimedOut);
-    assert!(pair.manager.has(&Event::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(reported, Error::Expired)));
     assert_eq!(pair.agv.counter(LinkCounter::RequestsExpired), 2);
 }
 
@@ -88,7 +88,7 @@ fn a_call_is_in_time_until_its_deadline() {
         pair.agv.offer("go()", |_| Ok(()));
         pair.publish();
         pair.manager.net.frozen = true;
-        pair.manager.tell("go", &none()).unwrap();
+        pair.manager.notify("go", &none()).unwrap();
         pair.run(Duration::from_micros(late));
         pair.manager.net.frozen = false;
         pair.settle();
@@ -103,12 +103,12 @@ fn a_call_that_waited_too_long_for_its_turn_is_not_run() {
     pair.agv.offer("go()", |_| Ok(()));
     pair.publish();
     pair.manager.call("work", &none()).unwrap();
-    let told = pair.manager.tell("go", &none()).unwrap();
+    let reported = pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_secs(3));
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     assert_eq!(pair.agv.ran(), ["work"]);
-    assert!(pair.manager.has(&Event::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(reported, Error::Expired)));
 }
 
 #[test]
@@ -118,7 +118,7 @@ fn what_falls_behind_the_window_is_stale() {
         pair.agv.offer("go(x: int)", |_| Ok(()));
         pair.publish();
         pair.manager.net.frozen = true;
-        let overtaken = pair.manager.tell("go", &x(-1)).unwrap();
+        let overtaken = pair.manager.notify("go", &x(-1)).unwrap();
         for at in 0..overtaking {
             pair.manager.request_with("go", &x(at.into()), &best_effort(), false).unwrap();
         }
@@ -139,7 +139,7 @@ fn calls_begin_in_their_order_and_run_side_by_side() {
     pair.agv.offer("quick()", |_| Ok(()));
     pair.publish();
     for function in ["first", "second", "third"] {
-        pair.manager.tell(function, &none()).unwrap();
+        pair.manager.notify(function, &none()).unwrap();
     }
     let quick = pair.manager.call("quick", &none()).unwrap();
     pair.run(Duration::from_millis(1));
@@ -176,16 +176,16 @@ fn as_many_calls_as_were_told_find_a_place_however_slow_they_are() {
     let mut pair = Pair::with(&Setup { running: 2, ..Setup::default() });
     pair.agv.offer_held("slow()");
     pair.publish();
-    let told = usize::from(pair.manager.session.hello().unwrap().limits.calls);
-    let ids: Vec<_> = (0..=told).map(|_| pair.manager.call("slow", &none()).unwrap()).collect();
+    let reported = usize::from(pair.manager.session.hello().unwrap().limits.calls);
+    let ids: Vec<_> = (0..=reported).map(|_| pair.manager.call("slow", &none()).unwrap()).collect();
     pair.run(Duration::from_millis(1));
     assert_eq!(pair.agv.ran().len(), 2);
-    assert_eq!(pair.manager.outcome(ids[told]).unwrap().unwrap_err(), Error::Busy, "one more than was told");
+    assert_eq!(pair.manager.outcome(ids[reported]).unwrap().unwrap_err(), Error::Busy, "one more than was told");
     while !pair.agv.held.is_empty() {
         pair.agv.answer_held(Ok(&*none()));
         pair.settle();
     }
-    assert!(ids[..told].iter().all(|id| pair.manager.outcome(*id).unwrap().is_ok()));
+    assert!(ids[..reported].iter().all(|id| pair.manager.outcome(*id).unwrap().is_ok()));
 }
 
 #[test]
@@ -231,14 +231,14 @@ fn an_emergency_overtakes_a_long_message_between_its_chunks() {
     pair.publish();
     pair.manager.net.datagrams = Datagrams::Lost;
     pair.manager.net.capacity = 100;
-    pair.manager.tell("read", &text(20_000)).unwrap();
+    pair.manager.notify("read", &text(20_000)).unwrap();
     while pair.agv.counter(LinkCounter::BytesReceived) < 5_000 {
         pair.step();
     }
     let before = pair.agv.counter(LinkCounter::BytesReceived) as usize;
     pair.manager.request_with("stop", &none(), &urgent(Priority::Emergency), true).unwrap();
     pair.settle();
-    let began: Vec<usize> = pair.agv.begun().map(|begun| begun.received).collect();
+    let began: Vec<usize> = pair.agv.started().map(|started| started.received).collect();
     assert_eq!(pair.agv.ran(), ["stop", "read"]);
     // The rest of one chunk, the emergency itself, and what the pipe held.
     assert!(began[0] - before <= 1_024 + EMERGENCY_BYTES + 200, "{} bytes", began[0] - before);

@@ -31,7 +31,7 @@ impl Side {
         self.session.answer_failed(context!(self), call.ticket, failure)
     }
 
-    fn tell_progress(&mut self, call: &Incoming, value: i64) -> Result<(), Error> {
+    fn report_progress(&mut self, call: &Incoming, value: i64) -> Result<(), Error> {
         self.session.progress(context!(self), call.ticket, &x(value))
     }
 
@@ -102,7 +102,7 @@ fn a_failure_brings_its_code_its_text_and_its_values() {
 #[test]
 fn a_request_that_waits_for_nothing_gets_the_text_of_its_failure() {
     let mut pair = with(GO);
-    let id = pair.manager.tell("go", &x(1)).unwrap();
+    let id = pair.manager.notify("go", &x(1)).unwrap();
     pair.run(Duration::from_millis(5));
     pair.agv.fail(&blocked("the way is blocked")).unwrap();
     pair.settle();
@@ -173,18 +173,18 @@ fn details_that_cannot_be_read_leave_the_code() {
 fn progress_comes_to_a_caller_that_wants_it_and_not_behind_the_reply() {
     let mut pair = with(GO);
     let (id, call) = begin(&mut pair, "go");
-    assert_eq!(pair.agv.tell_progress(&call, 10), Ok(()));
+    assert_eq!(pair.agv.report_progress(&call, 10), Ok(()));
     pair.settle();
     assert_eq!(pair.manager.progress, [(id, 10)]);
     pair.agv.answer_held(Ok(&*x(3)));
-    assert_eq!(pair.agv.tell_progress(&call, 20), Ok(()), "the call has ended");
+    assert_eq!(pair.agv.report_progress(&call, 20), Ok(()), "the call has ended");
     pair.run(PROGRESS_INTERVAL.times(3));
     assert_eq!((pair.manager.progress.len(), pair.agv.counter(LinkCounter::ProgressSent)), (1, 1));
 
     pair.manager.call("go", &x(1)).unwrap();
     pair.settle();
     let call = pair.agv.held[0];
-    assert_eq!(pair.agv.tell_progress(&call, 30), Ok(()), "it wants none");
+    assert_eq!(pair.agv.report_progress(&call, 30), Ok(()), "it wants none");
     pair.settle();
     assert_eq!(pair.agv.counter(LinkCounter::ProgressSent), 1);
     pair.agv.answer_held(Ok(&*x(3)));
@@ -195,17 +195,17 @@ fn progress_waits_for_its_interval_and_for_an_empty_stream() {
     let mut pair = with(GO);
     let (id, call) = begin(&mut pair, "go");
     let full = Err(Error::Full(Limit::SendQueue));
-    assert_eq!((pair.agv.tell_progress(&call, 1), pair.agv.tell_progress(&call, 2)), (Ok(()), full));
+    assert_eq!((pair.agv.report_progress(&call, 1), pair.agv.report_progress(&call, 2)), (Ok(()), full));
     pair.run(PROGRESS_INTERVAL);
-    assert_eq!(pair.agv.tell_progress(&call, 3), Ok(()));
+    assert_eq!(pair.agv.report_progress(&call, 3), Ok(()));
     pair.run(PROGRESS_INTERVAL);
     pair.agv.net.capacity = 0;
     pair.agv.session.send_frame(&Frame::Ping);
-    assert_eq!(pair.agv.tell_progress(&call, 4), full);
+    assert_eq!(pair.agv.report_progress(&call, 4), full);
     pair.agv.net.capacity = 1 << 20;
     pair.settle();
     pair.run(PROGRESS_INTERVAL);
-    assert_eq!(pair.agv.tell_progress(&call, 5), Ok(()));
+    assert_eq!(pair.agv.report_progress(&call, 5), Ok(()));
     pair.settle();
     assert_eq!(pair.manager.progress, [(id, 1), (id, 3), (id, 5)]);
 }
@@ -254,11 +254,11 @@ fn a_cancellation_does_not_end_the_order_that_has_taken_the_calls_place() {
     let (mut pair, slot) = moving();
     let (first, one) = begin(&mut pair, "go");
     let (_, two) = begin(&mut pair, "go");
-    assert!(!pair.agv.goes_on(&one) && pair.agv.goes_on(&two));
+    assert!(!pair.agv.continues(&one) && pair.agv.continues(&two));
     pair.manager.cancel(first);
     pair.run(LEASE);
     assert_eq!((pair.agv.cancelled(), pair.agv.stops()), (1, 0));
-    assert!(pair.agv.goes_on(&two) && pair.agv.is_live(slot));
+    assert!(pair.agv.continues(&two) && pair.agv.is_live(slot));
     assert!(!pair.agv.session.is_cancelled(two.ticket));
 }
 
@@ -306,7 +306,7 @@ fn a_cancellation_behind_the_answer_is_counted_and_changes_nothing() {
     pair.agv.hear_datagram(pair.agv.session.nonce(), &cancel);
     pair.settle();
     assert_eq!((pair.agv.counter(LinkCounter::CancelsIgnored), pair.agv.cancelled()), (1, 0));
-    assert!(pair.agv.goes_on(&two) && pair.agv.is_live(slot));
+    assert!(pair.agv.continues(&two) && pair.agv.is_live(slot));
 }
 
 #[test]
@@ -354,5 +354,5 @@ fn a_cancellation_ends_the_order_of_its_call_alone() {
     pair.manager.cancel(calls[1]);
     pair.settle();
     assert!(pair.agv.is_live(one) && !pair.agv.is_live(other));
-    assert!(!pair.manager.is_told(calls[1], LeaseEnd::Expired), "the caller knows");
+    assert!(!pair.manager.is_reported(calls[1], LeaseEnd::Expired), "the caller knows");
 }

@@ -24,7 +24,7 @@ fn quiet() -> Pair {
 #[test]
 fn the_first_message_goes_out_at_once() {
     let mut pair = quiet();
-    pair.manager.tell("log", &x(1)).unwrap();
+    pair.manager.notify("log", &x(1)).unwrap();
     assert_eq!(pair.manager.net.writes.len(), 1);
     pair.settle();
     assert_eq!(pair.agv.ran(), ["log"]);
@@ -34,7 +34,7 @@ fn the_first_message_goes_out_at_once() {
 fn those_that_follow_closely_go_out_together_when_the_time_is_up() {
     let mut pair = quiet();
     for at in 0..6 {
-        pair.manager.tell("log", &x(at)).unwrap();
+        pair.manager.notify("log", &x(at)).unwrap();
     }
     assert_eq!(pair.manager.net.writes.len(), 1);
     pair.run(GATHER - Duration::from_micros(1));
@@ -47,7 +47,7 @@ fn those_that_follow_closely_go_out_together_when_the_time_is_up() {
 fn messages_far_apart_go_out_one_by_one() {
     let mut pair = quiet();
     for at in 0..10 {
-        pair.manager.tell("log", &x(at)).unwrap();
+        pair.manager.notify("log", &x(at)).unwrap();
         assert_eq!(pair.manager.net.writes.len() as i64, at + 1);
         pair.run(GATHER);
     }
@@ -56,10 +56,10 @@ fn messages_far_apart_go_out_one_by_one() {
 #[test]
 fn what_gathers_goes_out_when_there_is_much_of_it() {
     let mut pair = quiet();
-    pair.manager.tell("log", &x(0)).unwrap();
-    pair.manager.tell("read", &text(5_000)).unwrap();
+    pair.manager.notify("log", &x(0)).unwrap();
+    pair.manager.notify("read", &text(5_000)).unwrap();
     assert_eq!(pair.manager.net.writes.len(), 1);
-    pair.manager.tell("read", &text(5_000)).unwrap();
+    pair.manager.notify("read", &text(5_000)).unwrap();
     assert_eq!(pair.manager.net.writes.len(), 2);
     pair.settle();
     assert_eq!(pair.agv.ran(), ["log", "read", "read"]);
@@ -71,7 +71,7 @@ fn what_gathers_makes_room_for_what_follows() {
     pair.agv.offer("read(text: string[20000])", |_| Ok(()));
     pair.publish();
     for _ in 0..3 {
-        pair.manager.tell("read", &text(1_400)).unwrap();
+        pair.manager.notify("read", &text(1_400)).unwrap();
     }
     pair.run(GATHER);
     assert_eq!(pair.agv.ran(), ["read", "read", "read"]);
@@ -80,8 +80,8 @@ fn what_gathers_makes_room_for_what_follows() {
 #[test]
 fn what_gathers_goes_out_when_asked() {
     let mut pair = quiet();
-    pair.manager.tell("log", &x(1)).unwrap();
-    pair.manager.tell("log", &x(2)).unwrap();
+    pair.manager.notify("log", &x(1)).unwrap();
+    pair.manager.notify("log", &x(2)).unwrap();
     pair.manager.flush_gathered();
     assert_eq!(pair.manager.net.writes.len(), 2);
     pair.settle();
@@ -91,8 +91,8 @@ fn what_gathers_goes_out_when_asked() {
 #[test]
 fn a_call_that_waits_for_its_answer_takes_along_what_has_gathered() {
     let mut pair = quiet();
-    pair.manager.tell("log", &x(1)).unwrap();
-    pair.manager.tell("log", &x(2)).unwrap();
+    pair.manager.notify("log", &x(1)).unwrap();
+    pair.manager.notify("log", &x(2)).unwrap();
     pair.manager.call("ask", &none()).unwrap();
     assert_eq!(pair.manager.net.writes.len(), 2);
     pair.settle();
@@ -102,8 +102,8 @@ fn a_call_that_waits_for_its_answer_takes_along_what_has_gathered() {
 #[test]
 fn what_has_gathered_when_the_link_closes_still_arrives() {
     let mut pair = quiet();
-    pair.manager.tell("log", &x(1)).unwrap();
-    pair.manager.tell("log", &x(2)).unwrap();
+    pair.manager.notify("log", &x(1)).unwrap();
+    pair.manager.notify("log", &x(2)).unwrap();
     pair.manager.close(crate::error::CloseReason::Stopped);
     pair.settle();
     assert_eq!(pair.agv.counter(LinkCounter::RequestsReceived), 2);
@@ -120,7 +120,7 @@ fn answering_behind_gathered() -> Pair {
     pair.manager.call("ask", &none()).unwrap();
     pair.settle();
     let high = RequestOptions { priority: Some(Priority::High), ..RequestOptions::default() };
-    pair.agv.tell("log", &x(1)).unwrap();
+    pair.agv.notify("log", &x(1)).unwrap();
     pair.agv.request_with("log", &x(2), &high, false).unwrap();
     pair
 }

@@ -80,7 +80,7 @@ fn a_loop_that_hung_for_longer_than_the_lease_revives_nothing() {
     assert!(!pair.agv.is_live(slot));
     beat(&mut pair, heart, 10);
     assert!(!pair.agv.is_live(slot));
-    assert!(pair.manager.is_told(call, LeaseEnd::Expired));
+    assert!(pair.manager.is_reported(call, LeaseEnd::Expired));
     assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 0, "its caller knows, and renews no more");
 }
 
@@ -168,7 +168,7 @@ fn what_is_not_answered_for_one_lease_is_released() {
     }
     let after = pair.manager.now.since(cut);
     assert!(after <= LEASE + LEASE.divided_by(4), "it moved for {after:?}");
-    assert!(pair.manager.is_told(call, LeaseEnd::Unanswered));
+    assert!(pair.manager.is_reported(call, LeaseEnd::Unanswered));
     pair.run(LEASE);
     assert_eq!(pair.manager.counter(LinkCounter::RenewalsUnanswered), 1);
     assert!(pair.manager.session.is_live() && !pair.manager.session.holds(call));

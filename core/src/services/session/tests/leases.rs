@@ -36,8 +36,8 @@ fn expirations(pair: &Pair) -> usize {
 }
 
 /// The manager has been told so of its first call.
-fn is_told(pair: &Pair, why: LeaseEnd) -> bool {
-    pair.manager.is_told(CallId(1), why)
+fn is_reported(pair: &Pair, why: LeaseEnd) -> bool {
+    pair.manager.is_reported(CallId(1), why)
 }
 
 #[test]
@@ -105,7 +105,7 @@ fn a_lease_ends_in_time_when_nothing_comes_through() {
     pair.manager.net.frozen = false;
     pair.run(Duration::from_secs(1));
     assert!(!pair.agv.is_live(slot), "renewals that were held back revive nothing");
-    assert!(is_told(&pair, LeaseEnd::Expired));
+    assert!(is_reported(&pair, LeaseEnd::Expired));
     assert_eq!(expirations(&pair), 1);
 }
 
@@ -117,7 +117,7 @@ fn a_renewal_that_comes_after_the_end_revives_nothing() {
     // Its end is rounded down to the millisecond before; the manager has not given up yet.
     pair.suspend_agv(LEASE - Duration::from_micros(500));
     assert!(!pair.agv.is_live(slot));
-    assert!(is_told(&pair, LeaseEnd::Expired));
+    assert!(is_reported(&pair, LeaseEnd::Expired));
     pair.run(Duration::from_secs(1));
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
 }
@@ -134,10 +134,10 @@ fn what_an_interrupt_has_seen_dead_is_not_renewed() {
     pair.settle();
     assert!(!pair.agv.is_live(slot), "the motors have been switched off, and come on again");
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::LeasesExpired)), (1, 1), "the hook is told");
-    assert!(is_told(&pair, LeaseEnd::Expired));
+    assert!(is_reported(&pair, LeaseEnd::Expired));
     pair.run(Duration::from_secs(1));
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
-    pair.manager.tell("go", &none()).unwrap();
+    pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     assert!(pair.agv.is_live(slot), "a new order moves it");
 }
@@ -151,7 +151,7 @@ fn an_order_does_not_take_the_place_of_a_motion_that_an_interrupt_has_seen_dead(
     pair.run(Duration::from_millis(1));
     assert!(pair.manager.has(&Event::Reply(early, Err(Error::Busy))), "the hook comes first");
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
-    pair.manager.tell("go", &none()).unwrap();
+    pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, true));
 }
@@ -196,7 +196,7 @@ proptest! {
                     pair.manager.net.datagrams = if pass { Datagrams::Pass } else { Datagrams::Lost };
                 }
                 Befalls::Order => {
-                    let _ = pair.manager.tell("go", &none());
+                    let _ = pair.manager.notify("go", &none());
                 }
             }
             pair.settle();
@@ -309,17 +309,17 @@ fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
     pair.publish();
     pair.manager.call("work", &none()).unwrap();
     // One command waits at the callee for its turn, another one at the caller for company: both are given up.
-    let told = pair.manager.tell("go", &none()).unwrap();
+    let reported = pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
-    let late = pair.manager.tell("go", &none()).unwrap();
+    let late = pair.manager.notify("go", &none()).unwrap();
     pair.manager.release(slot).unwrap();
     pair.run(Duration::from_millis(1));
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (1, false));
-    assert!(pair.manager.has(&Event::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(reported, Error::Expired)));
     assert!(pair.manager.has(&Event::Failed(late, Error::Expired)));
-    pair.manager.tell("go", &none()).unwrap();
+    pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (2, true));
 }
@@ -337,7 +337,7 @@ fn an_order_that_fails_leaves_nothing_going_on() {
     pair.settle();
     assert!(!pair.agv.is_live(slot) && !pair.manager.session.holds(failed));
     assert_eq!(expirations(&pair), 1);
-    assert!(is_told(&pair, LeaseEnd::Replaced));
+    assert!(is_reported(&pair, LeaseEnd::Replaced));
     pair.run(Duration::from_secs(2));
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
 }
@@ -349,7 +349,7 @@ fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
     assert!(pair.agv.end_order(slot, order) && !pair.agv.end_order(slot, order));
     pair.settle();
     assert!(!pair.agv.is_live(slot));
-    assert!(is_told(&pair, LeaseEnd::Finished));
+    assert!(is_reported(&pair, LeaseEnd::Finished));
     pair.run(Duration::from_secs(2));
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (0, 0));
 }
@@ -364,11 +364,11 @@ fn what_is_finished_is_the_order_that_was_named_and_not_the_newer_one() {
     assert!(!pair.agv.end_order(slot, older), "it was replaced");
     pair.run(Duration::from_secs(2));
     assert!(pair.agv.is_live(slot) && pair.manager.session.holds(newer), "the newer one goes on");
-    assert!(is_told(&pair, LeaseEnd::Replaced) && !pair.manager.is_told(newer, LeaseEnd::Finished));
+    assert!(is_reported(&pair, LeaseEnd::Replaced) && !pair.manager.is_reported(newer, LeaseEnd::Finished));
     let order = pair.agv.order_of(newer);
     assert!(pair.agv.end_order(slot, order));
     pair.settle();
-    assert!(!pair.agv.is_live(slot) && pair.manager.is_told(newer, LeaseEnd::Finished));
+    assert!(!pair.agv.is_live(slot) && pair.manager.is_reported(newer, LeaseEnd::Finished));
     assert_eq!(expirations(&pair), 0);
 }
 

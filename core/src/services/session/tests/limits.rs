@@ -113,8 +113,8 @@ fn a_message_that_crosses_a_lower_limit_is_refused_and_the_link_lives() {
 
 #[test]
 fn the_minimum_interval_is_kept_by_the_caller() {
-    let told = Constraints { minimum_interval: Duration::from_millis(10), ..Constraints::S_UNIT };
-    let mut pair = Pair::with(&Setup { agv: told, ..Setup::default() });
+    let reported = Constraints { minimum_interval: Duration::from_millis(10), ..Constraints::S_UNIT };
+    let mut pair = Pair::with(&Setup { agv: reported, ..Setup::default() });
     pair.agv.offer("go(x: int)", |_| Ok(()));
     pair.publish();
     pair.manager.call("go", &x(1)).unwrap();
@@ -166,7 +166,7 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     pair.publish();
     let others = pair.agv.take_buffers();
     // Of three in one read the last one can be run out of it.
-    let told = pair.manager.tell("work", &none()).unwrap();
+    let reported = pair.manager.notify("work", &none()).unwrap();
     let second = pair.manager.call("work", &none()).unwrap();
     let last = pair.manager.call("work", &none()).unwrap();
     pair.run(Duration::from_millis(1));
@@ -175,7 +175,7 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 2);
     assert_eq!(pair.manager.outcome(last), None);
     assert_eq!(pair.manager.outcome(second).unwrap().unwrap_err(), Error::Busy);
-    assert!(pair.manager.has(&Event::Failed(told, Error::Busy)));
+    assert!(pair.manager.has(&Event::Failed(reported, Error::Busy)));
     assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
 }
 
@@ -186,7 +186,7 @@ fn a_long_call_finds_one_buffer_more_to_wait_in() {
         let mut pair = Pair::with(&Setup { buffers: LEFT_BY_WAITING + more, running: 1, ..Setup::default() });
         pair.agv.offer_held("work(text: string[20000])");
         pair.publish();
-        pair.manager.tell("work", &text(20_000)).unwrap();
+        pair.manager.notify("work", &text(20_000)).unwrap();
         pair.settle();
         let second = pair.manager.call("work", &text(20_000)).unwrap();
         pair.settle();
@@ -209,7 +209,7 @@ fn refusals_without_a_buffer_are_bounded_and_leave_room_for_an_emergency() {
     let others = pair.agv.take_buffers();
     pair.agv.net.capacity = 0;
     for _ in 0..40 {
-        pair.manager.tell("work", &none()).unwrap();
+        pair.manager.notify("work", &none()).unwrap();
     }
     pair.run(Duration::from_millis(1));
     let dropped = pair.agv.counter(LinkCounter::RepliesDropped);

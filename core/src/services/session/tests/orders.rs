@@ -40,7 +40,7 @@ fn go(pair: &mut Pair, class: Priority, renew: Renew) -> CallId {
 }
 
 /// The same, begun; what its handler was given.
-fn begun(pair: &mut Pair, class: Priority) -> (CallId, Incoming) {
+fn started(pair: &mut Pair, class: Priority) -> (CallId, Incoming) {
     let id = go(pair, class, Renew::Process);
     pair.settle();
     (id, *pair.agv.held.last().unwrap())
@@ -50,8 +50,8 @@ fn expirations(pair: &Pair) -> usize {
     pair.agv.count(|event| matches!(event, Event::LeaseExpired(_)))
 }
 
-fn is_told(pair: &Pair, call: CallId, why: LeaseEnd) -> bool {
-    pair.manager.is_told(call, why)
+fn is_reported(pair: &Pair, call: CallId, why: LeaseEnd) -> bool {
+    pair.manager.is_reported(call, why)
 }
 
 #[test]
@@ -151,26 +151,26 @@ fn answered_calls_of_several_functions_are_released_at_once_however_often_one_of
 #[test]
 fn a_newer_call_replaces_an_older_one_for_ever_and_without_the_hook() {
     let (mut pair, slot) = vehicle();
-    let (first, old) = begun(&mut pair, Priority::Normal);
-    let (second, new) = begun(&mut pair, Priority::High);
-    assert!(is_told(&pair, first, LeaseEnd::Replaced));
+    let (first, old) = started(&mut pair, Priority::Normal);
+    let (second, new) = started(&mut pair, Priority::High);
+    assert!(is_reported(&pair, first, LeaseEnd::Replaced));
     assert!(!pair.manager.session.holds(first) && pair.manager.session.holds(second));
-    assert!(!pair.agv.goes_on(&old) && pair.agv.goes_on(&new));
+    assert!(!pair.agv.continues(&old) && pair.agv.continues(&new));
     // The end of the first is no matter of the second.
     pair.manager.cancel(first);
     pair.settle();
-    assert!(pair.agv.goes_on(&new) && pair.agv.is_live(slot));
+    assert!(pair.agv.continues(&new) && pair.agv.is_live(slot));
     pair.agv.answer_held(Err(Error::Busy));
     pair.settle();
-    assert!(pair.agv.goes_on(&new));
+    assert!(pair.agv.continues(&new));
     assert_eq!(expirations(&pair), 0);
     pair.manager.cancel(second);
     pair.settle();
-    assert_eq!((pair.agv.goes_on(&new), expirations(&pair)), (false, 1));
-    let (_, third) = begun(&mut pair, Priority::Low);
+    assert_eq!((pair.agv.continues(&new), expirations(&pair)), (false, 1));
+    let (_, third) = started(&mut pair, Priority::Low);
     pair.agv.answer_held(Ok(&*none()));
     pair.run(LEASE.divided_by(2));
-    assert!(pair.agv.goes_on(&third) && !pair.agv.goes_on(&old) && !pair.agv.goes_on(&new));
+    assert!(pair.agv.continues(&third) && !pair.agv.continues(&old) && !pair.agv.continues(&new));
 }
 
 #[test]
@@ -264,10 +264,10 @@ fn a_call_that_fails_ends_its_own_lease_only() {
 #[test]
 fn a_lost_link_ends_every_order() {
     let (mut pair, slot) = vehicle();
-    let (_, old) = begun(&mut pair, Priority::Normal);
-    let (_, new) = begun(&mut pair, Priority::High);
+    let (_, old) = started(&mut pair, Priority::Normal);
+    let (_, new) = started(&mut pair, Priority::High);
     pair.cut();
-    assert!(!pair.agv.is_live(slot) && !pair.agv.goes_on(&old) && !pair.agv.goes_on(&new));
+    assert!(!pair.agv.is_live(slot) && !pair.agv.continues(&old) && !pair.agv.continues(&new));
     assert_eq!(expirations(&pair), 1);
 }
 
@@ -292,7 +292,7 @@ fn what_gives_way_in_a_full_table_is_released_at_once_when_its_caller_drops_it()
         pair.agv.offer_leased(&std::format!("lift_{at}()"), LEASE);
     }
     pair.publish();
-    let (older, _) = begun(&mut pair, Priority::Normal);
+    let (older, _) = started(&mut pair, Priority::Normal);
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     for at in 1..LEASES {
@@ -379,7 +379,7 @@ fn who_holds_a_lease_of_a_function_that_is_removed_is_told_at_once() {
     pair.agv.functions.remove("go").unwrap();
     pair.agv.withdraw(slot);
     pair.settle();
-    assert_eq!((is_told(&pair, call, LeaseEnd::Expired), expirations(&pair)), (true, 0));
+    assert_eq!((is_reported(&pair, call, LeaseEnd::Expired), expirations(&pair)), (true, 0));
     assert!(!pair.manager.session.holds(call), "it is renewed no more");
 }
 

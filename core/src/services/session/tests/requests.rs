@@ -129,11 +129,11 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
     let mut pair = Pair::live();
     pair.agv.offer("go(x: int, name: string[3])", |_| Ok(()));
     pair.publish();
-    let told = pair.agv.functions.function(pair.agv.functions.find("go").unwrap()).unwrap();
+    let reported = pair.agv.functions.function(pair.agv.functions.find("go").unwrap()).unwrap();
     let header = RequestHeader {
         id: 7,
-        slot: told.slot,
-        generation: told.generation,
+        slot: reported.slot,
+        generation: reported.generation,
         wants_reply: false,
         wants_progress: false,
         takes_over: false,
@@ -236,7 +236,7 @@ fn a_failing_service_says_why() {
     let failed = pair.block_request("fail", &mut *none());
     assert_eq!(failed, Err(Error::Service(ServiceError::Failed(7))));
     assert_eq!(pair.block_request("lie", &mut *x(5)), Err(Error::Service(ServiceError::BadResults)));
-    let id = pair.manager.tell("fail", &none()).unwrap();
+    let id = pair.manager.notify("fail", &none()).unwrap();
     pair.settle();
     assert!(pair.manager.has(&Event::Failed(id, Error::Service(ServiceError::Failed(7)))));
 }

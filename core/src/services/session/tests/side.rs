@@ -27,7 +27,7 @@ pub(super) type Arguments = Box<Parameters<24_576>>;
 
 /// A handler that was begun.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Begun {
+pub(super) struct Started {
     pub(super) function: String,
     pub(super) priority: Priority,
     /// Bytes of the stream that had arrived by then.
@@ -84,7 +84,7 @@ pub(super) struct Side {
     pub(super) net: Net,
     pub(super) happened: Vec<Event>,
     /// Handlers that were begun.
-    pub(super) ran: Vec<Begun>,
+    pub(super) ran: Vec<Started>,
     /// Calls that wait for an answer of the test.
     pub(super) held: Vec<Incoming>,
     pub(super) hub: Lobby,
@@ -230,7 +230,7 @@ impl Side {
 
     fn run(&mut self, call: Incoming, arguments: &mut Arguments) {
         let function = self.functions.function(call.slot).unwrap();
-        self.ran.push(Begun {
+        self.ran.push(Started {
             function: function.name().to_string(),
             priority: call.priority,
             received: self.received,
@@ -271,9 +271,9 @@ impl Side {
             }
             #[cfg(feature = "details")]
             Some(Event::Progress(id, values)) => {
-                let mut told: Arguments = Box::default();
-                self.session.progress_values(&values, &self.inbox).unwrap().read_into(&mut told).unwrap();
-                self.progress.push((id, told.variable("x").unwrap()));
+                let mut reported: Arguments = Box::default();
+                self.session.progress_values(&values, &self.inbox).unwrap().read_into(&mut reported).unwrap();
+                self.progress.push((id, reported.variable("x").unwrap()));
             }
             #[cfg(feature = "streams")]
             Some(Event::Sample(sample)) => {

@@ -54,8 +54,9 @@ fn fill(pair: &mut Pair) -> usize {
     calls
 }
 
-fn is_told(pair: &Pair, why: LeaseEnd) -> usize {
-    pair.manager.count(|event| matches!(event, super::super::Event::LeaseEnded { why: told, .. } if *told == why))
+fn is_reported(pair: &Pair, why: LeaseEnd) -> usize {
+    pair.manager
+        .count(|event| matches!(event, super::super::Event::LeaseEnded { why: reported, .. } if *reported == why))
 }
 
 #[test]
@@ -251,5 +252,5 @@ fn releases_that_wait_for_the_stream_are_all_sent() {
     pair.manager.net.capacity = 1 << 20;
     pair.run(Duration::from_millis(100));
     assert!(slots.iter().all(|slot| !pair.agv.is_live(*slot)));
-    assert_eq!(is_told(&pair, LeaseEnd::Expired), 0);
+    assert_eq!(is_reported(&pair, LeaseEnd::Expired), 0);
 }

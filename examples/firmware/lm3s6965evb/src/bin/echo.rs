@@ -27,11 +27,11 @@ fn main() -> ! {
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
     static RESOURCES: ConstStaticCell<StackResources<4>> = ConstStaticCell::new(StackResources::new());
-    let told = arguments::read().map_err(ArgumentError::text)?;
+    let given = arguments::read().map_err(ArgumentError::text)?;
     let ethernet = ETHERNET.take();
     ethernet.start();
-    let config = cara_vehicle::network(&told.settings);
-    let (stack, runner) = embassy_net::new(ethernet, config, RESOURCES.take(), told.noise);
+    let config = cara_vehicle::network(&given.settings);
+    let (stack, runner) = embassy_net::new(ethernet, config, RESOURCES.take(), given.noise);
     spawner.spawn(network(runner).map_err(|_| "no room for a task")?);
     spawner.spawn(answer(stack).map_err(|_| "no room for a task")?);
     spawner.spawn(stack::report().map_err(|_| "no room for a task")?);

@@ -35,9 +35,9 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
-    let told = arguments::read().map_err(ArgumentError::text)?;
-    let at = told.at.ok_or("at=X,Y is not told, the cell in which it stands")?;
-    let (settings, security, noise) = told.security().ok_or("it joins no manager")?;
+    let given = arguments::read().map_err(ArgumentError::text)?;
+    let at = given.at.ok_or("at=X,Y is not told, the cell in which it stands")?;
+    let (settings, security, noise) = given.security().ok_or("it joins no manager")?;
     let ethernet = ETHERNET.take();
     ethernet.start();
     let sockets = SOCKETS.take();

@@ -52,8 +52,8 @@ fn answer(agv_manager: &CommunicationSystem, words: &[&str]) -> Result<String> {
         ["go_to", index, x, y] => go_to(&s_unit(agv_manager, index)?, [x.parse()?, y.parse()?]),
         ["release", index] => Ok(s_unit(agv_manager, index)?.release("go_to").map(|()| "released".to_owned())?),
         ["battery", index] => battery(&s_unit(agv_manager, index)?),
-        ["stop", index] => tell(&s_unit(agv_manager, index)?, "stop", "stopped"),
-        ["reset", index] => tell(&s_unit(agv_manager, index)?, "reset", "may drive again"),
+        ["stop", index] => command(&s_unit(agv_manager, index)?, "stop", "stopped"),
+        ["reset", index] => command(&s_unit(agv_manager, index)?, "reset", "may drive again"),
         _ => bail!("no such command: {HELP}"),
     }
 }
@@ -97,7 +97,7 @@ fn battery(agv: &Peer) -> Result<String> {
     Ok(format!("charge {:.1} %", charge.variable::<f64>("charge")?))
 }
 
-fn tell(agv: &Peer, function: &str, done: &str) -> Result<String> {
+fn command(agv: &Peer, function: &str, done: &str) -> Result<String> {
     agv.block_request(function, &mut Parameters::new())?;
     Ok(done.to_owned())
 }

@@ -354,7 +354,7 @@ impl Manager {
     }
 
     fn act(&mut self, now: Instant, command: Command<SocketAddrV4>) {
-        let Command::Tell(link, directive) = command else { unreachable!("a lone manager dials nobody") };
+        let Command::Notify(link, directive) = command else { unreachable!("a lone manager dials nobody") };
         let index = usize::from(link.0);
         let Some(session) = &mut self.sessions[index] else { return };
         let event = session.direct(context!(self, now), directive);

@@ -63,9 +63,9 @@ fn a_manager_elsewhere_may_have_it() {
 fn where_no_manager_runs_that_is_the_cause_and_it_is_about_the_node_that_was_asked_for() {
     let mut seen = evidence();
     seen.heard = vec![searching("other", 8, "boss")];
-    let told = check(&seen, &Which("agv".into()));
-    assert_eq!((told.len(), told[0].id, told[0].about.as_deref()), (1, Id::NoManager, Some("agv")));
-    assert!(told[0].certain, "it need not listen for longer");
+    let reported = check(&seen, &Which("agv".into()));
+    assert_eq!((reported.len(), reported[0].id, reported[0].about.as_deref()), (1, Id::NoManager, Some("agv")));
+    assert!(reported[0].certain, "it need not listen for longer");
     seen.running = vec![running("bos", 1)];
     assert_eq!(ids(&seen), [Id::NotHeard, Id::WrongManager], "another one runs");
 }
@@ -93,9 +93,9 @@ fn a_host_without_an_interface_is_told_behind_what_its_manager_knows() {
     seen.reach.clear();
     assert_eq!(ids(&seen), [Id::NoInterface], "nobody knows more");
     seen.running = vec![running("boss", 1)];
-    let told = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0).found;
+    let reported = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0).found;
     assert_eq!(ids(&seen), [Id::NotHeard, Id::NoInterface]);
-    assert!(told(&seen).contains("boss/1 neither has it nor waits for it"), "{}", told(&seen));
+    assert!(reported(&seen).contains("boss/1 neither has it nor waits for it"), "{}", reported(&seen));
     seen.running[0].nodes = vec![node_info("agv", 7, false)];
     assert_eq!(ids(&seen), [Id::Lost, Id::NoInterface]);
     seen.running[0].nodes[0].left_ms = Some(20_000);
@@ -197,12 +197,16 @@ fn connected_answering_and_own_units_are_no_trouble() {
 fn another_fleet_and_another_manager_are_told_together() {
     let mut seen = evidence();
     seen.heard = vec![Heard { fleet: Fleet(9), ..searching("agv", 7, "bos") }, answering("boss", 3)];
-    let told = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0);
-    assert!(told(&seen).found.ends_with("and it looks for the manager bos/1, and boss/1 runs"), "{:?}", told(&seen));
+    let reported = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0);
+    assert!(
+        reported(&seen).found.ends_with("and it looks for the manager bos/1, and boss/1 runs"),
+        "{:?}",
+        reported(&seen)
+    );
     seen.heard[0] = Heard { fleet: Fleet(9), ..searching("agv", 7, "boss") };
-    assert!(!told(&seen).found.contains("looks for"));
+    assert!(!reported(&seen).found.contains("looks for"));
     seen.fleet_known = false;
-    assert_eq!(told(&seen).advice, "no --fleet was given: try `--fleet 9`");
+    assert_eq!(reported(&seen).advice, "no --fleet was given: try `--fleet 9`");
 }
 
 #[test]

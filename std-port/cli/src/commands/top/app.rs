@@ -267,7 +267,7 @@ pub(super) struct App {
     pub(super) manager: String,
     pub(super) snapshot: Option<Snapshot>,
     /// When the snapshot came.
-    pub(super) told_at: Now,
+    pub(super) reported_at: Now,
     /// Since when the manager does not answer, and why.
     pub(super) gone: Option<(Now, String)>,
     pub(super) counters: Vec<Counted>,
@@ -312,7 +312,7 @@ impl App {
 
     /// How long ago the snapshot was told.
     pub(super) fn age(&self, now: Now) -> Duration {
-        now.saturating_sub(self.told_at)
+        now.saturating_sub(self.reported_at)
     }
 
     pub(super) fn nodes(&self) -> &[NodeInfo] {
@@ -355,7 +355,7 @@ impl App {
 
     // What is told.
 
-    pub(super) fn told(&mut self, news: News, now: Now) {
+    pub(super) fn reported(&mut self, news: News, now: Now) {
         match news {
             News::Snapshot(snapshot) => self.snapshot_came(*snapshot, now),
             News::Gone(why) => {
@@ -400,7 +400,7 @@ impl App {
             let before = std::mem::replace(&mut self.counters, counters);
             self.grown = rows::grown(&before, &self.counters);
         }
-        self.told_at = now;
+        self.reported_at = now;
         // What is known of nodes that the manager has forgotten goes too.
         let known: Vec<String> = snapshot.nodes.iter().map(selector).collect();
         let is_known = |node: &String| known.contains(node);

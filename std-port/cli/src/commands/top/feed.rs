@@ -113,8 +113,8 @@ fn look(first: Operator, way: &Way, out: &SyncSender<Message>, wanted: &Mutex<Wa
     let (mut operator, mut round) = (Some(first), 0_u32);
     loop {
         let opened = operator.take().map_or_else(|| way.open(), Ok);
-        let told = opened.and_then(|mut operator| Ok((snapshot(&mut operator, round % COUNTERS == 0)?, operator)));
-        match told {
+        let reported = opened.and_then(|mut operator| Ok((snapshot(&mut operator, round % COUNTERS == 0)?, operator)));
+        match reported {
             Ok((snapshot, opened)) => {
                 operator = Some(opened);
                 round = round.wrapping_add(1);
@@ -228,14 +228,14 @@ fn probe_one(
         }
         Ok(())
     });
-    let begun = Instant::now();
+    let started = Instant::now();
     let values = if asked.is_ok() && streams { values(opened, node).ok() } else { None };
     if asked.is_err() {
         // The node has left, or the manager is gone: a new connection will tell.
         *operator = None;
     }
     out.send(Message::News(News::Probe(Probe { node: node.to_owned(), round_trip, values })))?;
-    Ok(streams && begun.elapsed() > SLOW)
+    Ok(streams && started.elapsed() > SLOW)
 }
 
 fn values(operator: &mut Operator, node: &str) -> anyhow::Result<Vec<Value>> {

@@ -112,7 +112,7 @@ fn show(
 
 fn take(app: &mut App, message: Message, now: Duration) -> io::Result<Option<Act>> {
     match message {
-        Message::News(news) => app.told(news, now),
+        Message::News(news) => app.reported(news, now),
         Message::Terminal(Event::Key(key)) if key.kind != KeyEventKind::Release => return Ok(app.key(key, now)),
         Message::Terminal(Event::Paste(text)) => app.paste(&text),
         // A new size is seen when the next screen is drawn.

@@ -44,10 +44,10 @@ pub(super) struct Screen {
 impl Screen {
     pub(super) fn open() -> io::Result<Self> {
         // A panic of any thread ends the command: its text would be lost on the other screen, and nothing is drawn behind it.
-        let tell = std::panic::take_hook();
+        let report = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |panic| {
             restore();
-            tell(panic);
+            report(panic);
             std::process::exit(Exit::Failed as i32);
         }));
         enable_raw_mode()?;

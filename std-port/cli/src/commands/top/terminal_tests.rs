@@ -35,8 +35,8 @@ fn a_panic_gives_the_terminal_back_and_is_told() {
         terminal.type_in("x");
         assert_eq!(terminal.ends_restored(), 1);
         // On the screen that is left.
-        let told = terminal.screen().contents();
-        assert!(told.contains(&format!("the {thread} thread is broken")), "{told}");
+        let reported = terminal.screen().contents();
+        assert!(reported.contains(&format!("the {thread} thread is broken")), "{reported}");
     }
 }
 

@@ -139,10 +139,10 @@ fn event(name: &str, node: &str, text: &str) -> News {
 /// Everything at second 10.
 fn app() -> App {
     let mut app = App::new("depot/1".into());
-    app.told(News::Snapshot(Box::new(snapshot())), at(10_000));
-    app.told(probe("agv/1@s_unit"), at(10_000));
-    app.told(event("joined", "agv/1", "is connected"), at(10_000));
-    app.told(event("left", "lift/3", "nothing was heard of it"), at(10_000));
+    app.reported(News::Snapshot(Box::new(snapshot())), at(10_000));
+    app.reported(probe("agv/1@s_unit"), at(10_000));
+    app.reported(event("joined", "agv/1", "is connected"), at(10_000));
+    app.reported(event("left", "lift/3", "nothing was heard of it"), at(10_000));
     app
 }
 
@@ -279,7 +279,7 @@ fn a_watched_node_shows_all_that_is_known_of_it() {
     let mut app = app();
     assert_eq!(asked(key(&mut app, KeyCode::Enter)), Ask::Functions { node: "agv/1@s_unit".into() });
     let signatures = vec!["go_to(position: int[2])".to_owned()];
-    app.told(News::Functions { node: "agv/1@s_unit".into(), signatures }, at(10_000));
+    app.reported(News::Functions { node: "agv/1@s_unit".into(), signatures }, at(10_000));
     is_screen(
         &app,
         at(10_200),
@@ -317,7 +317,7 @@ S STOP ALL  s stop  c call  r reset  Enter watch  / filter  ? help  q quit
     assert_eq!(app.view, View::Nodes);
     // Of one that the manager has forgotten nothing is shown as known.
     key(&mut app, KeyCode::Enter);
-    app.told(News::Snapshot(Box::new(Snapshot { nodes: vec![node("agv", 2)], ..snapshot() })), at(10_300));
+    app.reported(News::Snapshot(Box::new(Snapshot { nodes: vec![node("agv", 2)], ..snapshot() })), at(10_300));
     assert!(screen(&app, at(10_400)).contains("the manager knows it no longer"));
 }
 
@@ -342,19 +342,19 @@ fn old_data_never_looks_live() {
     assert!(silent.contains("THE MANAGER DOES NOT ANSWER | all below is 2.1 s OLD"), "{silent}");
     assert!(silent.contains("was live") && !silent.contains("unit live ") && silent.contains(" ? "), "{silent}");
     // It says at once why, where that is known, and goes on counting.
-    app.told(News::Gone("the unit has ended, or closed the connection".into()), at(10_100));
-    app.told(News::Gone("no unit answers".into()), at(15_000));
+    app.reported(News::Gone("the unit has ended, or closed the connection".into()), at(10_100));
+    app.reported(News::Gone("no unit answers".into()), at(15_000));
     let gone = screen(&app, at(15_100));
     assert!(gone.contains("MANAGER GONE 5.0 s | all below is 5.1 s OLD | trying again | no unit answers"), "{gone}");
     assert!(gone.contains("was live") && gone.contains("manager_gone"), "{gone}");
     let old = buffer(&app, at(15_100), (80, 24), true);
     let cell = (0..80).map(|x| &old[(x, 6)]).find(|cell| cell.symbol() == "w").unwrap();
     assert!(cell.modifier.contains(Modifier::DIM) && cell.fg == Color::Reset, "{cell:?}");
-    app.told(News::Snapshot(Box::new(snapshot())), at(16_000));
+    app.reported(News::Snapshot(Box::new(snapshot())), at(16_000));
     let back = screen(&app, at(16_100));
     assert!(!back.contains("OLD") && back.contains(" live ") && back.contains("manager_back"), "{back}");
     let restarted = UnitInfo { epoch: "2".into(), ..unit() };
-    app.told(News::Snapshot(Box::new(Snapshot { unit: restarted, ..snapshot() })), at(17_000));
+    app.reported(News::Snapshot(Box::new(Snapshot { unit: restarted, ..snapshot() })), at(17_000));
     assert!(screen(&app, at(17_000)).contains("manager_restarted"));
 }
 
@@ -370,12 +370,15 @@ fn what_peers_say_does_not_act_on_the_terminal() {
     let counters = Some(vec![Counted { node: Some(evil.into()), counters: vec![(evil.into(), 3)] }]);
     let orders = vec![OrderInfo { function: evil.into(), order: evil.into(), ..order(evil, 1, Some(9), None) }];
     let unit = UnitInfo { mode: Some(evil.into()), ..unit() };
-    let told = Snapshot { unit, nodes: vec![named, left], refused: vec![refused], orders, counters };
-    app.told(News::Snapshot(Box::new(told)), at(10_000));
+    let reported = Snapshot { unit, nodes: vec![named, left], refused: vec![refused], orders, counters };
+    app.reported(News::Snapshot(Box::new(reported)), at(10_000));
     let value = Value { stream: evil.into(), text: evil.into(), age: Some(at(1)) };
-    app.told(News::Probe(Probe { node: selector.clone(), round_trip: None, values: Some(vec![value]) }), at(10_000));
-    app.told(event(evil, evil, evil), at(10_000));
-    app.told(News::Functions { node: selector.clone(), signatures: vec![evil.into()] }, at(10_000));
+    app.reported(
+        News::Probe(Probe { node: selector.clone(), round_trip: None, values: Some(vec![value]) }),
+        at(10_000),
+    );
+    app.reported(event(evil, evil, evil), at(10_000));
+    app.reported(News::Functions { node: selector.clone(), signatures: vec![evil.into()] }, at(10_000));
     let clean = |app: &App, what: &str| {
         for size in [(80, 24), (140, 50)] {
             let shown = screen_of(app, at(10_100), size);
@@ -396,14 +399,14 @@ fn what_peers_say_does_not_act_on_the_terminal() {
     app.paste(evil);
     assert_eq!(app.call.text, "a[31mbc");
     let number = task(key(&mut app, KeyCode::Enter));
-    app.told(News::End { task: number, is_bad: true, text: evil.into() }, at(10_000));
+    app.reported(News::End { task: number, is_bad: true, text: evil.into() }, at(10_000));
     assert!(clean(&app, "a mistake").contains("\\u{1b}"));
     key(&mut app, KeyCode::Esc);
     let number = task(letter(&mut app, 's'));
-    app.told(News::Line { task: number, is_bad: true, text: evil.into() }, at(10_000));
-    app.told(News::End { task: number, is_bad: true, text: evil.into() }, at(10_000));
+    app.reported(News::Line { task: number, is_bad: true, text: evil.into() }, at(10_000));
+    app.reported(News::End { task: number, is_bad: true, text: evil.into() }, at(10_000));
     assert!(matches!(app.mode, Mode::Report { .. }) && clean(&app, "a report").contains("\\u{1b}"));
-    app.told(News::Gone(evil.into()), at(10_000));
+    app.reported(News::Gone(evil.into()), at(10_000));
     key(&mut app, KeyCode::Esc);
     letter(&mut app, 'r');
     clean(&app, "a question");
@@ -430,7 +433,7 @@ fn every_size_is_drawn() {
 #[test]
 fn without_colours_there_are_none() {
     let mut app = app();
-    app.told(News::Gone("gone".into()), at(10_100));
+    app.reported(News::Gone("gone".into()), at(10_100));
     let coloured = |colours| {
         let buffer = buffer(&app, at(10_200), (80, 24), colours);
         buffer.content.iter().filter(|cell| cell.fg != Color::Reset || cell.bg != Color::Reset).count()
@@ -447,7 +450,7 @@ fn many(count: u32) -> News {
 #[test]
 fn two_hundred_nodes_are_scrolled_and_the_chosen_one_stays_chosen() {
     let mut app = App::new("depot/1".into());
-    app.told(many(200), at(10_000));
+    app.reported(many(200), at(10_000));
     assert!(screen(&app, at(10_000)).contains("agv-001/1 ") && !screen(&app, at(10_000)).contains("agv-100"));
     key(&mut app, KeyCode::End);
     let end = screen(&app, at(10_000));
@@ -467,9 +470,9 @@ fn two_hundred_nodes_are_scrolled_and_the_chosen_one_stays_chosen() {
 #[test]
 fn a_chosen_node_that_goes_is_replaced_by_none() {
     let mut app = App::new("depot/1".into());
-    app.told(many(3), at(10_000));
+    app.reported(many(3), at(10_000));
     key(&mut app, KeyCode::End);
-    app.told(many(2), at(10_100));
+    app.reported(many(2), at(10_100));
     assert_eq!(letter(&mut app, 's'), None);
     assert!(screen(&app, at(10_200)).contains("no node is chosen"), "{}", screen(&app, at(10_200)));
     assert_eq!(asked(letter(&mut app, 'S')), stop(None), "all of them need none");
@@ -478,9 +481,9 @@ fn a_chosen_node_that_goes_is_replaced_by_none() {
 #[test]
 fn a_node_that_was_refused_before_it_joined_is_chosen() {
     let mut app = App::new("depot/1".into());
-    app.told(News::Snapshot(Box::new(Snapshot { nodes: Vec::new(), ..snapshot() })), at(10_000));
+    app.reported(News::Snapshot(Box::new(Snapshot { nodes: Vec::new(), ..snapshot() })), at(10_000));
     assert_eq!(app.target(at(10_000)), None);
-    app.told(many(1), at(10_500));
+    app.reported(many(1), at(10_500));
     assert_eq!(app.target(at(10_500)).as_deref(), Some("agv-001/1@s_unit"));
 }
 
@@ -503,7 +506,7 @@ fn all_are_stopped_from_wherever_one_is() {
     for before in ['c', '/', 'r', '?', 'l'] {
         letter(&mut app, before);
         let number = task(control(&mut app, 's'));
-        app.told(News::End { task: number, is_bad: false, text: "3 of 3 acknowledged".into() }, at(10_000));
+        app.reported(News::End { task: number, is_bad: false, text: "3 of 3 acknowledged".into() }, at(10_000));
         key(&mut app, KeyCode::Esc);
     }
     for before in ['r', '?'] {
@@ -518,14 +521,17 @@ fn a_stop_that_fails_or_hangs_is_loud() {
     letter(&mut app, 'c');
     let number = task(control(&mut app, 's'));
     assert!(screen(&app, at(10_500)).contains("stop ALL: waiting for 500 ms, 0 answered"));
-    app.told(News::Line { task: number, is_bad: false, text: "agv/1  acknowledged after 1 ms".into() }, at(10_600));
+    app.reported(News::Line { task: number, is_bad: false, text: "agv/1  acknowledged after 1 ms".into() }, at(10_600));
     let late = screen(&app, at(11_500));
     assert!(late.contains("stop ALL: NOT ACKNOWLEDGED YET, waiting for 1.5 s, 1 answered"), "{late}");
-    app.told(News::Line { task: number, is_bad: true, text: "lift/3: not reached: it was away".into() }, at(11_600));
-    app.told(News::End { task: number, is_bad: true, text: "1 of 2 acknowledged".into() }, at(11_600));
+    app.reported(
+        News::Line { task: number, is_bad: true, text: "lift/3: not reached: it was away".into() },
+        at(11_600),
+    );
+    app.reported(News::End { task: number, is_bad: true, text: "1 of 2 acknowledged".into() }, at(11_600));
     // Over what was typed, with what has failed first.
-    let told = screen(&app, at(11_700));
-    let of = |text: &str| told.find(text).unwrap_or_else(|| panic!("{text}: {told}"));
+    let reported = screen(&app, at(11_700));
+    let of = |text: &str| reported.find(text).unwrap_or_else(|| panic!("{text}: {reported}"));
     assert!(of("1 of 2 acknowledged") < of("lift/3: not reached") && of("lift/3: not reached") < of("agv/1  ack"));
     // Hammering on the key does not fill the manager's connections.
     key(&mut app, KeyCode::Esc);
@@ -539,7 +545,7 @@ fn a_call_is_typed_and_a_mistake_keeps_the_prompt() {
     let mut app = app();
     assert_eq!(asked(letter(&mut app, 'c')), Ask::Functions { node: "agv/1@s_unit".into() });
     let signatures = vec!["go_to(position: int[2])".to_owned(), "halt()".to_owned()];
-    app.told(News::Functions { node: "agv/1@s_unit".into(), signatures }, at(10_000));
+    app.reported(News::Functions { node: "agv/1@s_unit".into(), signatures }, at(10_000));
     assert!(screen(&app, at(10_000)).contains("halt()"));
     "gx".chars().for_each(|character| _ = letter(&mut app, character));
     key(&mut app, KeyCode::Backspace);
@@ -552,7 +558,7 @@ fn a_call_is_typed_and_a_mistake_keeps_the_prompt() {
     assert_eq!(ask, Ask::Call { node: "agv/1@s_unit".into(), text });
     assert_eq!(key(&mut app, KeyCode::Enter), None, "it is not called twice");
     let mistake = "error: `position` has 2 elements, and this has 1\n  go_to(position: [1])\n                  ^^^";
-    app.told(News::End { task: number, is_bad: true, text: mistake.into() }, at(10_000));
+    app.reported(News::End { task: number, is_bad: true, text: mistake.into() }, at(10_000));
     let shown = screen(&app, at(10_000));
     let line = |text: &str| {
         let place = |line: &str| line.find(text).map(|at| line[..at].chars().count());
@@ -564,7 +570,7 @@ fn a_call_is_typed_and_a_mistake_keeps_the_prompt() {
     key(&mut app, KeyCode::Left);
     app.paste(", 2");
     let number = task(key(&mut app, KeyCode::Enter));
-    app.told(News::End { task: number, is_bad: false, text: "go_to()  1 ms".into() }, at(10_000));
+    app.reported(News::End { task: number, is_bad: false, text: "go_to()  1 ms".into() }, at(10_000));
     assert!(
         matches!(app.mode, Mode::Rows)
             && screen(&app, at(10_000)).contains("call agv/1 go_to(position: [1, 2]): go_to()")
@@ -604,7 +610,7 @@ fn rows_are_filtered_and_sorted() {
 fn memory_is_bounded() {
     let mut app = app();
     for number in 0..3 * EVENTS {
-        app.told(event("joined", "agv/1", &number.to_string()), at(10_000));
+        app.reported(event("joined", "agv/1", &number.to_string()), at(10_000));
         letter(&mut app, 's');
     }
     assert_eq!(app.events.len(), EVENTS);
@@ -612,9 +618,9 @@ fn memory_is_bounded() {
     let newest = app.events.front().map(|event| event.text.clone());
     assert_eq!(newest, Some((3 * EVENTS - 1).to_string()));
     let number = task(letter(&mut app, 'S').or_else(|| letter(&mut app, 'R').or_else(|| letter(&mut app, 'y'))));
-    (0..5_000).for_each(|_| app.told(News::Line { task: number, is_bad: false, text: "x".into() }, at(10_000)));
+    (0..5_000).for_each(|_| app.reported(News::Line { task: number, is_bad: false, text: "x".into() }, at(10_000)));
     assert_eq!(app.task(number).map(|task| task.lines.len()), Some(2_000));
     // What is known of a node goes with it.
-    app.told(many(1), at(10_500));
+    app.reported(many(1), at(10_500));
     assert!(app.round_trips.is_empty() && app.values.is_empty());
 }

@@ -10,13 +10,13 @@ const STOPPED: Duration = Duration::from_secs(2);
 
 /// A stop of all over a connection of its own. How long it took.
 fn stop(stage: &Stage) -> Duration {
-    let begun = Instant::now();
+    let started = Instant::now();
     let mut stream = stage.send("POST", "/api/stop", &[], "{\"node\":null}");
     stream.set_read_timeout(Some(STOPPED)).unwrap();
     let mut text = String::new();
     let _ = stream.read_to_string(&mut text);
-    assert!(starts(&text, 200) && text.contains("NoStop"), "after {:?}: {text:?}", begun.elapsed());
-    begun.elapsed()
+    assert!(starts(&text, 200) && text.contains("NoStop"), "after {:?}: {text:?}", started.elapsed());
+    started.elapsed()
 }
 
 /// Stops, again after each slow byte of the others.
@@ -37,8 +37,8 @@ fn refused(stage: &Stage, name: &str, least: u64) {
         // As long as there are too many requests it says nothing of limits.
         while let Ok(read @ 1..) = stream.read(&mut piece) {
             text.extend_from_slice(&piece[..read]);
-            let told = String::from_utf8_lossy(&text);
-            let message = told.split_once("data: ").and_then(|(_, message)| message.split_once("\n\n"));
+            let reported = String::from_utf8_lossy(&text);
+            let message = reported.split_once("data: ").and_then(|(_, message)| message.split_once("\n\n"));
             let Some((message, _)) = message else { continue };
             let message: Value = serde_json::from_str(message).unwrap();
             let Some(limits) = message["limits"]["rows"][""].as_array() else { return false };
@@ -141,16 +141,16 @@ fn a_head_has_seconds_as_a_whole_and_so_has_a_connection_that_asks_nothing() {
     let stage = stage();
     let mut slow = connections(&stage, 1, "GET / HTTP/1.1\r\nhost: localhost\r\nx-slow: ");
     let mut idle = connections(&stage, 1, "");
-    let begun = Instant::now();
+    let started = Instant::now();
     // Each byte would have begun the time anew.
     while slow[0].write_all(b"a").is_ok() {
-        assert!(begun.elapsed() < PATIENCE);
+        assert!(started.elapsed() < PATIENCE);
         std::thread::sleep(Duration::from_millis(200));
     }
-    assert!(begun.elapsed() >= Duration::from_secs(4), "a head may take some time: {:?}", begun.elapsed());
+    assert!(started.elapsed() >= Duration::from_secs(4), "a head may take some time: {:?}", started.elapsed());
     idle[0].set_read_timeout(Some(PATIENCE)).unwrap();
     assert!(matches!(idle[0].read(&mut [0]), Ok(0) | Err(_)));
-    assert!(begun.elapsed() < PATIENCE);
+    assert!(started.elapsed() < PATIENCE);
     refused(&stage, "requests that did not come", 2);
 }
 
@@ -168,12 +168,12 @@ fn a_browser_that_takes_nothing_is_given_up() {
     let file = format!("GET /map.js HTTP/1.1\r\nhost: {}\r\n\r\n", stage.address);
     // So many answers that no buffer of the system takes them.
     let many = file.repeat(20_000);
-    let begun = Instant::now();
+    let started = Instant::now();
     std::thread::scope(|scope| {
         crowd.iter_mut().for_each(|stream| drop(scope.spawn(|| drop(stream.write_all(many.as_bytes())))));
         println!("stopped after {:?}", stop(&stage));
     });
-    assert!(begun.elapsed() < PATIENCE);
+    assert!(started.elapsed() < PATIENCE);
     stop(&stage);
     refused(&stage, "took nothing", 8);
 }

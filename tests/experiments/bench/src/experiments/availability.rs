@@ -101,8 +101,8 @@ impl Lane<'_> {
                 let burst = self.bursts.burst(self.chars, period_ms);
                 let mut cell = Groups::default();
                 for _ in (0..self.bursts.groups).take_while(|_| !is_stopped()) {
-                    let told = || format!("{} characters every {period_ms} ms", self.chars);
-                    cell.own.push(pair.burst(&burst).with_context(told)?);
+                    let reported = || format!("{} characters every {period_ms} ms", self.chars);
+                    cell.own.push(pair.burst(&burst).with_context(reported)?);
                     bar.step();
                 }
                 rows.extend(cell.row(self.contender, self.setting, &burst));

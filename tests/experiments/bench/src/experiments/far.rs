@@ -104,8 +104,8 @@ fn turn(seats: &mut [Seat], cells: &mut [Cells]) -> Result<()> {
         let orders: Vec<Order> = delayed.collect();
         seat.pair.begin_blocks(&orders)
     };
-    let begun = seats.iter_mut().map(begin).collect::<Result<Vec<_>>>()?;
-    for (seat, used) in seats.iter_mut().zip(begun) {
+    let started = seats.iter_mut().map(begin).collect::<Result<Vec<_>>>()?;
+    for (seat, used) in seats.iter_mut().zip(started) {
         for (place, turn) in seat.places.iter().zip(seat.pair.end_blocks(used)?) {
             let cells = cells.get_mut(place.group).and_then(|cells| cells.get_mut(place.order));
             cells.and_then(|cells| cells.get_mut(place.peer)).context("a cell for each place")?.turns.push(turn);

@@ -79,7 +79,7 @@ fn connect(group: &Group, pairs: &mut [Option<Pair>]) -> Result<()> {
     let order = Order { chars, callers, calls_per_caller: 1, pause_ms: 0, delay_us: 0 };
     let connect = |(contender, pair): (&Contender, &mut Option<Pair>)| {
         let Some(running) = pair else { return Ok(()) };
-        contender.tolerate(running.block(&order).with_context(|| told(&order)))?;
+        contender.tolerate(running.block(&order).with_context(|| reported(&order)))?;
         pair.take_if(|_| !contender.works());
         Ok(())
     };
@@ -98,7 +98,7 @@ fn turn(
     let mut failure = Ok(());
     for ((contender, pair), cell) in contenders.iter().zip(pairs).zip(cells) {
         let Some(running) = pair.as_mut().filter(|_| cell.turns.len() == round) else { continue };
-        let outcome = running.block(order).with_context(|| told(order));
+        let outcome = running.block(order).with_context(|| reported(order));
         match contender.tolerate(outcome) {
             Ok(turn) => cell.turns.extend(turn),
             // The others go on, and the experiment fails when all is done.
@@ -109,7 +109,7 @@ fn turn(
     failure
 }
 
-fn told(order: &Order) -> String {
+fn reported(order: &Order) -> String {
     format!("{} characters, {} callers, {} ms apart", order.chars, order.callers, order.pause_ms)
 }
 
@@ -126,11 +126,11 @@ fn spaced_turn(
         let delayed = Order { delay_us: offset * place, ..order.clone() };
         Some(pair.as_mut()?.begin_blocks(&[delayed]))
     };
-    let begun: Vec<Option<Result<u64>>> = pairs.iter_mut().zip(0..).map(begin).collect();
+    let started: Vec<Option<Result<u64>>> = pairs.iter_mut().zip(0..).map(begin).collect();
     let mut failure = Ok(());
-    for (((contender, pair), begun), cell) in contenders.iter().zip(pairs).zip(begun).zip(cells) {
-        let (Some(running), Some(begun)) = (pair.as_mut(), begun) else { continue };
-        let turns = begun.and_then(|used| running.end_blocks(used)).with_context(|| told(order));
+    for (((contender, pair), started), cell) in contenders.iter().zip(pairs).zip(started).zip(cells) {
+        let (Some(running), Some(started)) = (pair.as_mut(), started) else { continue };
+        let turns = started.and_then(|used| running.end_blocks(used)).with_context(|| reported(order));
         match contender.tolerate(turns) {
             Ok(turns) if cell.turns.len() == round => cell.turns.extend(turns.into_iter().flatten()),
             Ok(_) => {}

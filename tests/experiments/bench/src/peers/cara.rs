@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use cara_bench_ends::{Caller, Delivery, Executed, Limits, Peer, Place, Printer, Server, cable_end};
-use cara_std::keys::{FleetKeys, Store, place::file_name};
+use cara_std::keys::{FleetKeys, Store, location::file_name};
 use cara_std::{
     Builder, CommunicationSystem, Constraints, Delivery as CaraDelivery, Fleet, Identity, Interfaces, Parameters,
     ParametersView, Peer as Node, RequestOptions, Served, ServiceError, Threads, Unit, UnitEvent,

@@ -99,23 +99,23 @@ impl Chart {
         let y = Marked::new(&self.y, points().map(|point| point.y).chain(spreads()));
         let mut builder = ChartBuilder::on(area);
         builder.caption(&self.title, (FONT, 16)).margin(10).x_label_area_size(42).y_label_area_size(62);
-        let mut chart = builder.build_cartesian_2d(x, y).map_err(told)?;
+        let mut chart = builder.build_cartesian_2d(x, y).map_err(reported)?;
         let mut mesh = chart.configure_mesh();
         let (x_text, y_text) = (|place: &f64| self.x.text(*place), |place: &f64| self.y.text(*place));
         mesh.x_desc(self.x.label).y_desc(self.y.label).x_label_formatter(&x_text).y_label_formatter(&y_text);
-        mesh.label_style((FONT, 13)).bold_line_style(BLACK.mix(0.12)).draw().map_err(told)?;
+        mesh.label_style((FONT, 13)).bold_line_style(BLACK.mix(0.12)).draw().map_err(reported)?;
         let place = |x: f64, y: f64| chart.backend_coord(&(self.x.place(x), self.y.place(y)));
         let (_, tops) = chart.plotting_area().get_pixel_range();
         for (index, (x, text)) in self.knees.iter().enumerate() {
             let at = chart.backend_coord(&(self.x.place(*x), 0.0)).0;
             let ends = [(at, tops.start), (at, tops.end)];
-            root.draw(&DashedPathElement::new(ends, 2, 3, BLACK.mix(0.6))).map_err(told)?;
+            root.draw(&DashedPathElement::new(ends, 2, 3, BLACK.mix(0.6))).map_err(reported)?;
             let height = tops.end - 16 - 14 * (index as i32 % 4);
             // On the side where there is room.
             let (columns, _) = chart.plotting_area().get_pixel_range();
             let is_right = at > (columns.start + columns.end) / 2;
             let left = if is_right { at - 6 * text.chars().count() as i32 - 4 } else { at + 3 };
-            root.draw(&Text::new(text.as_str(), (left, height), (FONT, 11))).map_err(told)?;
+            root.draw(&Text::new(text.as_str(), (left, height), (FONT, 11))).map_err(reported)?;
         }
         let style = |line: &Line| names.iter().position(|(name, _)| *name == line.name).map(Style::of);
         for line in &self.lines {
@@ -127,11 +127,11 @@ impl Chart {
             for (point, &at) in line.points.iter().zip(&path).filter(|_| line.kind == Kind::Measured) {
                 if let Some((low, high)) = point.spread {
                     let ends = [low, high].map(|y| shifted(place(point.x, y)));
-                    root.draw(&PathElement::new(ends, style.color.stroke_width(1))).map_err(told)?;
+                    root.draw(&PathElement::new(ends, style.color.stroke_width(1))).map_err(reported)?;
                 }
                 style.marker(root, at)?;
                 if point.is_knee {
-                    root.draw(&Circle::new(at, 9, style.color.stroke_width(2))).map_err(told)?;
+                    root.draw(&Circle::new(at, 9, style.color.stroke_width(2))).map_err(reported)?;
                 }
             }
         }
@@ -177,7 +177,7 @@ impl Style {
             (Kind::Measured, (_, 0)) => root.draw(&PathElement::new(path.to_vec(), color)),
             (Kind::Measured, (dash, gap)) => root.draw(&DashedPathElement::new(path.to_vec(), dash, gap, color)),
         }
-        .map_err(told)
+        .map_err(reported)
     }
 
     fn marker<D: DrawingBackend>(&self, root: &Area<D>, (x, y): (i32, i32)) -> Result<()> {
@@ -192,7 +192,7 @@ impl Style {
             3 => root.draw(&Rectangle::new([(x - 4, y - 4), (x + 4, y + 4)], color.filled())),
             _ => root.draw(&Cross::new((x, y), 4, color.stroke_width(2))),
         }
-        .map_err(told)
+        .map_err(reported)
     }
 }
 
@@ -205,7 +205,7 @@ pub(super) fn draw(rows: &[Vec<Chart>], about: &[String], path: &Path) -> Result
 }
 
 fn all<D: DrawingBackend>(rows: &[Vec<Chart>], about: &[String], root: &Area<D>) -> Result<()> {
-    root.fill(&WHITE).map_err(told)?;
+    root.fill(&WHITE).map_err(reported)?;
     let (charts, _) = root.split_horizontally(root.dim_in_pixel().0 - LEGEND);
     let mut names: Vec<(String, Kind)> = Vec::new();
     for line in rows.iter().flatten().flat_map(|chart| &chart.lines).filter(|line| !line.points.is_empty()) {
@@ -224,7 +224,7 @@ fn all<D: DrawingBackend>(rows: &[Vec<Chart>], about: &[String], root: &Area<D>)
         })?;
     }
     legend(root, &names, about)?;
-    root.present().map_err(told)
+    root.present().map_err(reported)
 }
 
 fn legend<D: DrawingBackend>(root: &Area<D>, names: &[(String, Kind)], about: &[String]) -> Result<()> {
@@ -235,16 +235,16 @@ fn legend<D: DrawingBackend>(root: &Area<D>, names: &[(String, Kind)], about: &[
         if *kind == Kind::Measured {
             style.marker(root, (left + 17, middle))?;
         }
-        root.draw(&Text::new(name.as_str(), (left + 42, middle - 7), (FONT, 13))).map_err(told)?;
+        root.draw(&Text::new(name.as_str(), (left + 42, middle - 7), (FONT, 13))).map_err(reported)?;
     }
     for (index, text) in about.iter().enumerate() {
         let top = 30 + (names.len() as i32 + 1) * SPACING + index as i32 * 18;
-        root.draw(&Text::new(text.as_str(), (left, top), (FONT, 12))).map_err(told)?;
+        root.draw(&Text::new(text.as_str(), (left, top), (FONT, 12))).map_err(reported)?;
     }
     Ok(())
 }
 
 /// The drawing library's errors borrow from what they are about.
-fn told(error: impl std::fmt::Display) -> anyhow::Error {
+fn reported(error: impl std::fmt::Display) -> anyhow::Error {
     anyhow!("{error}")
 }

@@ -62,7 +62,7 @@ impl EmbassyWorld {
         for visit in client.visits(&unit.identity(), 0) {
             heard.extend(visitor.pays(&self.bench, visit));
         }
-        if client.is_told().is_some_and(|told| told == heard) {
+        if client.is_reported().is_some_and(|reported| reported == heard) {
             self.reached("client was told");
         }
         if let UnknownClient::Silent(count) = client {

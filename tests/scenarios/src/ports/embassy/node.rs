@@ -202,13 +202,13 @@ impl Node for Rc<BoardNode> {
 
     fn begin_publish(&self) -> Pending<Vec<Identity>> {
         let pending = Pending::new();
-        let (unit, told) = (self.unit(), pending.share());
+        let (unit, reported) = (self.unit(), pending.share());
         self.board().spawn(async move {
             let result = match unit {
                 Ok(unit) => with_timeout(embassy_time::Duration::from_secs(10), unit.publish_and_wait()).await,
                 Err(error) => Ok(Err(error)),
             };
-            told.end(result.unwrap_or(Err(Error::TimedOut)).map(|()| Vec::new()), now());
+            reported.end(result.unwrap_or(Err(Error::TimedOut)).map(|()| Vec::new()), now());
         });
         pending
     }
@@ -251,14 +251,14 @@ impl Node for Rc<BoardNode> {
 
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
         let pending = Pending::new();
-        let (asked, told, mut parameters) = (self.peer(peer), pending.share(), boxed(parameters));
+        let (asked, reported, mut parameters) = (self.peer(peer), pending.share(), boxed(parameters));
         let function = function.to_owned();
         self.board().spawn(async move {
             let result = match asked {
                 Ok(peer) => peer.call(&function, &mut parameters).with(options).await.map_err(Error::from),
                 Err(error) => Err(error),
             };
-            told.end(result.map(|()| parameters), now());
+            reported.end(result.map(|()| parameters), now());
         });
         pending
     }
@@ -268,13 +268,13 @@ impl Node for Rc<BoardNode> {
         let peers = self.asked_with_all(function);
         let (count, outcomes) = (peers.len(), Rc::new(RefCell::new(Vec::new())));
         for peer in peers {
-            let (told, outcomes) = (pending.share(), Rc::clone(&outcomes));
+            let (reported, outcomes) = (pending.share(), Rc::clone(&outcomes));
             let (function, mut parameters) = (function.to_owned(), boxed(parameters));
             self.board().spawn(async move {
                 let outcome = peer.block_request(&function, &mut parameters).await;
                 outcomes.borrow_mut().push((peer.identity().clone(), outcome));
                 if outcomes.borrow().len() == count {
-                    told.end(Ok(outcomes.take()), now());
+                    reported.end(Ok(outcomes.take()), now());
                 }
             });
         }

@@ -54,7 +54,7 @@ impl Visitor {
     pub(super) fn pays(&self, bench: &Bench, visit: Visit) -> Vec<u8> {
         let (stack, to) = (self.board.stack(), (self.host, PLAIN_PORT));
         let (heard, over) = (Rc::new(RefCell::new(Vec::new())), Rc::new(Cell::new(false)));
-        let (noted, ended) = (Rc::clone(&heard), Rc::clone(&over));
+        let (recorded, ended) = (Rc::clone(&heard), Rc::clone(&over));
         self.board.spawn(async move {
             let mut socket = connection(stack, to).await;
             // The unit may close the connection while garbage is still being written.
@@ -69,7 +69,7 @@ impl Visitor {
             let listening = async {
                 let mut bytes = [0; 512];
                 while let Ok(count @ 1..) = socket.read(&mut bytes).await {
-                    noted.borrow_mut().extend_from_slice(&bytes[..count]);
+                    recorded.borrow_mut().extend_from_slice(&bytes[..count]);
                 }
             };
             let _ = with_timeout(embassy_time::Duration::from_micros(listens.as_micros()), listening).await;

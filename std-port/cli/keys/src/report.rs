@@ -26,7 +26,7 @@ pub(super) enum Done<'n> {
 }
 
 /// Prints what a command has done.
-pub(super) fn tell(done: Done<'_>, store: &Store, written: &[Written], global: &Global) -> anyhow::Result<()> {
+pub(super) fn print(done: Done<'_>, store: &Store, written: &[Written], global: &Global) -> anyhow::Result<()> {
     let next = next(store, written);
     if global.json {
         return Ok(output::object(&object(store, written, &next))?);

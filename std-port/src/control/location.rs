@@ -31,7 +31,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 
 /// Why there is no control socket.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum PlaceError {
+pub(super) enum LocationError {
     #[error("{0} has no directory above it: give the socket's whole path")]
     NoDirectory(PathBuf),
     #[error("{path} belongs to user {owner}: remove it, or set CARA_CONTROL_DIR to a directory of your own")]
@@ -46,7 +46,7 @@ pub(super) enum PlaceError {
     System { path: PathBuf, error: io::Error },
 }
 
-impl PlaceError {
+impl LocationError {
     fn system(path: &Path, error: impl Into<io::Error>) -> Self {
         Self::System { path: path.to_owned(), error: error.into() }
     }
@@ -119,17 +119,17 @@ pub(super) fn file_name(identity: &Identity, fleet: Fleet) -> String {
 }
 
 /// The `NAME/ID` and the fleet in the name of a unit's socket; for any other name, that name and fleet 0.
-pub(super) fn told_by_name(path: &Path) -> (String, u32) {
+pub(super) fn reported_by_name(path: &Path) -> (String, u32) {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    told(&name).unwrap_or_else(|| (path.display().to_string(), 0))
+    reported(&name).unwrap_or_else(|| (path.display().to_string(), 0))
 }
 
 /// Whether the name of a socket tells the whole name of its unit.
-pub(super) fn tells_name(path: &Path) -> bool {
-    told(&path.file_name().unwrap_or_default().to_string_lossy()).is_some_and(|(unit, _)| !unit.contains('~'))
+pub(super) fn reports_name(path: &Path) -> bool {
+    reported(&path.file_name().unwrap_or_default().to_string_lossy()).is_some_and(|(unit, _)| !unit.contains('~'))
 }
 
-fn told(file: &str) -> Option<(String, u32)> {
+fn reported(file: &str) -> Option<(String, u32)> {
     let (rest, fleet) = file.strip_suffix(SUFFIX)?.rsplit_once('-')?;
     let (name, id) = rest.rsplit_once('-')?;
     let id: u32 = id.parse().ok()?;
@@ -161,13 +161,13 @@ fn fnv(bytes: &[u8]) -> u64 {
 }
 
 /// The sockets in a directory, live or stale; none in a directory that other users can write to.
-pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
+pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, LocationError> {
     match enter(directory) {
         Ok(_) => {}
-        Err(PlaceError::System { error, .. }) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(LocationError::System { error, .. }) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         Err(error) => return Err(error),
     }
-    let entries = std::fs::read_dir(directory).map_err(|error| PlaceError::system(directory, error))?;
+    let entries = std::fs::read_dir(directory).map_err(|error| LocationError::system(directory, error))?;
     let mut sockets: Vec<PathBuf> = entries
         .filter_map(|entry| entry.ok().map(|entry| entry.path()))
         .filter(|path| path.to_string_lossy().ends_with(SUFFIX))
@@ -178,7 +178,7 @@ pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
 
 /// A listening socket and its file.
 #[derive(Clone, Debug)]
-pub(super) struct Place {
+pub(super) struct Location {
     path: PathBuf,
     /// Identifies the file, so that a later one at the same path is not removed.
     file: Mark,
@@ -192,23 +192,23 @@ fn mark(path: &Path) -> io::Result<Mark> {
     Ok((file.dev(), file.ino(), file.ctime(), file.ctime_nsec()))
 }
 
-impl Place {
+impl Location {
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
     /// Opens the socket at `path`, replacing a stale one.
-    pub(super) fn open(path: &Path) -> Result<(Self, UnixListener), PlaceError> {
+    pub(super) fn open(path: &Path) -> Result<(Self, UnixListener), LocationError> {
         let directory = parent(path)?;
         let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
-        made.map_err(|error| PlaceError::system(directory, error))?;
+        made.map_err(|error| LocationError::system(directory, error))?;
         let directory = enter(directory)?;
-        let _lock = lock(&directory).map_err(|error| PlaceError::system(path, error))?;
+        let _lock = lock(&directory).map_err(|error| LocationError::system(path, error))?;
         make_room(path)?;
-        let listener = listen_at(path, &directory).map_err(|error| PlaceError::system(path, error))?;
+        let listener = listen_at(path, &directory).map_err(|error| LocationError::system(path, error))?;
         // Other users cannot enter the directory, so the socket was not reachable with wider permissions in between.
-        set_permissions(path, Permissions::from_mode(0o600)).map_err(|error| PlaceError::system(path, error))?;
-        let file = mark(path).map_err(|error| PlaceError::system(path, error))?;
+        set_permissions(path, Permissions::from_mode(0o600)).map_err(|error| LocationError::system(path, error))?;
+        let file = mark(path).map_err(|error| LocationError::system(path, error))?;
         Ok((Self { path: path.to_owned(), file }, listener))
     }
 
@@ -227,22 +227,22 @@ impl Place {
     }
 }
 
-fn parent(path: &Path) -> Result<&Path, PlaceError> {
+fn parent(path: &Path) -> Result<&Path, LocationError> {
     let directory = path.parent().filter(|directory| !directory.as_os_str().is_empty());
-    directory.ok_or_else(|| PlaceError::NoDirectory(path.to_owned()))
+    directory.ok_or_else(|| LocationError::NoDirectory(path.to_owned()))
 }
 
 /// Opens a directory that belongs to this user and that no other user can enter.
-fn enter(path: &Path) -> Result<OwnedFd, PlaceError> {
+fn enter(path: &Path) -> Result<OwnedFd, LocationError> {
     let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::RDONLY | OFlags::CLOEXEC;
-    let directory = open(path, flags, Mode::empty()).map_err(|errno| PlaceError::system(path, errno))?;
-    let found = fstat(&directory).map_err(|errno| PlaceError::system(path, errno))?;
+    let directory = open(path, flags, Mode::empty()).map_err(|errno| LocationError::system(path, errno))?;
+    let found = fstat(&directory).map_err(|errno| LocationError::system(path, errno))?;
     let mode = found.st_mode & 0o777;
     if found.st_uid != own_uid() {
-        return Err(PlaceError::Foreign { path: path.to_owned(), owner: found.st_uid });
+        return Err(LocationError::Foreign { path: path.to_owned(), owner: found.st_uid });
     }
     if mode & 0o077 != 0 {
-        return Err(PlaceError::Open { path: path.to_owned(), mode });
+        return Err(LocationError::Open { path: path.to_owned(), mode });
     }
     Ok(directory)
 }
@@ -261,18 +261,18 @@ fn lock(directory: &OwnedFd) -> io::Result<OwnedFd> {
 }
 
 /// Removes a stale socket.
-fn make_room(path: &Path) -> Result<(), PlaceError> {
+fn make_room(path: &Path) -> Result<(), LocationError> {
     let Ok(found) = path.symlink_metadata() else { return Ok(()) };
     if !found.file_type().is_socket() {
-        return Err(PlaceError::NotASocket(path.to_owned()));
+        return Err(LocationError::NotASocket(path.to_owned()));
     }
     match dial(path) {
         Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
-            std::fs::remove_file(path).map_err(|error| PlaceError::system(path, error))
+            std::fs::remove_file(path).map_err(|error| LocationError::system(path, error))
         }
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
         // A full queue of connections is a sign of life, too.
-        _ => Err(PlaceError::InUse(path.to_owned())),
+        _ => Err(LocationError::InUse(path.to_owned())),
     }
 }
 
@@ -352,10 +352,10 @@ mod tests {
     #[test]
     fn the_name_of_a_socket_tells_its_unit() {
         for name in ["AGV_manager", "a-b", "../../etc", "Fähre 1"] {
-            assert_eq!(told_by_name(&Path::new("/x").join(name_of(name))), (format!("{name}/7"), 3));
+            assert_eq!(reported_by_name(&Path::new("/x").join(name_of(name))), (format!("{name}/7"), 3));
         }
         for odd in ["unit.sock", "a-b.sock", "a-1-x.sock", "a-1-2"] {
-            assert_eq!(told_by_name(&Path::new("/x").join(odd)), (format!("/x/{odd}"), 0));
+            assert_eq!(reported_by_name(&Path::new("/x").join(odd)), (format!("/x/{odd}"), 0));
         }
         assert_eq!(unescape("%"), "%");
         assert_eq!(unescape("%4"), "%4");
@@ -376,10 +376,10 @@ mod tests {
     fn the_directory_is_made_for_its_owner_alone_and_so_is_the_socket() {
         let above = directory();
         let path = above.path().join("deep").join("unit.sock");
-        let (place, _listener) = Place::open(&path).unwrap();
+        let (location, _listener) = Location::open(&path).unwrap();
         assert_eq!((mode(path.parent().unwrap()), mode(&path)), (0o700, 0o600));
         assert!(dial(&path).is_ok());
-        place.remove();
+        location.remove();
         assert!(!path.exists());
     }
 
@@ -389,8 +389,8 @@ mod tests {
         let open = above.path().join("open");
         std::fs::create_dir(&open).unwrap();
         set_permissions(&open, Permissions::from_mode(0o750)).unwrap();
-        assert!(matches!(Place::open(&open.join("unit.sock")), Err(PlaceError::Open { mode: 0o750, .. })));
-        assert!(matches!(sockets(&open), Err(PlaceError::Open { .. })));
+        assert!(matches!(Location::open(&open.join("unit.sock")), Err(LocationError::Open { mode: 0o750, .. })));
+        assert!(matches!(sockets(&open), Err(LocationError::Open { .. })));
     }
 
     #[test]
@@ -398,7 +398,7 @@ mod tests {
         let above = directory();
         let link = above.path().join("link");
         std::os::unix::fs::symlink(above.path(), &link).unwrap();
-        assert!(matches!(Place::open(&link.join("unit.sock")), Err(PlaceError::System { .. })));
+        assert!(matches!(Location::open(&link.join("unit.sock")), Err(LocationError::System { .. })));
     }
 
     /// Some directory of another user; there is none that root does not own in every container, so root looks on.
@@ -410,20 +410,20 @@ mod tests {
             println!("skipped: the process of number 1 belongs to this user");
             return;
         }
-        assert!(matches!(enter(foreign), Err(PlaceError::Foreign { owner: found, .. }) if found == owner));
+        assert!(matches!(enter(foreign), Err(LocationError::Foreign { owner: found, .. }) if found == owner));
     }
 
     #[test]
     fn a_socket_without_a_process_is_replaced_and_a_live_one_is_not() {
         let above = directory();
         let path = above.path().join("unit.sock");
-        let (stale, listener) = Place::open(&path).unwrap();
-        assert!(matches!(Place::open(&path), Err(PlaceError::InUse(_))));
+        let (stale, listener) = Location::open(&path).unwrap();
+        assert!(matches!(Location::open(&path), Err(LocationError::InUse(_))));
         drop(listener);
-        let (place, _listener) = Place::open(&path).unwrap();
+        let (location, _listener) = Location::open(&path).unwrap();
         stale.remove();
         assert!(path.exists(), "it is another's by now");
-        place.remove();
+        location.remove();
         assert!(!path.exists());
     }
 
@@ -432,19 +432,19 @@ mod tests {
         let above = directory();
         let path = above.path().join("unit.sock");
         std::fs::write(&path, "precious").unwrap();
-        assert!(matches!(Place::open(&path), Err(PlaceError::NotASocket(_))));
+        assert!(matches!(Location::open(&path), Err(LocationError::NotASocket(_))));
         assert_eq!(std::fs::read(&path).unwrap(), b"precious");
-        assert!(matches!(Place::open(Path::new("unit.sock")), Err(PlaceError::NoDirectory(_))));
+        assert!(matches!(Location::open(Path::new("unit.sock")), Err(LocationError::NoDirectory(_))));
     }
 
     #[test]
     fn a_path_longer_than_a_sockets_address_serves() {
         let above = directory();
         let path = above.path().join("d".repeat(120)).join("unit.sock");
-        let (place, _listener) = Place::open(&path).unwrap();
+        let (location, _listener) = Location::open(&path).unwrap();
         assert!(dial(&path).is_ok());
         assert_eq!(sockets(path.parent().unwrap()).unwrap(), std::slice::from_ref(&path));
-        place.remove();
+        location.remove();
         assert!(!path.exists());
     }
 }

@@ -18,7 +18,7 @@ use cara_tools::name_and_id::NameAndId;
 
 /// What the board is told.
 #[derive(clap::Args)]
-pub(super) struct Told {
+pub(super) struct Given {
     /// The board's name.
     #[arg(long, requires = "id")]
     name: Option<String>,
@@ -91,7 +91,7 @@ fn host(text: &str) -> Result<Ipv4Addr, &'static str> {
     if is_of_host(address) { Ok(address) } else { Err("this is no host's address: write one as in 10.0.0.1") }
 }
 
-impl Told {
+impl Given {
     /// Makes settings, or tells what is wrong with them. What is not said comes from the board's keys.
     pub(super) fn settings(&self, board: &Board, global: &Global, ring: Option<&KeyRing>) -> anyhow::Result<Settings> {
         if global.insecure && ring.is_some() {

@@ -23,7 +23,7 @@ const OF_HOST: &str = "/etc/cara/keys";
 /// The file name of a node's keys: `agv-17-17-s_unit-7.keys` of `agv-17/17` in fleet 7.
 ///
 /// ```
-/// use cara_std::keys::place::file_name;
+/// use cara_std::keys::location::file_name;
 /// use cara_std::{Fleet, Identity};
 ///
 /// assert_eq!(file_name(&Identity::m_unit("Depot A", 1)?, Fleet(7)), "Depot%20A-1-m_unit-7.keys");
@@ -226,7 +226,7 @@ mod tests {
         let mut host = host();
         let text = host.missing();
         let places = ["home/.config/cara/keys/depot-1-m_unit-7.keys", "etc/depot-1-m_unit-7.keys"];
-        places.iter().for_each(|place| assert!(text.contains(place), "{text}"));
+        places.iter().for_each(|location| assert!(text.contains(location), "{text}"));
         assert!(text.contains("`cara keys new-fleet --fleet 7 depot/1@m_unit`"), "{text}");
         let root = host.folder.path().join("home/.config/cara/keys");
         fs::create_dir_all(&root).unwrap();
