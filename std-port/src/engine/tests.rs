@@ -50,8 +50,9 @@ fn value(readings: &[Reading], group: Group, name: &str) -> u64 {
     readings.iter().find(|reading| (reading.group, reading.name) == (group, name)).unwrap().value
 }
 
-/// All buffers of a unit's pool.
+/// All buffers of a unit's pool, once none is in use: one that came back later could keep an answer.
 fn drain(pool: &MessagePool) -> Vec<Box<[u8]>> {
+    until(|| pool.counters().in_use == 0);
     std::iter::from_fn(|| pool.take()).collect()
 }
 
