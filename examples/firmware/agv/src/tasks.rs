@@ -1,9 +1,30 @@
-//! Tasks that every board spawns as they are. Those of its network, button, LED and watchdog are the board's own,
+//! How every board starts its AGV, and the tasks that are the same on all. Those of its network, button, LED and watchdog are the board's own,
 //! because their types are.
 
-use cara_embassy::Runner;
+use cara_embassy::{Runner, Security};
+use cara_settings::Settings;
+use embassy_executor::{SpawnError, Spawner};
+use embassy_net::Stack;
+use static_cell::StaticCell;
 
-use crate::{Agv, Vehicle};
+use crate::{Agv, Vehicle, VehicleResources};
+
+/// Makes the AGV of the settings and starts its tasks. Once per image: its memory is a static here. On an error the text says why.
+pub fn start(
+    spawner: Spawner,
+    stack: Stack<'static>,
+    settings: &Settings,
+    security: Security,
+) -> Result<Vehicle, &'static str> {
+    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
+    let made = crate::vehicle(stack, RESOURCES.init_with(VehicleResources::new), settings, security);
+    let (vehicle, runner) = made.map_err(|_| "the settings are of no vehicle")?;
+    crate::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
+    let has_no_room = |_: SpawnError| "no room for a task";
+    spawner.spawn(unit(runner).map_err(has_no_room)?);
+    spawner.spawn(drive(vehicle).map_err(has_no_room)?);
+    Ok(vehicle)
+}
 
 /// The unit's task, which the watchdog looks at.
 #[embassy_executor::task]

@@ -8,6 +8,8 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use embassy_executor::{Spawner, raw};
 use static_cell::StaticCell;
 
+use crate::fault;
+
 /// A task has been woken since the executor last looked.
 static WOKEN: AtomicBool = AtomicBool::new(false);
 
@@ -16,11 +18,14 @@ fn pender(_context: *mut ()) {
     WOKEN.store(true, Ordering::Release);
 }
 
-/// Runs tasks for ever, beginning with those that `first` spawns.
-pub fn run(first: impl FnOnce(Spawner)) -> ! {
+/// Runs tasks for ever, beginning with those that `spawn` starts. If it fails, the emulator ends with its text.
+pub fn run(spawn: impl FnOnce(Spawner) -> Result<(), &'static str>) -> ! {
     static EXECUTOR: StaticCell<raw::Executor> = StaticCell::new();
     let executor = EXECUTOR.init_with(|| raw::Executor::new(null_mut()));
-    first(executor.spawner());
+    if let Err(text) = spawn(executor.spawner()) {
+        cara_vehicle::error!("{=str}", text);
+        semihosting::process::exit(fault::NOT_STARTED)
+    }
     loop {
         #[cfg(feature = "faults")]
         let turn = crate::faults::turn();

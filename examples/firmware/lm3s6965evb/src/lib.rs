@@ -23,6 +23,7 @@ mod register;
 pub mod reset;
 pub mod stack;
 pub mod watchdog;
+pub mod wiring;
 
 /// Starts the clock and paints the stack; call it first, once.
 ///

@@ -3,15 +3,14 @@
 #![no_std]
 #![no_main]
 
-use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
-use cara_lm3s6965evb::ethernet::Ethernet;
-use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start, watchdog};
-use cara_vehicle::{Agv, LIMITS, Vehicle, VehicleResources};
+use cara_lm3s6965evb::wiring::{self, NO_ROOM};
+use cara_lm3s6965evb::{executor, motor, reset, start, watchdog};
+use cara_vehicle::{LIMITS, Vehicle, tasks};
 use embassy_executor::Spawner;
-use embassy_net::{Runner, StackResources};
+use embassy_net::StackResources;
 use embassy_time::{Duration, Timer};
-use static_cell::{ConstStaticCell, StaticCell};
+use static_cell::ConstStaticCell;
 
 /// How often the timer presses the button.
 const PRESSED_EVERY: Duration = Duration::from_secs(10);
@@ -25,40 +24,22 @@ fn main() -> ! {
     if place != 0 {
         cara_vehicle::info!("it ended at line or address {=u32:#x}", place);
     }
-    executor::run(|spawner| {
-        if let Err(text) = spawn(spawner) {
-            cara_vehicle::error!("{=str}", text);
-            semihosting::process::exit(fault::NOT_STARTED)
-        }
-    })
+    executor::run(spawn)
 }
 
 /// Not merged into `main`: what it needs of the stack is free again once the tasks run.
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
     static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
-    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    const NO_ROOM: &str = "no room for a task";
     let given = arguments::read().map_err(ArgumentError::text)?;
     let (settings, security, noise) = given.security().ok_or("it joins no manager")?;
-    let ethernet = ETHERNET.take();
-    ethernet.start();
-    let sockets = SOCKETS.take();
-    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, noise);
-    let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = cara_vehicle::vehicle(stack, resources, &settings, security);
-    let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
+    let stack = wiring::network(spawner, &settings, SOCKETS.take(), noise)?;
+    let vehicle = tasks::start(spawner, stack, &settings, security)?;
     #[cfg(feature = "faults")]
     cara_lm3s6965evb::faults::offer(vehicle).map_err(|_| "no room for the test's functions")?;
     #[cfg(feature = "lists")]
     cara_lm3s6965evb::lists::offer(vehicle).map_err(|_| "no room for the test's function with lists")?;
-    cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
-    spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
-    spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
-    spawner.spawn(drive(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
-    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     #[cfg(feature = "faults")]
     spawner.spawn(cara_lm3s6965evb::faults::starve().map_err(|_| NO_ROOM)?);
     #[cfg(feature = "faults")]
@@ -67,21 +48,6 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     }
     watchdog::start();
     Ok(())
-}
-
-#[embassy_executor::task]
-async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
-    runner.run().await
-}
-
-#[embassy_executor::task]
-async fn unit(mut runner: UnitRunner<Agv>) -> ! {
-    cara_board::watched(runner.run()).await
-}
-
-#[embassy_executor::task]
-async fn drive(vehicle: Vehicle) -> ! {
-    cara_vehicle::drive(vehicle).await
 }
 
 #[embassy_executor::task]

@@ -8,48 +8,36 @@ use core::fmt;
 
 use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
-use cara_lm3s6965evb::ethernet::Ethernet;
-use cara_lm3s6965evb::{executor, fault, motor, stack, start, watchdog};
+use cara_lm3s6965evb::wiring::{self, NO_ROOM};
+use cara_lm3s6965evb::{executor, motor, start, watchdog};
 use cara_vehicle::LIMITS;
 use cara_vehicle::warehouse::{self, Agv, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
-use embassy_net::{Runner, StackResources};
+use embassy_net::StackResources;
 use static_cell::{ConstStaticCell, StaticCell};
 
 #[cortex_m_rt::entry]
 fn main() -> ! {
     let _core = start();
     motor::start();
-    executor::run(|spawner| {
-        if let Err(text) = spawn(spawner) {
-            cara_vehicle::error!("{=str}", text);
-            semihosting::process::exit(fault::NOT_STARTED)
-        }
-    })
+    executor::run(spawn)
 }
 
 /// Not merged into `main`: what it needs of the stack is free again once the tasks run.
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
     static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    const NO_ROOM: &str = "no room for a task";
     let given = arguments::read().map_err(ArgumentError::text)?;
     let at = given.at.ok_or("at=X,Y is not told, the cell in which it stands")?;
     let (settings, security, noise) = given.security().ok_or("it joins no manager")?;
-    let ethernet = ETHERNET.take();
-    ethernet.start();
-    let sockets = SOCKETS.take();
-    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, noise);
+    let stack = wiring::network(spawner, &settings, SOCKETS.take(), noise)?;
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = warehouse::vehicle(stack, resources, &settings, security, at, note);
     let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
     cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
-    spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(drive(vehicle).map_err(|_| NO_ROOM)?);
-    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     watchdog::start();
     Ok(())
 }
@@ -57,11 +45,6 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
 /// To the host, at once.
 fn note(what: fmt::Arguments<'_>) {
     semihosting::eprintln!("{} {what}", embassy_time::Instant::now().as_micros());
-}
-
-#[embassy_executor::task]
-async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
-    runner.run().await
 }
 
 #[embassy_executor::task]

@@ -8,7 +8,7 @@ use cara_nucleo::Board;
 use cara_nucleo::board::{Button, Device, Led, Watchdog};
 use cara_settings::Settings;
 use cara_vehicle::provision::{Provision, halves};
-use cara_vehicle::{LIMITS, Vehicle, VehicleResources, led, tasks};
+use cara_vehicle::{LIMITS, Vehicle, led, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::{Runner, StackResources};
@@ -45,16 +45,10 @@ fn spawn(
     watchdog: Watchdog,
 ) -> Result<(), SpawnError> {
     static SOCKETS: StaticCell<StackResources<{ LIMITS.sockets() }>> = StaticCell::new();
-    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     let sockets = SOCKETS.init_with(StackResources::new);
     let (stack, network_runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
-    let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = cara_vehicle::vehicle(stack, resources, &settings, security);
-    let Ok((vehicle, unit)) = made else { defmt::panic!("no vehicle can be made of the settings") };
-    defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner)?);
-    spawner.spawn(tasks::unit(unit)?);
-    spawner.spawn(tasks::drive(vehicle)?);
+    let vehicle = defmt::unwrap!(tasks::start(spawner, stack, &settings, security));
     spawner.spawn(call_mechanic(vehicle, button)?);
     spawner.spawn(shine(vehicle, led)?);
     watchdog.start();

@@ -7,7 +7,7 @@ use cara_rp::Board;
 use cara_rp::board::{Device, Led};
 use cara_rp::parts::Button;
 use cara_vehicle::provision::{Provision, halves};
-use cara_vehicle::{LIMITS, Vehicle, VehicleResources, led, tasks};
+use cara_vehicle::{LIMITS, Vehicle, led, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::{Runner, StackResources};
@@ -20,7 +20,6 @@ async fn main(spawner: Spawner) {
 
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static SOCKETS: StaticCell<StackResources<{ LIMITS.sockets() }>> = StaticCell::new();
-    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     let Board { pages: [first, second], lives, seed, led, button, watchdog, network } = Board::start(spawner).await;
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
         proof.begin(lives, halves(seed)).map(|security| (settings, security))
@@ -34,13 +33,8 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     let sockets = SOCKETS.init_with(StackResources::new);
     let (stack, runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
     uplink.keep(spawner, stack, Some(&settings))?;
-    let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = cara_vehicle::vehicle(stack, resources, &settings, security);
-    let Ok((vehicle, unit)) = made else { defmt::panic!("no vehicle can be made of the settings") };
-    defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(talk(runner)?);
-    spawner.spawn(tasks::unit(unit)?);
-    spawner.spawn(tasks::drive(vehicle)?);
+    let vehicle = defmt::unwrap!(tasks::start(spawner, stack, &settings, security));
     spawner.spawn(call_mechanic(vehicle, button)?);
     spawner.spawn(shine(vehicle, led)?);
     watchdog.start();
