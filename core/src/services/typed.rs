@@ -93,7 +93,7 @@ pub trait AnyCall {
 /// declares both for its signature, as `progress (…)` and `fails (…)`. `()` stands for nothing. Every [`AnyCall`] is one.
 #[cfg(feature = "details")]
 pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
-    /// Tells the caller how far the call is, as [`notify`](AnyCall::tell) does.
+    /// Tells the caller how far the call is, as [`notify`](AnyCall::notify) does.
     fn progress(&self, values: &P) -> Result<(), Error> {
         values.with_parameters(|values| self.notify(values))?
     }

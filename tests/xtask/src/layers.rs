@@ -72,7 +72,7 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
     Purpose {
         what: "where the details of a failure and progress lie, and their frames",
         places: &["services/session/details.rs"],
-        items: &["connections::Place", "frame::Frame"],
+        items: &["connections::Span", "frame::Frame"],
     },
     Purpose { what: "hello and farewell", places: &["services/session/mod.rs"], items: &["frame::Frame"] },
     Purpose { what: "a ping", places: &["services/session/pinging.rs"], items: &["frame::Frame"] },
@@ -84,7 +84,7 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
     Purpose {
         what: "proof and renewal of keys: their frames, and where they lie",
         places: &["services/session/proving.rs", "services/session/renewing.rs"],
-        items: &["connections::Place", "frame::Frame"],
+        items: &["connections::Span", "frame::Frame"],
     },
     Purpose {
         what: "the step of a renewal that is kept until it can be sent",
@@ -94,12 +94,12 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
     Purpose {
         what: "what a link has received whole, where it lies, and the answer to a ping",
         places: &["services/session/inbound.rs"],
-        items: &["connections::Inbound", "connections::Place", "frame::Frame"],
+        items: &["connections::Inbound", "connections::Span", "frame::Frame"],
     },
     Purpose {
         what: "where a sample lies that came whole",
         places: &["services/session/streaming.rs"],
-        items: &["connections::Place"],
+        items: &["connections::Span"],
     },
     Purpose {
         what: "why a session datagram is dropped",
