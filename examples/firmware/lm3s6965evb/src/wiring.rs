@@ -1,4 +1,4 @@
-//! What every image of the board starts with: its network, and the task that reports the stack.
+//! What every image of the board starts with: its network.
 
 use cara_settings::Settings;
 use embassy_executor::Spawner;
@@ -6,7 +6,6 @@ use embassy_net::{Runner, Stack, StackResources};
 use static_cell::ConstStaticCell;
 
 use crate::ethernet::Ethernet;
-use crate::stack;
 
 /// Why an image does not start: it has more tasks than it said.
 pub const NO_ROOM: &str = "no room for a task";
@@ -23,7 +22,6 @@ pub fn network<const SOCKETS: usize>(
     ethernet.start();
     let (stack, runner) = embassy_net::new(ethernet, cara_vehicle::network(settings), sockets, noise);
     spawner.spawn(run(runner).map_err(|_| NO_ROOM)?);
-    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     Ok(stack)
 }
 

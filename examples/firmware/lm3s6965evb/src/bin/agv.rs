@@ -5,7 +5,7 @@
 
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::wiring::{self, NO_ROOM};
-use cara_lm3s6965evb::{executor, motor, reset, start, watchdog};
+use cara_lm3s6965evb::{executor, motor, reset, stack, start, watchdog};
 use cara_vehicle::{LIMITS, Vehicle, tasks};
 use embassy_executor::Spawner;
 use embassy_net::StackResources;
@@ -40,6 +40,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     #[cfg(feature = "lists")]
     cara_lm3s6965evb::lists::offer(vehicle).map_err(|_| "no room for the test's function with lists")?;
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
+    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     #[cfg(feature = "faults")]
     spawner.spawn(cara_lm3s6965evb::faults::starve().map_err(|_| NO_ROOM)?);
     #[cfg(feature = "faults")]

@@ -5,7 +5,7 @@
 
 use cara_lm3s6965evb::arguments::ArgumentError;
 use cara_lm3s6965evb::wiring::{self, NO_ROOM};
-use cara_lm3s6965evb::{arguments, executor, start};
+use cara_lm3s6965evb::{arguments, executor, stack, start};
 use cara_vehicle::echo;
 use embassy_executor::Spawner;
 use embassy_net::{Stack, StackResources};
@@ -23,6 +23,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let given = arguments::read().map_err(ArgumentError::text)?;
     let stack = wiring::network(spawner, &given.settings, RESOURCES.take(), given.noise)?;
     spawner.spawn(answer(stack).map_err(|_| NO_ROOM)?);
+    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     cara_vehicle::info!("started");
     Ok(())
 }

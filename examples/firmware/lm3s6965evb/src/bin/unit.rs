@@ -7,7 +7,7 @@
 use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::wiring::{self, NO_ROOM};
-use cara_lm3s6965evb::{executor, start};
+use cara_lm3s6965evb::{executor, stack, start};
 use cara_vehicle::least::{self, LIMITS, LeastResources};
 use embassy_executor::Spawner;
 use embassy_net::StackResources;
@@ -29,6 +29,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let made = least::unit(stack, RESOURCES.init_with(LeastResources::new), &settings, security);
     let unit_runner = made.map_err(|_| "the settings are of no s_unit")?;
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
+    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     cara_vehicle::info!("started");
     Ok(())
 }

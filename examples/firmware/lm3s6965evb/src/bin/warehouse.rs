@@ -9,7 +9,7 @@ use core::fmt;
 use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::wiring::{self, NO_ROOM};
-use cara_lm3s6965evb::{executor, motor, start, watchdog};
+use cara_lm3s6965evb::{executor, motor, stack, start, watchdog};
 use cara_vehicle::LIMITS;
 use cara_vehicle::warehouse::{self, Agv, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
@@ -38,6 +38,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(drive(vehicle).map_err(|_| NO_ROOM)?);
+    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     watchdog::start();
     Ok(())
 }

@@ -5,11 +5,11 @@
 
 use cara_embassy::{Config, Handler, Limits, Runner as UnitRunner, Security, ServiceOptions, resources};
 use cara_lm3s6965evb::arguments;
-use cara_lm3s6965evb::ethernet::Ethernet;
-use cara_lm3s6965evb::{executor, fault, start};
+use cara_lm3s6965evb::wiring::{self, NO_ROOM};
+use cara_lm3s6965evb::{executor, start};
 use defmt_semihosting as _;
 use embassy_executor::Spawner;
-use embassy_net::{Runner, StackResources};
+use embassy_net::StackResources;
 use static_cell::{ConstStaticCell, StaticCell};
 
 /// Those of an s_unit, with room for a text of 512 characters.
@@ -22,27 +22,18 @@ const SERVICES: [&str; 2] =
 #[cortex_m_rt::entry]
 fn main() -> ! {
     let _core = start();
-    executor::run(|spawner| {
-        if let Err(text) = spawn(spawner) {
-            defmt::error!("{=str}", text);
-            semihosting::process::exit(fault::NOT_STARTED)
-        }
-    })
+    executor::run(spawn)
 }
 
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
     static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
     static MEMORY: StaticCell<Memory> = StaticCell::new();
-    const NO_ROOM: &str = "no room for a task";
     let settings = arguments::read().map_err(|_| "the arguments are no settings")?.settings;
     let manager = settings.manager.as_ref().ok_or("the arguments name no manager")?;
-    let ethernet = ETHERNET.take();
-    ethernet.start();
     // The same numbers in every run, as far as the network lets them be.
     let seed = 1;
-    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), SOCKETS.take(), seed);
+    let stack = wiring::network(spawner, &settings, SOCKETS.take(), seed)?;
     let (name, id) = (settings.identity.name(), settings.identity.id());
     let config = Config::s_unit(name, id, &manager.name, manager.id, Security::insecure(seed))
         .map_err(|_| "the settings are of no unit")?;
@@ -56,15 +47,9 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
             .map_err(|_| "no room for a service")?;
     }
     unit.publish_my_function_list().map_err(|_| "nothing is published")?;
-    spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(serve(unit_runner).map_err(|_| NO_ROOM)?);
     defmt::info!("started");
     Ok(())
-}
-
-#[embassy_executor::task]
-async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
-    runner.run().await
 }
 
 #[embassy_executor::task]
