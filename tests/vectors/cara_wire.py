@@ -708,19 +708,23 @@ def text_form(name, arguments, results, sections):
     return text + "".join(" " + word + " " + listed(variables) for word, variables in declared)
 
 
+# Attributes without a value, and their bits.
+FLAGS = {"idempotent": 4, "stop": 8, "reset": 16}
+
+
 def decode_attributes(data):
     flags, actuator, least, lease = Reader(data).fixed("BBHI")
     return {
-        "priority": PRIORITIES[flags & 3], "idempotent": flags & 4 != 0, "lease": lease or None,
-        "actuator": actuator, "stop": flags & 8 != 0, "reset": flags & 16 != 0,
+        "priority": PRIORITIES[flags & 3], "lease": lease or None, "actuator": actuator,
         "stream": least if flags & 32 else None,
+        **{name: flags & bit != 0 for name, bit in FLAGS.items()},
     }
 
 
 def encode_attributes(attributes):
     """Those that are left out have their defaults."""
     flags = PRIORITIES.index(attributes.get("priority", "normal"))
-    for name, bit in (("idempotent", 4), ("stop", 8), ("reset", 16)):
+    for name, bit in FLAGS.items():
         flags |= bit if attributes.get(name) else 0
     stream = attributes.get("stream")
     flags |= 0 if stream is None else 32

@@ -4,9 +4,9 @@ use proc_macro2::TokenStream;
 use quote::{format_ident, quote};
 use syn::parse::{Parse, ParseStream};
 use syn::spanned::Spanned;
-use syn::{Attribute, Error, Ident, Lit, LitInt, Result, Token};
+use syn::{Attribute, Error, Ident, Lit, LitInt, Meta, Result, Token};
 
-use crate::attributes::{extract, flag, set};
+use crate::attributes::{extract, set};
 
 /// How a function wants to be called.
 #[derive(Default)]
@@ -14,41 +14,55 @@ pub(crate) struct Attributes {
     pub(crate) priority: Option<Ident>,
     pub(crate) lease: Option<LitInt>,
     pub(crate) actuator: Option<Ident>,
-    pub(crate) stop: bool,
-    pub(crate) reset: bool,
-    pub(crate) idempotent: bool,
+    /// Those without a value. The core knows which there are: each sets the field of its name.
+    flags: Vec<Ident>,
 }
 
 /// The classes, as the attribute and as `Priority` name them.
 const PRIORITIES: [(&str, &str); 4] =
     [("emergency", "Emergency"), ("high", "High"), ("normal", "Normal"), ("low", "Low")];
+/// Attributes without a value that are Rust's own, or that have one where they are right.
+const NO_FLAGS: [&str; 8] = ["cold", "deprecated", "help", "inline", "must_use", "name", "returns", "track_caller"];
 /// A shorter lease cannot be kept.
 const SHORTEST_LEASE: u64 = 20;
 
 impl Attributes {
     /// Takes them away from others.
     pub(crate) fn take(attributes: &mut Vec<Attribute>) -> Result<Self> {
-        let names = ["priority", "lease", "actuator", "stop", "reset", "idempotent"];
         let mut found = Self::default();
-        for attribute in extract(attributes, &names) {
+        for attribute in extract(attributes, &["priority", "lease", "actuator"]) {
             match attribute.path().get_ident().map(ToString::to_string).unwrap_or_default().as_str() {
                 "priority" => set(&mut found.priority, read_priority(&attribute)?, &attribute)?,
                 "lease" => set(&mut found.lease, read_lease(&attribute)?, &attribute)?,
-                "actuator" => {
+                _ => {
                     let wrong = |_| Error::new(attribute.span(), "write #[actuator(drive)]: the name of what it moves");
                     set(&mut found.actuator, attribute.parse_args().map_err(wrong)?, &attribute)?;
                 }
-                "stop" => found.stop = flag(&attribute).map(|()| true)?,
-                "reset" => found.reset = flag(&attribute).map(|()| true)?,
-                _ => found.idempotent = flag(&attribute).map(|()| true)?,
             }
+        }
+        let is_flag = |attribute: &Attribute| matches!(&attribute.meta, Meta::Path(path) if path.get_ident().is_some());
+        let (flags, kept): (Vec<_>, Vec<_>) = std::mem::take(attributes)
+            .into_iter()
+            .partition(|attribute| is_flag(attribute) && !NO_FLAGS.iter().any(|name| attribute.path().is_ident(name)));
+        *attributes = kept;
+        for attribute in &flags {
+            let flag = attribute.path().get_ident().cloned();
+            if flag.as_ref().is_some_and(|flag| found.flags.contains(flag)) {
+                return Err(Error::new_spanned(attribute, "this attribute is there twice"));
+            }
+            found.flags.extend(flag);
         }
         Ok(found)
     }
 
+    /// Whether it has this one of those without a value.
+    pub(crate) fn has(&self, flag: &str) -> bool {
+        self.flags.iter().any(|found| found == flag)
+    }
+
     /// As an expression of the core's type.
     pub(crate) fn expression(&self, root: &TokenStream) -> TokenStream {
-        let Self { priority, lease, stop, reset, idempotent, .. } = self;
+        let Self { priority, lease, flags, .. } = self;
         let parts = quote!(#root::typed::parts);
         let word = priority.as_ref().map_or("normal".to_owned(), ToString::to_string);
         let class = PRIORITIES.iter().find(|(name, _)| *name == word).map_or("Normal", |(_, class)| class);
@@ -60,9 +74,7 @@ impl Attributes {
         quote!(#parts::Attributes {
             priority: #parts::Priority::#class,
             lease: #lease,
-            idempotent: #idempotent,
-            stop: #stop,
-            reset: #reset,
+            #(#flags: true,)*
             ..#parts::Attributes::NORMAL
         })
     }

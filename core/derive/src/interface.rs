@@ -184,7 +184,8 @@ impl Function {
 
     /// What holds between its attributes and the rest.
     fn check(&self, span: Span) -> Result<()> {
-        let Attributes { priority, lease, actuator, stop, reset, .. } = &self.attributes;
+        let Attributes { priority, lease, actuator, .. } = &self.attributes;
+        let (stops, resets) = (self.attributes.has("stop"), self.attributes.has("reset"));
         let emergency = priority.as_ref().filter(|priority| *priority == "emergency");
         if let (Some(priority), true) = (emergency, self.takes_state) {
             let wrong = "an emergency service waits for nothing, and so does not get the state: take no self";
@@ -200,11 +201,11 @@ impl Function {
         if let (Some(lease), None) = (lease, actuator) {
             return Err(Error::new(lease.span(), "a lease is of what moves: name it with #[actuator(drive)]"));
         }
-        if let (Some(actuator), None, false, false) = (actuator, lease, *stop, *reset) {
+        if let (Some(actuator), None, false, false) = (actuator, lease, stops, resets) {
             let wrong = "what moves an actuator has a lease, as #[lease(ms = 400)]; or say #[stop] or #[reset]";
             return Err(Error::new(actuator.span(), wrong));
         }
-        if *stop && *reset {
+        if stops && resets {
             return Err(Error::new(span, "a function stops or resets, not both"));
         }
         Ok(())

@@ -6,47 +6,91 @@ use crate::config::Priority;
 use crate::error::Error;
 use crate::time::Duration;
 
-/// How a function wants to be called.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Attributes {
-    /// Priority of calls that name none.
-    pub priority: Priority,
-    /// How long what the function starts goes on after the last call or renewal, in whole milliseconds. Renewals are at
-    /// least 5 ms apart: a lease of less than 20 ms cannot be kept.
-    pub lease: Option<Duration>,
-    /// Running it twice is as good as running it once.
-    pub idempotent: bool,
-    /// Functions of one unit with the same number, which is not 0, move the same thing. Of a unit's own functions it is
-    /// told by the leases that they share.
-    pub actuator: u8,
-    /// A call of it ends the orders of its actuator, or of all, and inhibits new ones until a function with `reset` is called.
-    pub stop: bool,
-    /// A call of it that its service answers with results lets its actuator, or all, move again.
-    pub reset: bool,
-    /// It is a stream, whose results are values that change: subscribers get them, at least so many milliseconds apart. It
-    /// has no arguments, and is not called.
-    #[cfg(feature = "streams")]
-    pub stream: Option<u16>,
+/// Declares [`Attributes`] and the table of its flags: each flag stands here once, with its bit on the wire, and derive, ports,
+/// control socket, page and command take it from [`Attributes::FLAGS`].
+macro_rules! attributes {
+    ($($name:ident = $bit:literal, $means:literal;)+) => {
+        /// How a function wants to be called.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+        pub struct Attributes {
+            /// Priority of calls that name none.
+            pub priority: Priority,
+            /// How long what the function starts goes on after the last call or renewal, in whole milliseconds. Renewals are at
+            /// least 5 ms apart: a lease of less than 20 ms cannot be kept.
+            pub lease: Option<Duration>,
+            /// Functions of one unit with the same number, which is not 0, move the same thing. A unit's own functions get it from
+            /// the leases that they share.
+            pub actuator: u8,
+            /// It is a stream, whose results are values that change: subscribers get them, at least so many milliseconds apart.
+            /// It has no arguments, and is not called.
+            #[cfg(feature = "streams")]
+            pub stream: Option<u16>,
+            $(#[doc = $means] pub $name: bool,)+
+        }
+
+        impl Attributes {
+            /// The default, for constants.
+            pub const NORMAL: Self = Self {
+                priority: Priority::Normal,
+                lease: None,
+                actuator: 0,
+                #[cfg(feature = "streams")]
+                stream: None,
+                $($name: false,)+
+            };
+            /// What a function has or has not, in the order in which it is shown.
+            pub const FLAGS: &'static [Flag] = &[$(Flag {
+                word: stringify!($name),
+                get: |attributes| attributes.$name,
+                set: |attributes, is_set| attributes.$name = is_set,
+            },)+];
+
+            const fn flags(&self) -> u8 {
+                0 $(| if self.$name { 1 << $bit } else { 0 })+
+            }
+
+            const fn set_flags(&mut self, bits: u8) {
+                $(self.$name = bits & (1 << $bit) != 0;)+
+            }
+        }
+    };
+}
+
+attributes! {
+    stop = 3, "A call of it ends the orders of its actuator, or of all, and inhibits new ones until a function with `reset` is called.";
+    reset = 4, "A call of it that its service answers with results lets its actuator, or all, move again.";
+    idempotent = 2, "Running it twice is as good as running it once.";
+}
+
+/// An attribute that a function has or has not: a field of [`Attributes`] by its name, for what reads, writes and shows them all.
+#[derive(Clone, Copy, Debug)]
+pub struct Flag {
+    word: &'static str,
+    get: fn(&Attributes) -> bool,
+    set: fn(&mut Attributes, bool),
+}
+
+impl Flag {
+    /// The field's name, which is also its attribute in an interface and its key in JSON.
+    pub const fn word(&self) -> &'static str {
+        self.word
+    }
+
+    /// Whether it is set.
+    pub fn is_set(&self, attributes: &Attributes) -> bool {
+        (self.get)(attributes)
+    }
+
+    /// Sets it, or takes it back.
+    pub fn set(&self, attributes: &mut Attributes, is_set: bool) {
+        (self.set)(attributes, is_set);
+    }
 }
 
 impl Attributes {
-    /// The default, for constants.
-    pub const NORMAL: Self = Self {
-        priority: Priority::Normal,
-        lease: None,
-        idempotent: false,
-        actuator: 0,
-        stop: false,
-        reset: false,
-        #[cfg(feature = "streams")]
-        stream: None,
-    };
     /// Bytes of the encoded form.
     pub const WIRE_BYTES: usize = 8;
     const PRIORITY: u8 = 0b11;
-    const IDEMPOTENT: u8 = 1 << 2;
-    const STOP: u8 = 1 << 3;
-    const RESET: u8 = 1 << 4;
     #[cfg(feature = "streams")]
     const STREAM: u8 = 1 << 5;
 
@@ -56,18 +100,14 @@ impl Attributes {
         self.stop || class == Priority::Emergency && self.priority == Priority::Emergency
     }
 
-    /// Bits 0 and 1: priority; bits 2 to 5: idempotent, stop, reset, stream; actuator, u8; of a stream the least interval in
+    /// Bits 0 and 1: priority; bits 2 to 4: the flags; bit 5: a stream; actuator, u8; of a stream the least interval in
     /// milliseconds, u16 little-endian, otherwise zero; the lease in milliseconds, u32 little-endian, 0 for none. A lease is rounded down, but never to none.
     pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
-        let bit = |set, bit| if set { bit } else { 0 };
-        let flags = self.priority as u8
-            | bit(self.idempotent, Self::IDEMPOTENT)
-            | bit(self.stop, Self::STOP)
-            | bit(self.reset, Self::RESET);
+        let flags = self.priority as u8 | self.flags();
         #[cfg(not(feature = "streams"))]
         let [low, high] = [0; 2];
         #[cfg(feature = "streams")]
-        let flags = flags | bit(self.stream.is_some(), Self::STREAM);
+        let flags = flags | if self.stream.is_some() { Self::STREAM } else { 0 };
         #[cfg(feature = "streams")]
         let [low, high] = self.stream.unwrap_or(0).to_le_bytes();
         let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
@@ -82,16 +122,16 @@ impl Attributes {
         #[cfg(not(feature = "streams"))]
         let _ = (low, high);
         let lease = u32::from_le_bytes([a, b, c, d]);
-        Ok(Self {
+        let mut attributes = Self {
             priority: Priority::from_wire(flags & Self::PRIORITY).ok_or(Error::Malformed)?,
             lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
-            idempotent: flags & Self::IDEMPOTENT != 0,
             actuator,
-            stop: flags & Self::STOP != 0,
-            reset: flags & Self::RESET != 0,
             #[cfg(feature = "streams")]
             stream: (flags & Self::STREAM != 0).then_some(u16::from_le_bytes([low, high])),
-        })
+            ..Self::NORMAL
+        };
+        attributes.set_flags(flags);
+        Ok(attributes)
     }
 }
 
@@ -111,8 +151,7 @@ impl fmt::Display for Attributes {
         if self.actuator != 0 {
             write!(f, ", actuator {}", self.actuator)?;
         }
-        let words = [(self.stop, ", stop"), (self.reset, ", reset"), (self.idempotent, ", idempotent")];
-        words.iter().filter(|(set, _)| *set).try_for_each(|(_, word)| f.write_str(word))
+        Self::FLAGS.iter().filter(|flag| flag.is_set(self)).try_for_each(|flag| write!(f, ", {}", flag.word()))
     }
 }
 
@@ -130,25 +169,32 @@ mod tests {
 
     use super::*;
 
+    /// The bits of the first byte that mean something.
+    fn every_bit() -> u8 {
+        let bit = |flag: &Flag| {
+            let mut attributes = Attributes { priority: Priority::Emergency, ..Attributes::NORMAL };
+            flag.set(&mut attributes, true);
+            attributes.encode()[0]
+        };
+        Attributes::FLAGS.iter().map(bit).fold(0b10_0011, |bits, bit| bits | bit)
+    }
+
     #[test]
     fn attributes_travel() {
         let usual = Attributes::default();
         assert_eq!(usual.encode(), [2, 0, 0, 0, 0, 0, 0, 0]);
-        let all = Attributes {
+        let leased = Attributes {
             priority: Priority::Emergency,
             lease: Some(Duration::from_millis(0x1234)),
-            idempotent: true,
             actuator: 7,
-            stop: true,
-            reset: true,
-            #[cfg(feature = "streams")]
-            stream: usual.stream,
+            ..usual
         };
+        let all = Attributes { idempotent: true, stop: true, reset: true, ..leased };
         assert_eq!(all.encode(), [0x1C, 7, 0, 0, 0x34, 0x12, 0, 0]);
         assert_eq!(Attributes::decode(&all.encode()), Ok(all));
         let short = Attributes { lease: Some(Duration::from_micros(1)), ..usual };
         assert_eq!(Attributes::decode(&short.encode()).unwrap().lease, Some(Duration::from_millis(1)));
-        let later = [0x1C | 0xC0, 7, 9, 9, 0x34, 0x12, 0, 0, 7, 7];
+        let later = [all.encode()[0] | !every_bit(), 7, 9, 9, 0x34, 0x12, 0, 0, 7, 7];
         assert_eq!(Attributes::decode(&later), Ok(all), "a later version says more");
         assert_eq!(Attributes::decode(&later[..7]), Err(Error::Malformed));
     }
@@ -160,6 +206,22 @@ mod tests {
         assert_eq!(pose.encode(), [0x23, 0, 1, 2, 0, 0, 0, 0]);
         assert_eq!(Attributes::decode(&pose.encode()), Ok(pose));
         assert_eq!(pose.to_string(), "low, stream every 513 ms at most");
+    }
+
+    #[test]
+    fn each_flag_has_a_bit_of_its_own_and_travels() {
+        let mut bits = 0;
+        for flag in Attributes::FLAGS {
+            let mut attributes = Attributes { priority: Priority::Emergency, ..Attributes::NORMAL };
+            flag.set(&mut attributes, true);
+            let [encoded, ..] = attributes.encode();
+            assert!(encoded.is_power_of_two() && encoded & (bits | 0b0010_0011) == 0, "{}", flag.word());
+            bits |= encoded;
+            assert_eq!(Attributes::decode(&attributes.encode()), Ok(attributes));
+            assert_eq!(attributes.to_string(), std::format!("emergency, {}", flag.word()));
+            flag.set(&mut attributes, false);
+            assert!(!flag.is_set(&attributes));
+        }
     }
 
     #[test]

@@ -10,7 +10,7 @@ use core::fmt;
 use crate::config::{SIGNATURE_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
-pub use super::attributes::Attributes;
+pub use super::attributes::{Attributes, Flag};
 use super::help;
 use super::name::check_name;
 use super::nested;

@@ -590,8 +590,9 @@ pub struct FunctionInfo {
     pub name: String,
     /// Its text form, as `go_to(position: int[2]) -> (position: int[2])`.
     pub signature: String,
-    /// How it wants to be called: `priority`, `lease_us` (or null), `idempotent`.
-    #[serde(flatten, with = "super::attributes::Form")]
+    /// How it wants to be called: `priority`, `lease_us` (or null), `actuator`, a key for each of [`Attributes::FLAGS`], and
+    /// `stream_ms` of a stream.
+    #[serde(flatten, with = "super::attributes")]
     pub attributes: Attributes,
     /// What it does, in a line; absent where the node says nothing.
     #[serde(default, skip_serializing_if = "String::is_empty")]

@@ -142,6 +142,10 @@ entry!(attributes, {
     keep((Attributes::decode(unknown_slice()), unknown::<Attributes>().encode()));
     show(*unknown::<Attributes>());
     keep(unknown::<Attributes>().is_urgent(*unknown()));
+    for flag in Attributes::FLAGS {
+        flag.set(unknown(), !flag.is_set(unknown()));
+        keep(flag.word());
+    }
 });
 
 entry!(own_list, {

@@ -239,15 +239,16 @@ fn spec(spec: VariableSpec<'_>) -> Value {
 }
 
 fn attributes(attributes: &Attributes) -> Value {
-    json!({
+    let mut shown = json!({
         "priority": attributes.priority.word(),
-        "idempotent": attributes.idempotent,
         "actuator": attributes.actuator,
-        "stop": attributes.stop,
-        "reset": attributes.reset,
         "lease": attributes.lease.map(|lease| lease.as_millis()),
         "stream": attributes.stream,
-    })
+    });
+    for flag in Attributes::FLAGS {
+        shown[flag.word()] = flag.is_set(attributes).into();
+    }
+    shown
 }
 
 fn block(context: &Context, bytes: &[u8]) -> Option<Value> {

@@ -175,11 +175,18 @@ fn attributes() -> Vec<Vector> {
     let drive = Attributes { actuator: 3, idempotent: false, ..leased };
     let stop = Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::default() };
     let reset = Attributes { reset: true, actuator: 3, ..Attributes::default() };
-    let json = |priority: &str, idempotent: bool, lease: Option<u32>, actuator: u8, stop: bool, reset: bool| {
-        json!({
-            "priority": priority, "idempotent": idempotent, "lease": lease,
-            "actuator": actuator, "stop": stop, "reset": reset, "stream": null,
-        })
+    // The bits that mean nothing yet.
+    let later = Attributes::FLAGS.iter().fold(0b1101_1100, |bits, flag| {
+        let mut attributes = Attributes { priority: Priority::Emergency, ..Attributes::NORMAL };
+        flag.set(&mut attributes, true);
+        bits & !attributes.encode()[0]
+    });
+    let json = |priority: &str, flags: &[&str], lease: Option<u32>, actuator: u8, stream: Option<u16>| {
+        let mut shown = json!({ "priority": priority, "lease": lease, "actuator": actuator, "stream": stream });
+        for flag in Attributes::FLAGS {
+            shown[flag.word()] = flags.contains(&flag.word()).into();
+        }
+        shown
     };
     let made = |names, attributes: &Attributes, value: &Value| {
         Vector::new(names, Kind::Attributes, Context::default(), &attributes.encode(), value)
@@ -190,32 +197,29 @@ fn attributes() -> Vec<Vector> {
             Kind::Attributes,
             Context::default(),
             &Attributes::default().encode(),
-            &json("normal", false, None, 0, false, false),
+            &json("normal", &[], None, 0, None),
         ),
         Vector::new(
             ("attributes_leased", "high priority, idempotent, a lease of half a second"),
             Kind::Attributes,
             Context::default(),
             &leased.encode(),
-            &json("high", true, Some(500), 0, false, false),
+            &json("high", &["idempotent"], Some(500), 0, None),
         ),
-        made(("attributes_actuator", "it moves actuator 3"), &drive, &json("high", false, Some(500), 3, false, false)),
-        made(("attributes_stop", "it stops all"), &stop, &json("emergency", true, None, 0, true, false)),
-        made(("attributes_reset", "it resets actuator 3"), &reset, &json("normal", false, None, 3, false, true)),
+        made(("attributes_actuator", "it moves actuator 3"), &drive, &json("high", &[], Some(500), 3, None)),
+        made(("attributes_stop", "it stops all"), &stop, &json("emergency", &["idempotent", "stop"], None, 0, None)),
+        made(("attributes_reset", "it resets actuator 3"), &reset, &json("normal", &["reset"], None, 3, None)),
         made(
             ("attributes_stream", "a stream, whose values come at least 20 ms apart"),
             &Attributes { priority: Priority::Low, stream: Some(20), ..Attributes::default() },
-            &json!({
-                "priority": "low", "idempotent": false, "lease": null, "actuator": 0, "stop": false, "reset": false,
-                "stream": 20,
-            }),
+            &json("low", &[], None, 0, Some(20)),
         ),
         Vector::new(
             ("attributes_of_a_later_version", "other bits, and what follows, are passed over"),
             Kind::Attributes,
             Context::default(),
-            &[0xC0 | 5, 0, 9, 9, 0xF4, 1, 0, 0, 7, 7],
-            &json("high", true, Some(500), 0, false, false),
+            &[leased.encode()[0] | later, 0, 9, 9, 0xF4, 1, 0, 0, 7, 7],
+            &json("high", &["idempotent"], Some(500), 0, None),
         )
         .lossy(),
         Vector::new(

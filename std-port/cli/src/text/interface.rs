@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::{self, Write};
 
 use cara_std::control::protocol::FunctionInfo;
-use cara_std::{Definition, Priority, Type, VariableSpec, VariableSpecs, is_hidden};
+use cara_std::{Attributes, Definition, Priority, Type, VariableSpec, VariableSpecs, is_hidden};
 
 /// Units of variables, by their names.
 type Units = BTreeMap<String, String>;
@@ -121,9 +121,8 @@ fn method(
     if let Some(lease) = attributes.lease {
         writeln!(source, "    #[lease(ms = {})]", lease.as_millis())?;
     }
-    let flags = [(attributes.stop, "stop"), (attributes.reset, "reset"), (attributes.idempotent, "idempotent")];
-    for (_, flag) in flags.iter().filter(|(is_set, _)| *is_set) {
-        writeln!(source, "    #[{flag}]")?;
+    for flag in Attributes::FLAGS.iter().filter(|flag| flag.is_set(attributes)) {
+        writeln!(source, "    #[{}]", flag.word())?;
     }
     let results: Vec<VariableSpec<'_>> = signature.results().collect();
     if !results.is_empty() {

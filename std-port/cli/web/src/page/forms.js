@@ -45,10 +45,11 @@ export async function refresh({ key, node }) {
   $("functions").replaceChildren(...(list.length ? list.map((info) => form(key, info)) : [make("p", { className: "faint" }, "It has published none to this unit.")]));
 }
 
+// How attributes without a value are shown; one that is not here is shown by its name.
+const FLAGS = { stop: ["stops", "bad"], reset: ["resets", ""] };
+
 function badges(info) {
-  const all = [];
-  if (info.stop) all.push(["stops", "bad"]);
-  if (info.reset) all.push(["resets", ""]);
+  const all = Object.keys(info).filter((key) => info[key] === true).map((key) => FLAGS[key] ?? [key, ""]);
   if (info.lease_us) all.push([`lease ${span(info.lease_us / 1000)}`, ""]);
   if (info.priority && info.priority !== "normal") all.push([info.priority, ""]);
   return all.map(([word, kind]) => make("span", { className: `badge ${kind}` }, word));
