@@ -16,9 +16,9 @@ use embassy_time::Timer;
 
 use crate::details;
 use crate::handle::Handle;
+use crate::link::InFlight;
 use crate::machine::Machine;
 use crate::peer::Peer;
-use crate::replies::InFlight;
 use crate::time::{now, timer};
 
 /// How long a request waits for room at a time.

@@ -14,10 +14,12 @@ use cara_core::services::call::{Callee, Detail, Outgoing};
 use crate::calls::CallError;
 use crate::handle::Handle;
 use crate::handler::Served;
-use crate::machine::{LinkContext, LinkSession, Machine};
+use crate::link::InFlight;
+use crate::machine::Machine;
 use crate::peer::Peer;
-use crate::replies::InFlight;
-use crate::taken::{PAUSE, Running, TakenCall};
+use crate::port::{LinkContext, LinkSession};
+use crate::taken::{PAUSE, TakenCall};
+use crate::task_slots::Running;
 use crate::time::{now, timer};
 
 impl<T> Served<T> {

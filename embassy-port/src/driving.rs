@@ -17,19 +17,20 @@ use cara_core::host::mailman::LinkId;
 use cara_core::host::port::Port as _;
 use cara_core::services::Context;
 use cara_core::services::lease::Lease;
-use cara_core::services::session::{Event, Incoming};
+use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
 use core::task::{Context as TaskContext, Poll};
 
 use crate::event::{Name, UnitEvent};
 use crate::line::{Progress, address_of};
-use crate::machine::{Board, LinkSession, Machine};
+use crate::machine::{Machine, Started};
+use crate::port::{Board, LinkSession};
+#[cfg(feature = "streams")]
+use crate::readings::came;
 use crate::replies::ended;
 #[cfg(feature = "details")]
 use crate::replies::reported;
-#[cfg(feature = "streams")]
-use crate::subscriptions::came;
 use crate::time::now;
 
 /// How long a dialling peer may take for its hello, and for its proof, while no other one could dial, or while another
@@ -47,14 +48,6 @@ pub(crate) enum Job {
     Safe(Slot),
     /// Run the hook for a lost peer.
     Lost,
-}
-
-/// The call that the runner is to run next, if there is one; its arguments are in the runner's parameters.
-// A wide tag, and nothing narrow beside the call: it is then moved in words, and not byte by byte.
-#[repr(u32)]
-pub(crate) enum Started {
-    Nothing,
-    Call(Incoming),
 }
 
 impl<T> Machine<T> {

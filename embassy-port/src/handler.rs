@@ -34,7 +34,7 @@ pub struct Served<T: 'static> {
     pub(crate) failure: core::cell::Cell<Option<cara_core::distribution::failure::Failure>>,
     /// The call, unless the handler has taken it.
     #[cfg(feature = "details")]
-    pub(crate) running: core::cell::Cell<Option<crate::taken::Running>>,
+    pub(crate) running: core::cell::Cell<Option<crate::task_slots::Running>>,
 }
 
 impl<T> fmt::Debug for Served<T> {
@@ -275,7 +275,7 @@ pub(crate) struct Listed<T: 'static> {
     pub(crate) then: Option<&'static Hook<T>>,
     /// Its newest value, of a stream.
     #[cfg(feature = "streams")]
-    pub(crate) stream: Option<&'static dyn crate::streams::Cell>,
+    pub(crate) stream: Option<&'static dyn crate::stream_cell::Cell>,
 }
 
 impl<T> Clone for Listed<T> {

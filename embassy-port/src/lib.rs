@@ -94,14 +94,20 @@ mod interfaces;
 mod lease;
 mod limits;
 mod line;
+mod link;
 mod machine;
 mod mail;
 mod peer;
+mod port;
 mod publishing;
+#[cfg(feature = "streams")]
+mod readings;
 mod replies;
 mod resources;
 mod runner;
 mod security;
+#[cfg(feature = "streams")]
+mod stream_cell;
 #[cfg(feature = "streams")]
 mod streams;
 #[cfg(feature = "streams")]
@@ -109,7 +115,9 @@ mod subscriptions;
 mod taken;
 #[cfg(feature = "details")]
 mod taking;
+mod task_slots;
 mod time;
+mod waiting;
 
 pub use calls::{CallError, Hold};
 #[cfg(feature = "details")]
@@ -129,13 +137,17 @@ pub use interfaces::Actuator;
 pub use lease::LeaseWatch;
 pub use limits::Limits;
 pub use peer::{Peer, TheirFunctionList};
+#[cfg(feature = "streams")]
+pub use readings::{SubscriptionCell, SubscriptionInner};
 pub use resources::{Memory, Resources, new};
 pub use runner::Runner;
 pub use security::Security;
 #[cfg(feature = "streams")]
-pub use streams::{Publisher, Stream, StreamCell};
+pub use stream_cell::StreamCell;
 #[cfg(feature = "streams")]
-pub use subscriptions::{Subscription, SubscriptionCell, SubscriptionInner};
+pub use streams::{Publisher, Stream};
+#[cfg(feature = "streams")]
+pub use subscriptions::Subscription;
 pub use taken::TakenCall;
 #[cfg(feature = "details")]
 pub use taking::{LongCall, TypedTaken};

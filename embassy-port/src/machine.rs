@@ -1,7 +1,6 @@
 //! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
 
 use cara_core::config::LEASES;
-use cara_core::counters::Counters;
 use cara_core::distribution::claim::{Claim, StoredClaim, TaggedClaim};
 use cara_core::distribution::connection_handler::Command;
 use cara_core::distribution::function_list::FunctionList;
@@ -9,7 +8,7 @@ use cara_core::distribution::identity::{Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
 use cara_core::services::hub::Hub;
-use cara_core::services::session::{Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{Incoming, Session, SessionConfig};
 use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
@@ -20,35 +19,20 @@ use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
 use crate::config::Table;
-use crate::driving::Started;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::limits::Limits;
 use crate::line::Line;
+use crate::link::{InFlight, Link};
 use crate::mail::EmbassyMailman;
-use crate::replies::{InFlight, ReplyBox, Waiter};
-use crate::security::{LinkCipher, Proof};
-use crate::taken::TaskSlot;
+use crate::port::{Board, LinkContext, LinkCounters, LinkSession};
+use crate::replies::ReplyBox;
+use crate::security::Proof;
+use crate::task_slots::TaskSlot;
 use crate::time::now;
 
-/// Emergencies that tasks may wait for on a link whose calls are all in flight.
-pub(crate) const EMERGENCIES: usize = 2;
 /// Tasks that can wait for the same thing without waking each other.
 const TASKS_WAITING: usize = 4;
-
-/// Boards with embassy-net, as the core's port.
-pub(crate) enum Board {}
-
-impl Port for Board {
-    type Storage = Lent;
-    type Cipher = LinkCipher;
-    type Endpoint = SocketAddrV4;
-    const MANAGES: bool = cfg!(feature = "manager");
-}
-
-pub(crate) type LinkSession = Session<Board>;
-pub(crate) type LinkContext<'c> = Context<'c, Board>;
-pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 
 /// What a handle points to.
 pub(crate) struct Shared<T: 'static> {
@@ -89,44 +73,12 @@ impl<T> Unwanted<T> {
     }
 }
 
-/// One link: the session while it is open, its memory while it is not.
-pub(crate) struct Link {
-    pub(crate) session: Option<LinkSession>,
-    pub(crate) storage: Option<SessionStorage<Lent>>,
-    /// Tells this link from an earlier one with the same index.
-    pub(crate) serial: u32,
-    /// When it was opened.
-    pub(crate) since: Instant,
-    pub(crate) waiters: &'static mut [Option<Waiter>],
-    /// Places of emergencies, where the others are taken.
-    pub(crate) urgent: [Option<Waiter>; EMERGENCIES],
-    /// The serial of the list that was last sent to the peer, for tasks that wait until it is read.
-    pub(crate) reported: Option<u32>,
-}
-
-impl Link {
-    pub(crate) fn new(storage: SessionStorage<Lent>, waiters: &'static mut [Option<Waiter>]) -> Self {
-        let urgent = [const { None }; EMERGENCIES];
-        Self {
-            session: None,
-            storage: Some(storage),
-            serial: 0,
-            since: Instant::START,
-            waiters,
-            urgent,
-            reported: None,
-        }
-    }
-
-    /// The peer, from joining to leaving.
-    pub(crate) fn peer(&self) -> Option<&Identity> {
-        self.session.as_ref().and_then(LinkSession::peer)
-    }
-
-    /// Whether it leads to a peer that requests can be made of.
-    pub(crate) fn is_live(&self) -> bool {
-        self.session.as_ref().is_some_and(LinkSession::is_live)
-    }
+/// The call that the runner is to run next, if there is one; its arguments are in the runner's parameters.
+// A wide tag, and nothing narrow beside the call: it is then moved in words, and not byte by byte.
+#[repr(u32)]
+pub(crate) enum Started {
+    Nothing,
+    Call(Incoming),
 }
 
 /// What the unit is made of.
@@ -148,7 +100,7 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) mail: EmbassyMailman,
     pub(crate) reply: ReplyBox,
     #[cfg(feature = "streams")]
-    pub(crate) readings: crate::subscriptions::Readings,
+    pub(crate) readings: crate::readings::Readings,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
     pub(crate) started: Started,

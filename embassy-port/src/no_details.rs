@@ -8,9 +8,9 @@ use cara_core::services::call::{Callee, Outgoing};
 
 use crate::calls::CallError;
 use crate::handle::Handle;
+use crate::link::InFlight;
 use crate::machine::Machine;
 use crate::peer::Peer;
-use crate::replies::InFlight;
 
 /// What is known of a failed call.
 pub(crate) type Kept = ();

@@ -3,7 +3,8 @@
 use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;
 
-use crate::machine::{LinkContext, LinkSession, Machine};
+use crate::machine::Machine;
+use crate::port::{LinkContext, LinkSession};
 
 impl<T> Machine<T> {
     /// Does something on each link; one that is not live yet may have told its list.

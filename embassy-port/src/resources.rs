@@ -24,17 +24,20 @@ use embassy_net::Stack;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 
 use crate::config::Config;
-use crate::driving::Started;
+
 use crate::event::{Events, UnitEvent};
 use crate::handle::Handle;
 use crate::handler::Listed;
 use crate::limits::Limits;
 use crate::line::Line;
-use crate::machine::{Board, Link, Machine, Shared, Unwanted, Wakers};
+use crate::link::Link;
+use crate::link::Waiter;
+use crate::machine::{Machine, Shared, Started, Unwanted, Wakers};
 use crate::mail::EmbassyMailman;
-use crate::replies::{ReplyBox, Waiter};
+use crate::port::Board;
+use crate::replies::ReplyBox;
 use crate::runner::Runner;
-use crate::taken::TaskSlot;
+use crate::task_slots::TaskSlot;
 use crate::time::now;
 
 /// Nodes that are remembered for each link: the one that is connected, and one that was.
@@ -286,7 +289,7 @@ impl<
                 },
                 reply: ReplyBox::new(self.reply.write([0; REPLY])),
                 #[cfg(feature = "streams")]
-                readings: crate::subscriptions::Readings::NONE,
+                readings: crate::readings::Readings::NONE,
                 tasks: self.tasks.write(
                     self.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized()))),
                 ),

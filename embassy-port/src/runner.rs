@@ -11,12 +11,14 @@ use cara_core::error::Error;
 use cara_core::services::session::Incoming;
 use cara_core::time::{Duration, Instant};
 
-use crate::driving::{Job, Started};
+use crate::driving::Job;
 use crate::handle::Handle;
 use crate::handler::{Hook, Listed, Served};
 use crate::lease::LeaseWatch;
-use crate::machine::{LinkSession, Machine, Shared};
-use crate::taken::Running;
+use crate::machine::Started;
+use crate::machine::{Machine, Shared};
+use crate::port::LinkSession;
+use crate::task_slots::Running;
 use crate::time::{now, timer};
 
 /// Steps in a row before other tasks get their turn.

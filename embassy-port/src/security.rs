@@ -50,7 +50,7 @@ mod secured {
     use cara_secure::link::{Cipher, Credentials};
     use cara_secure::random::Random;
 
-    use crate::machine::Board;
+    use crate::port::Board;
 
     pub(crate) type LinkCipher = Cipher;
 
@@ -165,7 +165,7 @@ mod plain {
     use cara_core::host::secure::Plain;
     use cara_core::services::Keys;
 
-    use crate::machine::Board;
+    use crate::port::Board;
 
     pub(crate) type LinkCipher = Plain;
 

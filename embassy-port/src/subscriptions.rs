@@ -1,144 +1,22 @@
-//! Streams of a node, as a board reads them: the newest value of each, with its age, in memory that the application lends.
+//! Streams of a node, as a board reads them: the newest value of each, with its age.
 
-use core::cell::{Cell, RefCell};
 use core::fmt;
 use core::future::poll_fn;
 use core::task::Poll;
 
-use cara_core::distribution::identity::Identity;
-use cara_core::distribution::parameters::{ParametersInner, ParametersView};
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
-use cara_core::services::session::{Event, ReplyBlock};
-use cara_core::time::{Duration, Instant};
+use cara_core::services::session::Event;
+use cara_core::time::Duration;
 use cara_core::typed::Variables;
-use embassy_sync::waitqueue::WakerRegistration;
 
 use crate::event::Name;
 use crate::handle::Handle;
-use crate::machine::{Link, Machine};
+use crate::link::Link;
+use crate::machine::Machine;
 use crate::peer::Peer;
+use crate::readings::{Reading, SubscriptionCell, Wanted};
 use crate::time::now;
-
-/// Room for the newest value of a stream of a node: `BYTES` of its variables, with their names. One that is longer is refused
-/// with [`Error::Full`]. Each subscription has one of its own.
-pub type SubscriptionCell<const BYTES: usize> = SubscriptionInner<[u8; BYTES]>;
-
-/// [`SubscriptionCell`] of any size; not named directly.
-pub struct SubscriptionInner<B: ?Sized> {
-    /// The unit's other subscriptions.
-    next: Cell<Option<&'static Reading>>,
-    state: RefCell<State>,
-    values: RefCell<ParametersInner<B>>,
-}
-
-/// The cell of a subscription, whatever its size.
-pub(crate) type Reading = SubscriptionInner<[u8]>;
-
-struct State {
-    /// What it is for; `None` while it is free.
-    wanted: Option<Wanted>,
-    /// Values that have come.
-    count: u32,
-    /// The newest one is here.
-    is_there: bool,
-    arrived: Instant,
-    /// On arrival.
-    age: Duration,
-    refused: Option<Error>,
-    task: WakerRegistration,
-}
-
-struct Wanted {
-    peer: Identity,
-    stream: Name,
-    interval: Duration,
-}
-
-impl<const BYTES: usize> SubscriptionInner<[u8; BYTES]> {
-    /// Free, and without a value.
-    pub const fn new() -> Self {
-        let state = State {
-            wanted: None,
-            count: 0,
-            is_there: false,
-            arrived: Instant::START,
-            age: Duration::ZERO,
-            refused: None,
-            task: WakerRegistration::new(),
-        };
-        Self { next: Cell::new(None), state: RefCell::new(state), values: RefCell::new(ParametersInner::sized()) }
-    }
-}
-
-impl<const BYTES: usize> Default for SubscriptionInner<[u8; BYTES]> {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
-impl<B: ?Sized> fmt::Debug for SubscriptionInner<B> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("SubscriptionCell").finish_non_exhaustive()
-    }
-}
-
-impl Reading {
-    fn is_of(&self, peer: &Identity, stream: &str) -> bool {
-        self.state.borrow().wanted.as_ref().is_some_and(|wanted| wanted.peer == *peer && wanted.stream == stream)
-    }
-
-    fn receive(&self, now: Instant, age: Duration, block: &ReplyBlock<'_>) {
-        let mut values = self.values.borrow_mut();
-        // Each time: the node may have published the stream with other variables.
-        let outcome = values.lay_out(block.signature()).and_then(|()| block.read_into(&mut values));
-        let state = &mut *self.state.borrow_mut();
-        (state.refused, state.is_there) = (outcome.err(), outcome.is_ok());
-        (state.arrived, state.age) = (now, age);
-        state.count = state.count.wrapping_add(1);
-        state.task.wake();
-    }
-
-    fn was_answered(&self, answer: Option<Error>) {
-        let mut state = self.state.borrow_mut();
-        state.refused = answer;
-        state.task.wake();
-    }
-}
-
-/// The subscriptions of a unit: a list of the cells.
-pub(crate) struct Readings(Option<&'static Reading>);
-
-impl Readings {
-    pub(crate) const NONE: Self = Self(None);
-
-    fn iter(&self) -> impl Iterator<Item = &'static Reading> + use<> {
-        core::iter::successors(self.0, |reading| reading.next.get())
-    }
-
-    fn of(&self, peer: &Identity, stream: &str) -> impl Iterator<Item = &'static Reading> {
-        self.iter().filter(move |reading| reading.is_of(peer, stream))
-    }
-
-    fn add(&mut self, reading: &'static Reading) {
-        reading.next.set(self.0.replace(reading));
-    }
-
-    fn remove(&mut self, reading: &'static Reading) {
-        let next = reading.next.take();
-        match self.iter().find(|other| other.next.get().is_some_and(|next| core::ptr::eq(next, reading))) {
-            Some(before) => before.next.set(next),
-            None => self.0 = next,
-        }
-    }
-}
-
-/// A value of a stream has come, if that is what happened.
-pub(crate) fn came(readings: &Readings, link: &Link, now: Instant, event: &Event, lent: &[u8]) {
-    let Event::Sample(sample) = event else { return };
-    let Some(session) = &link.session else { return };
-    let Some((peer, block)) = session.peer().zip(session.results(&sample.values, lent).ok()) else { return };
-    readings.of(peer, block.signature().name()).for_each(|reading| reading.receive(now, sample.age, &block));
-}
 
 impl<T> Machine<T> {
     /// What a node says of this unit's subscriptions.

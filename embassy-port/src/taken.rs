@@ -1,93 +1,22 @@
-//! Calls that a task takes: they wait here until it does, and answers wait here that could not be kept.
+//! Calls that a task takes.
 
 use cara_core::config::Priority;
-use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
+use cara_core::services::Context;
 use cara_core::services::session::Incoming;
-use cara_core::services::{Context, Ticket};
 use cara_core::time::{Duration, Instant};
 use core::fmt;
 
 use crate::handle::Handle;
 use crate::lease::LeaseWatch;
-use crate::machine::{LinkContext, LinkSession, Machine};
+use crate::machine::Machine;
+use crate::task_slots::{Holds, Running, TaskSlot, answer};
 use crate::time::{now, timer};
 
 /// How long an answer waits for room at a time.
 pub(crate) const PAUSE: Duration = Duration::from_millis(5);
-
-/// Names a call of a peer that runs here.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Running {
-    pub(crate) link: u16,
-    pub(crate) serial: u32,
-    pub(crate) ticket: Ticket,
-    /// The caller waits for the answer until then.
-    pub(crate) deadline: Instant,
-}
-
-/// Room for one call.
-pub(crate) struct TaskSlot {
-    parameters: &'static mut ParametersView,
-    holds: Holds,
-}
-
-enum Holds {
-    Nothing,
-    /// Its arguments wait for a task.
-    Call {
-        running: Running,
-        call: Incoming,
-        caller: Identity,
-    },
-    /// Its results wait for room on the link.
-    Answer {
-        running: Running,
-        result: Result<(), Error>,
-    },
-}
-
-impl TaskSlot {
-    pub(crate) fn new(parameters: &'static mut ParametersView) -> Self {
-        Self { parameters, holds: Holds::Nothing }
-    }
-
-    fn is_free(&self) -> bool {
-        matches!(self.holds, Holds::Nothing)
-    }
-
-    fn running(&self) -> Option<Running> {
-        match self.holds {
-            Holds::Nothing => None,
-            Holds::Call { running, .. } | Holds::Answer { running, .. } => Some(running),
-        }
-    }
-
-    fn function(&self) -> Option<Slot> {
-        match &self.holds {
-            Holds::Call { call, .. } => Some(call.slot),
-            _ => None,
-        }
-    }
-}
-
-/// Answers a call, or gives up once its deadline has passed; `false` if the answer cannot be queued now.
-#[inline(never)]
-fn answer(
-    session: &mut LinkSession,
-    cx: &mut LinkContext<'_>,
-    running: &Running,
-    result: Result<&ParametersView, Error>,
-) -> bool {
-    let kept = session.answer(cx, running.ticket, result).is_ok();
-    let late = cx.now >= running.deadline;
-    if !kept && late {
-        session.drop_answer(running.ticket);
-    }
-    kept || late
-}
 
 impl<T> Machine<T> {
     fn free_slot(&mut self) -> Option<&mut TaskSlot> {

@@ -1,0 +1,25 @@
+//! Boards with embassy-net, as the core sees them.
+
+use core::net::SocketAddrV4;
+
+use cara_core::counters::Counters;
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::session::Session;
+use cara_core::services::{Context, Port};
+use cara_core::storage::Lent;
+
+use crate::security::LinkCipher;
+
+/// Boards with embassy-net, as the core's port.
+pub(crate) enum Board {}
+
+impl Port for Board {
+    type Storage = Lent;
+    type Cipher = LinkCipher;
+    type Endpoint = SocketAddrV4;
+    const MANAGES: bool = cfg!(feature = "manager");
+}
+
+pub(crate) type LinkSession = Session<Board>;
+pub(crate) type LinkContext<'c> = Context<'c, Board>;
+pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
