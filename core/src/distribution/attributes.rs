@@ -15,11 +15,11 @@ macro_rules! attributes {
         pub struct Attributes {
             /// Priority of calls that name none.
             pub priority: Priority,
-            /// How long what the function starts goes on after the last call or renewal, in whole milliseconds. Renewals are at
-            /// least 5 ms apart: a lease of less than 20 ms cannot be kept.
+            /// How long what a call has started may go on after the call, or its last renewal, was made, in whole milliseconds.
+            /// Renewals are at least 5 ms apart: a lease of less than 20 ms cannot be kept.
             pub lease: Option<Duration>,
-            /// Functions of one unit with the same number, which is not 0, move the same thing. A unit's own functions get it from
-            /// the leases that they share.
+            /// Functions of one unit with the same number move the same thing; 0 is none. A unit numbers its own functions when it
+            /// publishes them: those that share a lease get one number.
             pub actuator: u8,
             /// It is a stream, whose results are values that change: subscribers get them, at least so many milliseconds apart.
             /// It has no arguments, and is not called.
@@ -57,7 +57,7 @@ macro_rules! attributes {
 }
 
 attributes! {
-    stop = 3, "A call of it ends the orders of its actuator, or of all, and inhibits new ones until a function with `reset` is called.";
+    stop = 3, "A call of it ends the orders of its actuator, or of all, and inhibits new ones until a function with `reset` has answered with results.";
     reset = 4, "A call of it that its service answers with results lets its actuator, or all, move again.";
     idempotent = 2, "Running it twice is as good as running it once.";
 }
@@ -94,14 +94,14 @@ impl Attributes {
     #[cfg(feature = "streams")]
     const STREAM: u8 = 1 << 5;
 
-    /// Whether a call in this class has a place where other calls find none: it stops, or is an emergency of an emergency
-    /// service.
+    /// Whether a call in this class may use a place that is kept free: a stop, or an emergency call of an emergency service.
     pub fn is_urgent(&self, class: Priority) -> bool {
         self.stop || class == Priority::Emergency && self.priority == Priority::Emergency
     }
 
     /// Bits 0 and 1: priority; bits 2 to 4: the flags; bit 5: a stream; actuator, u8; of a stream the least interval in
-    /// milliseconds, u16 little-endian, otherwise zero; the lease in milliseconds, u32 little-endian, 0 for none. A lease is rounded down, but never to none.
+    /// milliseconds, u16 little-endian, otherwise zero; the lease in milliseconds, u32 little-endian, 0 for none. A lease is rounded down, but never to none,
+    /// and is 49 days at most.
     pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
         let flags = self.priority as u8 | self.flags();
         #[cfg(not(feature = "streams"))]
@@ -115,7 +115,8 @@ impl Attributes {
         [flags, self.actuator, low, high, a, b, c, d]
     }
 
-    /// The inverse of [`encode`](Self::encode). Other bits, and bytes that follow, are of a later version and passed over;
+    /// The inverse of [`encode`](Self::encode). Other bits, and bytes that follow, are of a later version and passed over, as is the
+    /// stream's without the feature `streams`;
     /// [`Error::Malformed`] for fewer bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
         let &[flags, actuator, low, high, a, b, c, d, ..] = bytes else { return Err(Error::Malformed) };
