@@ -48,11 +48,19 @@ pub(crate) fn plain(ident: &Ident) -> String {
     text.strip_prefix("r#").map_or(text.clone(), str::to_owned)
 }
 
+/// Whether an attribute has one of these names.
+pub(crate) fn is_one_of(attribute: &Attribute, names: &[&str]) -> bool {
+    names.iter().any(|name| attribute.path().is_ident(name))
+}
+
 /// Takes the attributes of these names out.
 pub(crate) fn extract(attributes: &mut Vec<Attribute>, names: &[&str]) -> Vec<Attribute> {
-    let (taken, kept) = std::mem::take(attributes)
-        .into_iter()
-        .partition(|attribute| names.iter().any(|name| attribute.path().is_ident(name)));
+    extract_if(attributes, |attribute| is_one_of(attribute, names))
+}
+
+/// Takes those out that are wanted.
+pub(crate) fn extract_if(attributes: &mut Vec<Attribute>, is_wanted: impl FnMut(&Attribute) -> bool) -> Vec<Attribute> {
+    let (taken, kept) = std::mem::take(attributes).into_iter().partition(is_wanted);
     *attributes = kept;
     taken
 }

@@ -6,7 +6,7 @@ use syn::parse::{Parse, ParseStream};
 use syn::spanned::Spanned;
 use syn::{Attribute, Error, Ident, Lit, LitInt, Meta, Result, Token};
 
-use crate::attributes::{extract, set};
+use crate::attributes::{extract, extract_if, is_one_of, set};
 
 /// How a function wants to be called.
 #[derive(Default)]
@@ -41,11 +41,7 @@ impl Attributes {
             }
         }
         let is_flag = |attribute: &Attribute| matches!(&attribute.meta, Meta::Path(path) if path.get_ident().is_some());
-        let (flags, kept): (Vec<_>, Vec<_>) = std::mem::take(attributes)
-            .into_iter()
-            .partition(|attribute| is_flag(attribute) && !NO_FLAGS.iter().any(|name| attribute.path().is_ident(name)));
-        *attributes = kept;
-        for attribute in &flags {
+        for attribute in extract_if(attributes, |attribute| is_flag(attribute) && !is_one_of(attribute, &NO_FLAGS)) {
             let flag = attribute.path().get_ident().cloned();
             if flag.as_ref().is_some_and(|flag| found.flags.contains(flag)) {
                 return Err(Error::new_spanned(attribute, "this attribute is there twice"));

@@ -9,6 +9,9 @@ use static_cell::StaticCell;
 
 use crate::{Agv, Vehicle, VehicleResources};
 
+/// Why a board does not start: its executor has no room for a task.
+pub const NO_ROOM: &str = "no room for a task";
+
 /// Makes the AGV of the settings and starts its tasks. Once per image: its memory is a static here. On an error the text says why.
 pub fn start(
     spawner: Spawner,
@@ -20,7 +23,7 @@ pub fn start(
     let made = crate::vehicle(stack, RESOURCES.init_with(VehicleResources::new), settings, security);
     let (vehicle, runner) = made.map_err(|_| "the settings are of no vehicle")?;
     crate::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
-    let has_no_room = |_: SpawnError| "no room for a task";
+    let has_no_room = |_: SpawnError| NO_ROOM;
     spawner.spawn(unit(runner).map_err(has_no_room)?);
     spawner.spawn(drive(vehicle).map_err(has_no_room)?);
     Ok(vehicle)

@@ -1,14 +1,12 @@
 //! What every image of the board starts with: its network.
 
 use cara_settings::Settings;
+pub use cara_vehicle::tasks::NO_ROOM;
 use embassy_executor::Spawner;
 use embassy_net::{Runner, Stack, StackResources};
 use static_cell::ConstStaticCell;
 
 use crate::ethernet::Ethernet;
-
-/// Why an image does not start: it has more tasks than it said.
-pub const NO_ROOM: &str = "no room for a task";
 
 /// Starts the controller and the network of the settings. Once per image.
 pub fn network<const SOCKETS: usize>(
