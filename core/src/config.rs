@@ -30,7 +30,7 @@ pub const FAILURE_VALUES_BYTES: usize = 256;
 pub const PROGRESS_INTERVAL: Duration = Duration::from_millis(10);
 /// Longest encoded signature (name, arguments and results of one function), in bytes: 384, or 1,024 for units that have
 /// lists and records. Stored as long as it is.
-pub const SIGNATURE_BYTES: usize = if cfg!(feature = "nested") { 1024 } else { 384 };
+pub const SIGNATURE_BYTES: usize = if crate::ability::NESTED { 1024 } else { 384 };
 /// Longest line of help on a function, in bytes; a longer one is cut. Stored as long as it is, with the signature.
 pub const HELP_BYTES: usize = 160;
 /// Longest unit of a variable, in bytes; a longer one is cut. Stored as long as it is, with the signature.
@@ -163,10 +163,8 @@ pub struct Constraints {
     /// How long orders of a manager go on once another one of its identity, with a higher claim, wants to command.
     pub handover: Duration,
     /// Streams of this unit that one peer may be subscribed to; the next subscription is refused.
-    #[cfg(feature = "streams")]
     pub subscriptions_per_peer: u16,
     /// Bytes of values of streams that one peer is sent in a second; what is above comes later, and is newer then.
-    #[cfg(feature = "streams")]
     pub stream_bytes: u32,
 }
 
@@ -181,9 +179,7 @@ impl Constraints {
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 64,
         handover: Duration::from_secs(10),
-        #[cfg(feature = "streams")]
         subscriptions_per_peer: 1_024,
-        #[cfg(feature = "streams")]
         stream_bytes: 1_000_000,
     };
     /// Defaults of an s_unit, sized for a microcontroller.
@@ -196,9 +192,7 @@ impl Constraints {
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 8,
         handover: Duration::from_secs(10),
-        #[cfg(feature = "streams")]
         subscriptions_per_peer: 8,
-        #[cfg(feature = "streams")]
         stream_bytes: 100_000,
     };
 }

@@ -51,7 +51,7 @@ impl<C: Counter, const N: usize> Counters<C, N> {
 
     /// All names and values, zeros included.
     pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
-        C::ALL.iter().map(|&counter| (counter.name(), self.value(counter)))
+        C::ALL.iter().take(N).map(|&counter| (counter.name(), self.value(counter)))
     }
 
     /// Adds the values of `other`, as when links are summed up.
@@ -74,30 +74,30 @@ impl<C: Counter, const N: usize> fmt::Debug for Counters<C, N> {
     }
 }
 
-/// Declares an enum of counters: `counters! { /// doc  pub enum Name { /// doc  Variant, … } }`.
+/// Declares an enum of counters, and how many of them there are: `counters! { /// doc  pub enum Name[COUNT] { /// doc  Variant, … } }`.
 macro_rules! counters {
-    ($(#[$meta:meta])* pub enum $name:ident {
-        $(#[doc = $help:literal] $(#[cfg(feature = $feature:literal)])? $variant:ident,)+
+    ($(#[$meta:meta])* pub enum $name:ident[$count:expr] {
+        $(#[doc = $help:literal] $variant:ident,)+
     }) => {
         $(#[$meta])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-        pub enum $name { $(#[doc = $help] $(#[cfg(feature = $feature)])? $variant,)+ }
+        pub enum $name { $(#[doc = $help] $variant,)+ }
 
         impl $name {
-            /// How many counters there are.
-            pub const COUNT: usize = <Self as $crate::counters::Counter>::ALL.len();
+            /// How many there are in this build, the first ones of all.
+            pub const COUNT: usize = $count;
         }
 
         impl $crate::counters::Counter for $name {
-            const ALL: &'static [Self] = &[$($(#[cfg(feature = $feature)])? Self::$variant,)+];
+            const ALL: &'static [Self] = &[$(Self::$variant,)+];
             fn index(self) -> usize {
                 self as usize
             }
             fn name(self) -> &'static str {
-                match self { $($(#[cfg(feature = $feature)])? Self::$variant => stringify!($variant),)+ }
+                match self { $(Self::$variant => stringify!($variant),)+ }
             }
             fn help(self) -> &'static str {
-                match self { $($(#[cfg(feature = $feature)])? Self::$variant => $help.trim_ascii(),)+ }
+                match self { $(Self::$variant => $help.trim_ascii(),)+ }
             }
         }
     };

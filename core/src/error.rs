@@ -66,7 +66,6 @@ pub enum Limit {
     #[error("every thread for handlers is busy: try again later, or let handlers take less time")]
     Handlers = 12,
     /// The peer's `Constraints::subscriptions_per_peer`.
-    #[cfg(feature = "streams")]
     #[error("the peer lets this unit subscribe to no more streams: end one, or raise subscriptions_per_peer there")]
     Subscriptions = 13,
     /// Lists and records inside each other.

@@ -58,6 +58,7 @@
 #[cfg(test)]
 extern crate std;
 
+pub mod ability;
 mod bytes;
 pub mod config;
 pub mod counters;
@@ -81,9 +82,7 @@ pub use host::mailman::Mailman;
 pub use services::hub::Hub;
 pub use services::session::{Event, Session};
 pub use services::typed;
-#[cfg(feature = "details")]
-pub use services::typed::TypedCall;
-pub use services::typed::{AnyCall, AsyncState, Variables};
+pub use services::typed::{AnyCall, AsyncState, TypedCall, Variables};
 
 #[cfg(feature = "derive")]
 pub use cara_derive::{Variables, interface};

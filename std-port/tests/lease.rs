@@ -22,7 +22,7 @@ mod distribution {
     pub(crate) use cara_core::distribution::*;
 }
 mod services {
-    pub(crate) use cara_core::services::{heart, requests};
+    pub(crate) use cara_core::services::{heart, requests, stream};
 }
 mod sync {
     /// Loom's atomics in a model, and those of the standard library in the tests of the file itself.

@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+use crate::ability::STREAMS;
 use crate::config::Priority;
 use crate::error::Error;
 use crate::time::Duration;
@@ -23,7 +24,6 @@ macro_rules! attributes {
             pub actuator: u8,
             /// It is a stream, whose results are values that change: subscribers get them, at least so many milliseconds apart.
             /// It has no arguments, and is not called.
-            #[cfg(feature = "streams")]
             pub stream: Option<u16>,
             $(#[doc = $means] pub $name: bool,)+
         }
@@ -34,7 +34,6 @@ macro_rules! attributes {
                 priority: Priority::Normal,
                 lease: None,
                 actuator: 0,
-                #[cfg(feature = "streams")]
                 stream: None,
                 $($name: false,)+
             };
@@ -91,8 +90,12 @@ impl Attributes {
     /// Bytes of the encoded form.
     pub const WIRE_BYTES: usize = 8;
     const PRIORITY: u8 = 0b11;
-    #[cfg(feature = "streams")]
     const STREAM: u8 = 1 << 5;
+
+    /// Whether it is a [stream](Self::stream), and no function.
+    pub const fn is_stream(&self) -> bool {
+        STREAMS && self.stream.is_some()
+    }
 
     /// Whether a call in this class may use a place that is kept free: a stop, or an emergency call of an emergency service.
     pub fn is_urgent(&self, class: Priority) -> bool {
@@ -104,11 +107,7 @@ impl Attributes {
     /// and is 49 days at most.
     pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
         let flags = self.priority as u8 | self.flags();
-        #[cfg(not(feature = "streams"))]
-        let [low, high] = [0; 2];
-        #[cfg(feature = "streams")]
-        let flags = flags | if self.stream.is_some() { Self::STREAM } else { 0 };
-        #[cfg(feature = "streams")]
+        let flags = flags | if self.is_stream() { Self::STREAM } else { 0 };
         let [low, high] = self.stream.unwrap_or(0).to_le_bytes();
         let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
         let [a, b, c, d] = lease.to_le_bytes();
@@ -119,15 +118,12 @@ impl Attributes {
     /// stream's without the feature `streams`; [`Error::Malformed`] for fewer bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
         let &[flags, actuator, low, high, a, b, c, d, ..] = bytes else { return Err(Error::Malformed) };
-        #[cfg(not(feature = "streams"))]
-        let _ = (low, high);
         let lease = u32::from_le_bytes([a, b, c, d]);
         let mut attributes = Self {
             priority: Priority::from_wire(flags & Self::PRIORITY).ok_or(Error::Malformed)?,
             lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
             actuator,
-            #[cfg(feature = "streams")]
-            stream: (flags & Self::STREAM != 0).then_some(u16::from_le_bytes([low, high])),
+            stream: (STREAMS && flags & Self::STREAM != 0).then_some(u16::from_le_bytes([low, high])),
             ..Self::NORMAL
         };
         attributes.set_flags(flags);
@@ -142,7 +138,6 @@ impl fmt::Display for Attributes {
         if let Some(lease) = self.lease {
             write!(f, ", lease {} ms", lease.as_millis())?;
         }
-        #[cfg(feature = "streams")]
         match self.stream {
             Some(0) => f.write_str(", stream")?,
             Some(least) => write!(f, ", stream every {least} ms at most")?,

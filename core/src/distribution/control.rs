@@ -6,37 +6,40 @@ use super::compact::{Reader, Writer};
 use super::hello::ClaimReport;
 use super::items::{Item, Malformed};
 use super::message::CONTROL;
+use crate::ability::STREAMS;
 use crate::error::Error;
 
 /// Makes [`Control`] of its table: each row is the item's kind, the variant and its fields in their order.
 macro_rules! controls {
-    ($($(#[$about:meta])* $kind:literal $(if $feature:literal)? => $name:ident { $($(#[$field_about:meta])* $field:ident: $type:ty,)* })*) => {
+    ($($(#[$about:meta])* $kind:literal $(if $is_on:ident)? => $name:ident { $($(#[$field_about:meta])* $field:ident: $type:ty,)* })*) => {
         /// Messages between two units that are no requests: what they tell each other about their functions, limits and
         /// leases.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub enum Control<'b> {
-            $($(#[$about])* $(#[cfg(feature = $feature)])? $name { $($(#[$field_about])* $field: $type,)* },)*
+            $($(#[$about])* $name { $($(#[$field_about])* $field: $type,)* },)*
         }
 
         impl<'b> Control<'b> {
             /// How many kinds there are.
             #[cfg(test)]
-            pub(crate) const KINDS: u16 = [$($(#[cfg(feature = $feature)])? $kind),*].len() as u16;
+            pub(crate) const KINDS: u16 = [$($kind),*].len() as u16;
 
             fn put(&self, writer: &mut Writer<'_>) {
                 match *self {
-                    $($(#[cfg(feature = $feature)])? Self::$name { $($field),* } => {
+                    $(Self::$name { $($field),* } $(if $is_on)? => {
                         let item = writer.begin($kind);
                         $($field.put(writer);)*
                         writer.end(item);
                     })*
+                    // None is made of an ability that is off.
+                    _ => {}
                 }
             }
 
             /// Reads an item of a control message; `None` for a kind that this version does not know.
             pub fn take(item: &Item<'b>) -> Result<Option<Self>, Malformed> {
                 item.read(|reader| match item.kind {
-                    $($(#[cfg(feature = $feature)])? $kind => Some(Self::$name { $($field: Field::take(reader)),* }),)*
+                    $($kind $(if $is_on)? => Some(Self::$name { $($field: Field::take(reader)),* }),)*
                     _ => None,
                 })
             }
@@ -104,7 +107,7 @@ controls! {
         report: ClaimReport,
     }
     /// The sender wants values of a stream of the reader, or no more of them.
-    8 if "streams" => Subscribe {
+    8 if STREAMS => Subscribe {
         /// Its slot.
         slot: u16,
         /// Its life.
@@ -113,7 +116,7 @@ controls! {
         interval: u32,
     }
     /// The answer to `Subscribe`.
-    9 if "streams" => Subscribed {
+    9 if STREAMS => Subscribed {
         /// Its slot.
         slot: u16,
         /// Its life.
@@ -128,11 +131,9 @@ controls! {
 }
 
 /// As the interval of a subscription: there is none.
-#[cfg(feature = "streams")]
 pub const NO_SUBSCRIPTION: u32 = u32::MAX;
 
 /// Why a subscription was refused.
-#[cfg(feature = "streams")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum SubscriptionRefusal {
@@ -146,7 +147,6 @@ pub enum SubscriptionRefusal {
     Full = 3,
 }
 
-#[cfg(feature = "streams")]
 impl Field<'_> for SubscriptionRefusal {
     fn put(self, writer: &mut Writer<'_>) {
         writer.number(self as u64);

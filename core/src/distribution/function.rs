@@ -7,6 +7,7 @@
 
 use core::fmt;
 
+use crate::ability::{DETAILS, HELP};
 use crate::config::{SIGNATURE_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
@@ -95,7 +96,6 @@ impl Definition {
     /// let pose = cara_core::Definition::stream("pose(position: float[2])").unwrap();
     /// assert_eq!(pose.to_string(), "pose() -> (position: float[2])");
     /// ```
-    #[cfg(feature = "streams")]
     pub fn stream(text: &str) -> Result<Self, ParseError> {
         text::parse_stream(text)
     }
@@ -143,18 +143,15 @@ impl Definition {
     /// assert_eq!(go_to.to_string(), "go_to() progress (left: float)");
     /// # Ok::<(), cara_core::error::Error>(())
     /// ```
-    #[cfg(feature = "details")]
     pub fn progress(self, parameters: &ParametersView) -> Result<Self, Error> {
         self.declaring(specs_of(parameters), self.signature().failure())
     }
 
     /// The same function whose failures have the variables of `parameters`; their values don't matter.
-    #[cfg(feature = "details")]
     pub fn failure(self, parameters: &ParametersView) -> Result<Self, Error> {
         self.declaring(self.signature().progress(), specs_of(parameters))
     }
 
-    #[cfg(feature = "details")]
     fn declaring<'a>(
         &self,
         mut progress: impl Iterator<Item = VariableSpec<'a>>,
@@ -179,14 +176,12 @@ fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_
 }
 
 /// What a signature may declare behind its results.
-#[cfg(feature = "details")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Section {
     Progress = 1,
     Failure = 2,
 }
 
-#[cfg(feature = "details")]
 impl Section {
     pub(super) const ALL: [(Self, &'static str); 2] = [(Self::Progress, "progress"), (Self::Failure, "fails")];
 }
@@ -200,7 +195,7 @@ impl<'a> Signature<'a> {
         let whole = Self { bytes };
         // What a later version may have behind it is of no use.
         let with_help = whole.in_front_of(help::SECTION.saturating_add(1));
-        let has_room = cfg!(feature = "help") && with_help.bytes.len() <= SIGNATURE_BYTES;
+        let has_room = HELP && with_help.bytes.len() <= SIGNATURE_BYTES;
         let this = if has_room { with_help } else { whole.without_help() };
         if this.bytes.len() > SIGNATURE_BYTES {
             return Err(Error::Malformed);
@@ -228,13 +223,11 @@ impl<'a> Signature<'a> {
     }
 
     /// What its calls tell while they run.
-    #[cfg(feature = "details")]
     pub fn progress(&self) -> VariableSpecs<'a> {
         self.section(Section::Progress as u8)
     }
 
     /// The values of its failures.
-    #[cfg(feature = "details")]
     pub fn failure(&self) -> VariableSpecs<'a> {
         self.section(Section::Failure as u8)
     }
@@ -257,7 +250,6 @@ impl<'a> Signature<'a> {
         Self { bytes: self.bytes.get(..length).unwrap_or(self.bytes) }
     }
 
-    #[cfg(any(feature = "details", feature = "help"))]
     pub(super) fn section(&self, wanted: u8) -> VariableSpecs<'a> {
         let mut rest = self.results().behind();
         while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {
@@ -442,7 +434,6 @@ pub(super) struct Builder {
     arguments_at: usize,
     results_at: Option<usize>,
     /// The section that was begun last, and where its count is.
-    #[cfg(feature = "details")]
     section: Option<(Section, usize)>,
 }
 
@@ -459,23 +450,18 @@ impl Builder {
         Ok(builder)
     }
 
-    /// Adds what a signature declares behind its results.
-    #[cfg(feature = "details")]
+    /// Adds what a signature declares behind its results. A unit that has no use for it passes it over.
     fn sections_of(&mut self, signature: Signature<'_>) -> Result<(), Error> {
+        if !DETAILS {
+            return Ok(());
+        }
         let mut all = Section::ALL.into_iter();
         all.try_for_each(|(section, _)| {
             signature.section(section as u8).try_for_each(|spec| self.declare(section, spec))
         })
     }
 
-    /// A unit that has no use for sections passes them over.
-    #[cfg(not(feature = "details"))]
-    fn sections_of(&mut self, _: Signature<'_>) -> Result<(), Error> {
-        Ok(())
-    }
-
     /// Adds a variable to a section; the sections come behind the results, in their order.
-    #[cfg(feature = "details")]
     pub(super) fn declare(&mut self, section: Section, spec: VariableSpec<'_>) -> Result<(), Error> {
         self.begin_results()?;
         let at = match self.section {
@@ -495,13 +481,7 @@ impl Builder {
 
     pub(super) fn new(name: &str) -> Result<Self, Error> {
         check_name(name)?;
-        let mut builder = Self {
-            bytes: heapless::Vec::new(),
-            arguments_at: 0,
-            results_at: None,
-            #[cfg(feature = "details")]
-            section: None,
-        };
+        let mut builder = Self { bytes: heapless::Vec::new(), arguments_at: 0, results_at: None, section: None };
         builder.push(&[name.len() as u8])?;
         builder.push(name.as_bytes())?;
         builder.arguments_at = builder.bytes.len();
@@ -631,9 +611,8 @@ impl fmt::Display for Signature<'_> {
         if results.left > 0 {
             write!(f, " -> {results}")?;
         }
-        #[cfg(feature = "details")]
-        for (section, word) in Section::ALL {
-            let specs = self.section(section as u8);
+        for (section, word) in Section::ALL.iter().filter(|_| DETAILS) {
+            let specs = self.section(*section as u8);
             if specs.left > 0 {
                 write!(f, " {word} {specs}")?;
             }

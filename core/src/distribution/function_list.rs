@@ -8,9 +8,9 @@ use core::fmt;
 use super::function::Signature;
 use super::latch::LatchWord;
 use super::table::Table;
-#[cfg(feature = "streams")]
 pub(crate) use super::table::Wish;
 pub use super::table::{Entry, Function, Generation, Slot};
+use crate::ability::HELP;
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
 
@@ -183,7 +183,7 @@ impl<S: Storage> TheirFunctionList<S> {
             self.table.take(index);
         }
         // A list that does not grow, as on a board, has no use for help. Rather all without it than one function skipped.
-        let keeps_help = cfg!(feature = "help") && self.most.1 > 0;
+        let keeps_help = HELP && self.most.1 > 0;
         let kept = if keeps_help { signature } else { signature.without_help() };
         let mut put = self.put(slot, generation, attributes, kept.as_bytes());
         if keeps_help && put == Err(Error::Full(Limit::SignatureBytes)) {
@@ -212,14 +212,12 @@ impl<S: Storage> TheirFunctionList<S> {
     }
 
     /// What this unit wants of a stream.
-    #[cfg(feature = "streams")]
     pub(crate) fn wish_mut(&mut self, slot: Slot) -> Option<&mut Wish> {
         let index = self.index_of(slot)?;
-        self.table.entries.get_mut(index).map(|entry| &mut entry.wish)
+        self.table.entries.get_mut(index)?.wish.get_mut()
     }
 
     /// A stream of which the peer has not been told what this unit wants: its place, its generation and the interval.
-    #[cfg(feature = "streams")]
     pub(crate) fn untold_wish(&self) -> Option<(Slot, Generation, u32)> {
         let untold = |entry: &&Entry| entry.function.is_some() && entry.wish.interval != entry.wish.advertised;
         let entry = self.table.entries.iter().find(untold)?;

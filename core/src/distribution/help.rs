@@ -4,12 +4,9 @@
 //! passes them over: type u8 of a text, length u8, what it is u32 little-endian, text. 0 is the help; 1 is a unit behind the
 //! name of its variable and a blank, as `position m`.
 
-#[cfg(feature = "help")]
 use super::function::{Definition, Signature, VariableSpec, VariableSpecs};
 use super::parameters::Type;
-#[cfg(feature = "help")]
 use crate::config::{HELP_BYTES, UNIT_BYTES};
-#[cfg(feature = "help")]
 use crate::error::{Error, Limit};
 
 /// The number of the section; whatever has a greater one is behind it.
@@ -25,7 +22,6 @@ pub(super) const fn head(is_unit: bool, length: usize) -> [u8; 6] {
     [Type::String as u8, length as u8, a, b, c, d]
 }
 
-#[cfg(feature = "help")]
 impl Definition {
     /// The same function with a line of help for people: what it does. A text of more than [`HELP_BYTES`] is cut.
     ///
@@ -56,10 +52,7 @@ impl Definition {
     pub fn unit(self, variable: &str, unit: &str) -> Result<Self, Error> {
         let signature = self.signature();
         let has = |specs: VariableSpecs<'_>| specs.named(variable).is_some();
-        #[cfg(feature = "details")]
         let is_reported = has(signature.progress()) || has(signature.failure());
-        #[cfg(not(feature = "details"))]
-        let is_reported = false;
         if !is_reported && !has(signature.arguments()) && !has(signature.results()) {
             return Err(Error::UnknownVariable);
         }
@@ -86,12 +79,10 @@ impl Definition {
 }
 
 /// As much of a text as there is room for, up to the end of a character.
-#[cfg(feature = "help")]
 fn cut(text: &str, most: usize) -> &str {
     text.get(..text.floor_char_boundary(most)).unwrap_or(text)
 }
 
-#[cfg(feature = "help")]
 impl<'a> Signature<'a> {
     /// What the function does, in a line for people; empty where nothing is said.
     pub fn help(&self) -> &'a str {

@@ -4,11 +4,11 @@
 //! that knows the encoding; `docs/wire.md` says it in words.
 
 pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome, trace_id};
-#[cfg(feature = "streams")]
 pub use super::control::{NO_SUBSCRIPTION, SubscriptionRefusal};
 
 use super::block::Put;
 use super::function_list::{Generation, Slot};
+use crate::ability::{DETAILS, STREAMS};
 use crate::config::Priority;
 use crate::error::{Error, ServiceError};
 use crate::host::connections::Report;
@@ -19,9 +19,7 @@ const REQUEST: u8 = 1;
 const REPLY: u8 = 2;
 pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
-#[cfg(feature = "details")]
 const PROGRESS: u8 = 5;
-#[cfg(feature = "streams")]
 const SAMPLE: u8 = 6;
 
 const WANTS_REPLY: u8 = 1;
@@ -60,12 +58,10 @@ pub enum Message<'b> {
     /// An asynchronous request was not run, or its service failed.
     Failure(u32, Error),
     /// What a running call tells.
-    #[cfg(feature = "details")]
     Progress(u32, &'b [u8]),
     /// Lists, limits, leases: [items](super::items), of which [`Control`] is one each.
     Control(&'b [u8]),
     /// The newest value of a stream.
-    #[cfg(feature = "streams")]
     Sample(SampleHeader, &'b [u8]),
 }
 
@@ -87,15 +83,13 @@ impl<'b> Message<'b> {
                 let (id, status) = decode_reply(bytes.first_chunk()?);
                 Some(Self::Failure(id, status.err()?))
             }
-            #[cfg(feature = "details")]
-            PROGRESS => {
+            PROGRESS if DETAILS => {
                 let &[_, _, _, words, a, b, c, d] = bytes.first_chunk::<PROGRESS_BYTES>()?;
                 let block = behind_header(bytes, &words, PROGRESS_BYTES)?;
                 Some(Self::Progress(u32::from_le_bytes([a, b, c, d]), block))
             }
             CONTROL => Some(Self::Control(bytes.get(CONTROL_HEADER_BYTES..)?)),
-            #[cfg(feature = "streams")]
-            SAMPLE => {
+            SAMPLE if STREAMS => {
                 let header = SampleHeader::decode(bytes.first_chunk()?);
                 Some(Self::Sample(header, behind_header(bytes, bytes.get(6)?, SAMPLE_BYTES)?))
             }
@@ -221,7 +215,6 @@ impl RequestHeader {
 }
 
 /// What stands in front of a value of a stream.
-#[cfg(feature = "streams")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleHeader {
     /// The sender's stream.
@@ -233,10 +226,8 @@ pub struct SampleHeader {
 }
 
 /// Bytes before the block of a sample.
-#[cfg(feature = "streams")]
 pub const SAMPLE_BYTES: usize = 16;
 
-#[cfg(feature = "streams")]
 impl SampleHeader {
     /// The header's bytes.
     pub fn encode(&self) -> [u8; SAMPLE_BYTES] {
@@ -256,18 +247,15 @@ impl SampleHeader {
 }
 
 /// Bytes before the block of progress.
-#[cfg(feature = "details")]
 pub const PROGRESS_BYTES: usize = 8;
 
 /// The header of what call `id` tells.
-#[cfg(feature = "details")]
 pub fn encode_progress(id: u32) -> [u8; PROGRESS_BYTES] {
     let [a, b, c, d] = id.to_le_bytes();
     [PROGRESS, 0, 0, (PROGRESS_BYTES / WORD) as u8, a, b, c, d]
 }
 
 /// What stands behind the header of a reply or failure whose service failed: its text, and the block of its values.
-#[cfg(feature = "details")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FailureDetails<'b> {
     /// The reason in words.
@@ -276,7 +264,6 @@ pub struct FailureDetails<'b> {
     pub values: &'b [u8],
 }
 
-#[cfg(feature = "details")]
 impl<'b> FailureDetails<'b> {
     /// `None` for any other message, and where there are none.
     pub fn of(message: &'b [u8]) -> Option<Self> {
@@ -417,7 +404,6 @@ pub enum SessionBody<'b> {
     /// The caller no longer wants a leased call, wherever it is.
     Release(Release),
     /// The caller has given a call up, and waits for it no longer.
-    #[cfg(feature = "details")]
     Cancel(Release),
     /// The caller gives up all its calls of a leased function up to this id, whether in flight, queued or running.
     ReleaseAll(Slot, u32),
@@ -473,7 +459,6 @@ const PONG: u8 = 5;
 const RELEASE: u8 = 6;
 const RELEASE_ALL: u8 = 7;
 const RENEWED: u8 = 8;
-#[cfg(feature = "details")]
 const CANCEL: u8 = 9;
 const CLOSE: u8 = 10;
 
@@ -505,8 +490,7 @@ impl<'b> SessionBody<'b> {
             }
             RENEWED => Some(Self::Renewed(u32::from_le_bytes(*rest.first_chunk()?))),
             RELEASE => Some(Self::Release(Release::decode(rest)?)),
-            #[cfg(feature = "details")]
-            CANCEL => Some(Self::Cancel(Release::decode(rest)?)),
+            CANCEL if DETAILS => Some(Self::Cancel(Release::decode(rest)?)),
             RELEASE_ALL => {
                 let (slot, id) = rest.split_first_chunk()?;
                 Some(Self::ReleaseAll(Slot(u16::from_le_bytes(*slot)), u32::from_le_bytes(*id.first_chunk()?)))
@@ -551,7 +535,6 @@ impl<'b> SessionBody<'b> {
     }
 
     /// The bytes that cancel one call.
-    #[cfg(feature = "details")]
     pub fn cancel(release: &Release) -> [u8; 6] {
         let [_, rest @ ..] = Self::release(release);
         let [a, b, c, d, e] = rest;

@@ -5,8 +5,10 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::attributes::Attributes;
+use super::control::NO_SUBSCRIPTION;
 use super::function::Signature;
 use super::value::saturate;
+use crate::ability::{Begins, STREAMS, State};
 use crate::bytes::{copy, move_down};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
@@ -60,14 +62,11 @@ pub struct Entry<H = ()> {
     /// It is kept and not shown.
     pub(super) hidden: bool,
     /// What this unit wants of a stream.
-    #[cfg(feature = "streams")]
-    pub(super) wish: Wish,
+    pub(super) wish: State<Wish, { STREAMS as usize }>,
     pub(super) function: Option<Stored<H>>,
 }
 
-/// What a unit wants of a stream of its peer: the interval of a subscription in milliseconds, or
-/// [`NO_SUBSCRIPTION`](super::control::NO_SUBSCRIPTION).
-#[cfg(feature = "streams")]
+/// What a unit wants of a stream of its peer: the interval of a subscription in milliseconds, or [`NO_SUBSCRIPTION`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Wish {
     pub(crate) interval: u32,
@@ -75,9 +74,8 @@ pub(crate) struct Wish {
     pub(crate) advertised: u32,
 }
 
-#[cfg(feature = "streams")]
-impl Wish {
-    const NONE: Self = Self { interval: super::control::NO_SUBSCRIPTION, advertised: super::control::NO_SUBSCRIPTION };
+impl Begins for Wish {
+    const BEGIN: &'static Self = &Self { interval: NO_SUBSCRIPTION, advertised: NO_SUBSCRIPTION };
 }
 
 pub(super) struct Stored<H> {
@@ -91,13 +89,7 @@ pub(super) struct Stored<H> {
 impl<H> Entry<H> {
     /// Room without a function.
     pub const fn empty() -> Self {
-        Self {
-            generation: Generation(0),
-            hidden: false,
-            #[cfg(feature = "streams")]
-            wish: Wish::NONE,
-            function: None,
-        }
+        Self { generation: Generation(0), hidden: false, wish: State::NEW, function: None }
     }
 }
 
@@ -164,10 +156,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         copy(signature, place);
         let length = signature.len() as u16;
         entry.hidden = false;
-        #[cfg(feature = "streams")]
-        {
-            entry.wish = Wish::NONE;
-        }
+        entry.wish = State::NEW;
         entry.function = Some(Stored { slot, at: saturate(self.used), length, attributes, handler });
         self.used = end;
         self.len = self.len.saturating_add(1);

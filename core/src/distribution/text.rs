@@ -12,6 +12,7 @@ use crate::error::{Error, Limit};
 use super::function::{Builder, Definition, VariableSpec};
 use super::name::is_name_byte;
 use super::parameters::Type;
+use crate::ability::{DETAILS, NESTED};
 use crate::config::{DEPTH, SIGNATURE_BYTES};
 
 /// The position of a syntax error, and what is expected there.
@@ -65,7 +66,7 @@ impl fmt::Display for Expected {
             Self::ShorterName => "a shorter name",
             Self::NewName => "a name that is not in the list yet",
             Self::SameAsArgument => "the type and size of the argument of this name",
-            Self::Type if cfg!(feature = "nested") => "a type: int, float, string, bool, bytes or {…}",
+            Self::Type if NESTED => "a type: int, float, string, bool, bytes or {…}",
             Self::Type => "a type: int, float, string, bool or bytes",
             Self::ShallowerType => "at most 4 lists and records inside each other",
             Self::Size => "a size: a number of 32 bits",
@@ -92,8 +93,7 @@ pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
         parser.list(|spec| builder.result(spec))?;
         expected = Expected::End;
     }
-    #[cfg(feature = "details")]
-    for (section, word) in super::function::Section::ALL {
+    for (section, word) in super::function::Section::ALL.into_iter().filter(|_| DETAILS) {
         parser.skip_spaces();
         if parser.take(word.as_bytes()) {
             parser.list(|spec| builder.declare(section, spec))?;
@@ -105,7 +105,6 @@ pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
 }
 
 /// Reads a stream; see [`Definition::stream`].
-#[cfg(feature = "streams")]
 pub(super) fn parse_stream(text: &str) -> Result<Definition, ParseError> {
     let mut parser = Parser { text: text.as_bytes(), position: 0 };
     let (at, name) = parser.name()?;

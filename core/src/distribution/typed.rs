@@ -6,12 +6,12 @@
 
 use core::fmt;
 
-#[cfg(feature = "streams")]
 use super::function::{Builder, Definition};
 use super::function::{Signature, VariableSpec, VariableSpecs};
 use super::nested::{self, Bounds};
 use super::parameters::{Elements, Fields, FromValue, Parameters, ParametersView, Slot, Type};
 use super::value::{Element, Value};
+use crate::ability::{DETAILS, HELP};
 use crate::bytes::are_same;
 use crate::config::{NAME_BYTES, VARIABLES};
 pub use crate::error::Part;
@@ -172,21 +172,19 @@ impl Variables for () {
 }
 
 /// The stream whose values are those of a struct. [`Error::BadName`], and [`Error::Full`] for too many variables.
-#[cfg(feature = "streams")]
 pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     let mut stream = Builder::new(name)?;
     V::SPECS.iter().try_for_each(|spec| stream.result(*spec))?;
     let stream = stream.finish();
-    #[cfg(feature = "help")]
-    let stream = {
-        // What there is no room for is the help.
-        let reported = if V::HELP.is_empty() { Ok(stream.clone()) } else { stream.clone().help(V::HELP) };
-        let mut units = V::UNITS.iter();
-        let reported = reported
-            .and_then(|reported| units.try_fold(reported, |reported, (variable, unit)| reported.unit(variable, unit)));
-        reported.unwrap_or(stream)
-    };
-    Ok(stream)
+    if !HELP {
+        return Ok(stream);
+    }
+    // What there is no room for is the help.
+    let reported = if V::HELP.is_empty() { Ok(stream.clone()) } else { stream.clone().help(V::HELP) };
+    let mut units = V::UNITS.iter();
+    let reported = reported
+        .and_then(|reported| units.try_fold(reported, |reported, (variable, unit)| reported.unit(variable, unit)));
+    Ok(reported.unwrap_or(stream))
 }
 
 /// Each argument where it stands in the signature.
@@ -370,10 +368,9 @@ impl Mismatch {
             Ok(())
         };
         given(ours.results(), theirs.results(), Part::Result)?;
-        #[cfg(feature = "details")]
-        for (ours, theirs, part) in
-            [(ours.progress(), theirs.progress(), Part::Progress), (ours.failure(), theirs.failure(), Part::Failure)]
-        {
+        let details =
+            [(ours.progress(), theirs.progress(), Part::Progress), (ours.failure(), theirs.failure(), Part::Failure)];
+        for (ours, theirs, part) in details.into_iter().filter(|_| DETAILS) {
             if theirs.raw().next().is_some() {
                 given(ours, theirs, part)?;
             }

@@ -5,6 +5,7 @@
 
 use core::fmt;
 
+use crate::ability::NESTED;
 use crate::bytes::{as_text, copy};
 use crate::error::Error;
 
@@ -42,8 +43,8 @@ impl Type {
             2 => Some(Self::String),
             3 => Some(Self::Bool),
             4 => Some(Self::Bytes),
-            5 if cfg!(feature = "nested") => Some(Self::List),
-            6 if cfg!(feature = "nested") => Some(Self::Record),
+            5 if NESTED => Some(Self::List),
+            6 if NESTED => Some(Self::Record),
             _ => None,
         }
     }
@@ -69,7 +70,7 @@ impl Type {
     /// Whether it is made of other types. Without the feature `nested` none is, and what asks costs nothing.
     #[inline]
     pub const fn is_nested(self) -> bool {
-        cfg!(feature = "nested") && matches!(self, Self::List | Self::Record)
+        NESTED && matches!(self, Self::List | Self::Record)
     }
 
     /// Bytes of one element; 0 for lists and records, whose elements differ.

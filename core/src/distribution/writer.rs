@@ -9,6 +9,7 @@ use super::function::RawSpec;
 use super::nested::{self, LIST_HEAD};
 use super::parameters::{IntoValue, ParametersView, Target};
 use super::value::{Type, saturate};
+use crate::ability::{Ability, NESTED, Nested};
 use crate::bytes::copy;
 use crate::error::{Error, Limit};
 
@@ -43,11 +44,18 @@ enum To<'a> {
     /// A variable that is no list or record.
     Variable(Target<'a>),
     /// The list or record in a place.
-    #[cfg(feature = "nested")]
-    Nested(&'a mut ParametersView, usize),
+    Nested(<Nested as Ability>::Of<(&'a mut ParametersView, usize)>),
     /// What a list or record that is being written has next, and where it ends once it is there.
-    #[cfg(feature = "nested")]
-    Part(&'a mut ParametersView, u8, usize, Made, &'a mut Option<usize>),
+    Part(<Nested as Ability>::Of<Part<'a>>),
+}
+
+/// What a list or record that is being written has next.
+struct Part<'a> {
+    view: &'a mut ParametersView,
+    index: u8,
+    at: usize,
+    made: Made,
+    end: &'a mut Option<usize>,
 }
 
 /// A type, and where in the arena stands what it is made of.
@@ -71,45 +79,55 @@ impl Slot<'_> {
     pub fn set(self, value: impl IntoValue) -> Result<(), Error> {
         match self.0 {
             To::Variable(target) => value.into_value(target),
-            #[cfg(feature = "nested")]
-            To::Nested(_, place) => Err(Error::WrongType { index: place as u8 }),
-            #[cfg(feature = "nested")]
-            To::Part(view, index, at, made, end) => {
-                *end = Some(leaf(view, index, at, made, value)?);
-                Ok(())
+            To::Nested(nested) => {
+                Err(Error::WrongType { index: Nested::get::<(&mut ParametersView, usize)>(nested).1 as u8 })
+            }
+            To::Part(part) => {
+                Nested::get::<Part<'_>>(part).write(|view, index, at, made| leaf(view, index, at, made, value))
             }
         }
     }
 
     /// Sets it to a list.
-    #[cfg(feature = "nested")]
     pub fn list(self, write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
         match self.0 {
             To::Variable(target) => Err(Error::WrongType { index: target.index }),
-            To::Nested(view, place) => view.write_list(place, write),
-            To::Part(view, index, at, made, end) => {
-                *end = Some(list(view, index, at, made, write)?);
-                Ok(())
+            To::Nested(nested) => {
+                let (view, place): (&mut ParametersView, _) = Nested::get(nested);
+                view.write_list(place, write)
+            }
+            To::Part(part) => {
+                Nested::get::<Part<'_>>(part).write(|view, index, at, made| list(view, index, at, made, write))
             }
         }
     }
 
     /// Sets it to a record.
-    #[cfg(feature = "nested")]
     pub fn record(self, write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
         match self.0 {
             To::Variable(target) => Err(Error::WrongType { index: target.index }),
-            To::Nested(view, place) => view.write_record(place, write),
-            To::Part(view, index, at, made, end) => {
-                *end = Some(record(view, index, at, made, write)?);
-                Ok(())
+            To::Nested(nested) => {
+                let (view, place): (&mut ParametersView, _) = Nested::get(nested);
+                view.write_record(place, write)
+            }
+            To::Part(part) => {
+                Nested::get::<Part<'_>>(part).write(|view, index, at, made| record(view, index, at, made, write))
             }
         }
     }
 }
 
+impl Part<'_> {
+    fn write(
+        self,
+        write: impl FnOnce(&mut ParametersView, u8, usize, Made) -> Result<usize, Error>,
+    ) -> Result<(), Error> {
+        *self.end = Some(write(self.view, self.index, self.at, self.made)?);
+        Ok(())
+    }
+}
+
 /// Lets `write` set a part, and returns where it ends.
-#[cfg(feature = "nested")]
 fn part(
     view: &mut ParametersView,
     index: u8,
@@ -118,7 +136,9 @@ fn part(
     write: impl FnOnce(Slot<'_>) -> Result<(), Error>,
 ) -> Result<usize, Error> {
     let mut end = None;
-    write(Slot(To::Part(view, index, at, made, &mut end)))?;
+    if let Some(part) = Nested::of(Part { view, index, at, made, end: &mut end }) {
+        write(Slot(To::Part(part)))?;
+    }
     end.ok_or(Error::MissingArgument { index })
 }
 
@@ -141,7 +161,6 @@ impl ListWriter<'_> {
     }
 
     /// Adds an element that `write` sets.
-    #[cfg(feature = "nested")]
     pub fn push_with(&mut self, write: impl FnOnce(Slot<'_>) -> Result<(), Error>) -> Result<(), Error> {
         self.add(|view, index, at, element| part(view, index, at, element, write))
     }
@@ -188,7 +207,6 @@ impl RecordWriter<'_> {
     }
 
     /// Has `write` set the next field.
-    #[cfg(feature = "nested")]
     pub fn set_with(&mut self, name: &str, write: impl FnOnce(Slot<'_>) -> Result<(), Error>) -> Result<(), Error> {
         self.field(name, |view, index, at, field| part(view, index, at, field, write))
     }
@@ -216,11 +234,10 @@ impl ParametersView {
     #[doc(hidden)]
     #[inline]
     pub fn slot_of(&mut self, place: usize) -> Result<Slot<'_>, Error> {
-        #[cfg(feature = "nested")]
-        if self.value_of(place)?.kind().is_nested() {
-            return Ok(Slot(To::Nested(self, place)));
+        if !NESTED || !self.value_of(place)?.kind().is_nested() {
+            return self.target_of(place).map(Slot::from);
         }
-        self.target_of(place).map(Slot::from)
+        Nested::of((self, place)).map(To::Nested).map(Slot).ok_or(Error::WrongType { index: place as u8 })
     }
 
     pub(super) fn write_list(

@@ -286,7 +286,6 @@ impl<'c, C: Caller, Q> Call<'c, C, Q> {
 
     /// Hears what the call tells while it runs: the newest progress that has not been heard, and none after the reply. Where
     /// `hear` returns `Break`, the call is given up and ends with [`Error::Cancelled`]: what it moves stops, and its handler is told.
-    #[cfg(feature = "details")]
     pub fn watch<F>(self, hear: F) -> Call<'c, C, Q, Watched<F>>
     where
         Q: Request,
@@ -386,9 +385,7 @@ impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
 
 /// Progress is asked for where something hears it, and not otherwise.
 const fn options<Q: Request, W: Watch<Q>>(options: RequestOptions) -> RequestOptions {
-    #[cfg(feature = "details")]
-    let options = RequestOptions { progress: W::WATCHES, ..options };
-    options
+    RequestOptions { progress: W::WATCHES, ..options }
 }
 
 /// The results of an answered call. Where they cannot be read, what the call started is not wanted.

@@ -317,7 +317,6 @@ impl<S: Storage> Calls<S> {
     }
 
     /// The caller has given up a call that runs; `false` where that is known, an error where it does not run.
-    #[cfg(feature = "details")]
     pub(crate) fn cancel(&mut self, class: Priority, id: u32) -> Result<bool, Error> {
         let mut running = self.running.iter_mut().flatten();
         let head = running.find(|head| head.id == id && head.priority == class).ok_or(Error::Stale)?;
@@ -329,7 +328,6 @@ impl<S: Storage> Calls<S> {
     }
 
     /// A call that was given up, of which the port does not know.
-    #[cfg(feature = "details")]
     pub(crate) fn take_cancelled(&mut self) -> Option<Ticket> {
         let is_untold = |head: &CallHead| head.cancelled == Cancelled::Untold;
         let index = self.running.iter().position(|head| head.as_ref().is_some_and(is_untold))?;

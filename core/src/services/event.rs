@@ -146,9 +146,7 @@ impl<F, N, E> UnitEvent<F, N, E> {
             | Event::Actuator { .. } => {
                 return None;
             }
-            #[cfg(feature = "details")]
             Event::Progress(..) | Event::Cancelled(_) => return None,
-            #[cfg(feature = "streams")]
             Event::Sample(_) | Event::Subscribed(..) => return None,
             Event::Acknowledged { skipped, .. } => Self::FunctionsSkipped { peer: peer(), skipped },
         })

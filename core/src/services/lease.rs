@@ -442,7 +442,6 @@ pub trait Service {
     }
 
     /// The newest value, of a stream.
-    #[cfg(feature = "streams")]
     fn stream(&self) -> Option<&dyn crate::services::stream::Source> {
         None
     }

@@ -194,7 +194,6 @@ mod own_list;
 pub mod publications;
 pub mod requests;
 pub mod session;
-#[cfg(feature = "streams")]
 pub mod stream;
 pub mod typed;
 

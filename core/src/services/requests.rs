@@ -30,7 +30,6 @@ pub struct Pending {
     /// The class of a call whose function has a lease, which is released when the call fails.
     pub(crate) leased: Option<Priority>,
     /// The class that the call was made in.
-    #[cfg(feature = "details")]
     pub(crate) class: Priority,
     /// The call has ended, and its release has yet to be sent in the stream.
     pub(crate) release_unsent: bool,
@@ -122,7 +121,6 @@ impl<S: Storage> Requests<S> {
             generation,
             deadline,
             leased: leased.then_some(class),
-            #[cfg(feature = "details")]
             class,
             release_unsent: false,
         };
@@ -196,7 +194,6 @@ impl<S: Storage> Requests<S> {
     }
 
     /// A call that waits for its reply.
-    #[cfg(feature = "details")]
     pub(crate) fn waiting_for(&self, id: CallId) -> Option<&Pending> {
         let index = (id.0 as usize).checked_rem(self.pending.len())?;
         let place = self.pending.get(index)?.as_ref().filter(|pending| pending.id == id);

@@ -4,12 +4,10 @@
 //! which call them at a peer. Signatures and the places of variables are constants; a peer that has another version of the
 //! interface is told apart before anything is sent.
 
-#[cfg(feature = "details")]
 use core::future::Future;
 use core::ops::DerefMut;
 
 use crate::config::Priority;
-#[cfg(feature = "details")]
 use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::identity::Identity;
@@ -72,18 +70,15 @@ pub trait AnyCall {
     /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
     fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended>;
     /// What the service returns for this failure, whose text goes to the caller; on a port that cannot tell it, its code alone.
-    #[cfg(feature = "details")]
     fn fail(&self, failure: Failure) -> ServiceError {
         failure.error()
     }
     /// Tells the caller how far the call is, if it wants to know and the signature says `progress (…)`. Nothing on a port whose
     /// services have run to their end before anything can be sent, as on boards. An error where the values do not fit the signature.
-    #[cfg(feature = "details")]
     fn notify(&self, _progress: &ParametersView) -> Result<(), Error> {
         Ok(())
     }
     /// Whether the caller has given the call up, waits no longer, or is gone; never on a port as above.
-    #[cfg(feature = "details")]
     fn is_cancelled(&self) -> bool {
         false
     }
@@ -91,7 +86,6 @@ pub trait AnyCall {
 
 /// A call that tells `P` while it runs, and `F` when it fails: an argument `call: &impl TypedCall<Left, Blocked>` of a function
 /// declares both for its signature, as `progress (…)` and `fails (…)`. `()` stands for nothing. Every [`AnyCall`] is one.
-#[cfg(feature = "details")]
 pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
     /// Tells the caller how far the call is, as [`notify`](AnyCall::notify) does.
     fn progress(&self, values: &P) -> Result<(), Error> {
@@ -106,7 +100,6 @@ pub trait TypedCall<P: Variables, F: Variables = ()>: AnyCall {
 }
 
 /// A failure with values, or without them where text and bytes are longer than they are declared.
-#[cfg(feature = "details")]
 #[doc(hidden)]
 pub fn failure(code: u16, text: &str, values: &impl Variables) -> Failure {
     let mut failure = Failure::new(code, text);
@@ -116,7 +109,6 @@ pub fn failure(code: u16, text: &str, values: &impl Variables) -> Failure {
     failure
 }
 
-#[cfg(feature = "details")]
 impl<C: AnyCall, P: Variables, F: Variables> TypedCall<P, F> for C {}
 
 /// The state of a unit, for an `async fn` of an interface: an argument `state: &impl AsyncState<Self>` is no variable, but this.

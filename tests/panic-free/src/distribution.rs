@@ -142,6 +142,7 @@ entry!(attributes, {
     keep((Attributes::decode(unknown_slice()), unknown::<Attributes>().encode()));
     show(*unknown::<Attributes>());
     keep(unknown::<Attributes>().is_urgent(*unknown()));
+    keep(unknown::<Attributes>().is_stream());
     for flag in Attributes::FLAGS {
         flag.set(unknown(), !flag.is_set(unknown()));
         keep(flag.word());

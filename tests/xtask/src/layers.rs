@@ -19,7 +19,7 @@ enum Layer {
 }
 
 /// Modules at the root of the core that belong to no layer and that every layer may use.
-const FOUNDATION: [&str; 8] = ["bytes", "config", "counters", "error", "fmt", "random", "storage", "time"];
+const FOUNDATION: [&str; 9] = ["ability", "bytes", "config", "counters", "error", "fmt", "random", "storage", "time"];
 
 /// What services use of host directly, past distribution.
 struct Purpose {

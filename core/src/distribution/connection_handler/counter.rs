@@ -2,7 +2,7 @@
 
 crate::counters::counters! {
     /// What a unit counts about discovery and membership.
-    pub enum NodeCounter {
+    pub enum NodeCounter[<NodeCounter as crate::counters::Counter>::ALL.len()] {
         /// Datagrams of another mode, or of no unit at all.
         DatagramMagic,
         /// Datagrams of another version.

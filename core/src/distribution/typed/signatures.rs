@@ -1,6 +1,7 @@
 //! Signatures that are made when compiling, and the rules that they keep.
 
 use super::Units;
+use crate::ability::{HELP, NESTED};
 use crate::config::{DEPTH, FAILURE_VALUES_BYTES, HELP_BYTES, NAME_BYTES, SIGNATURE_BYTES, UNIT_BYTES, VARIABLES};
 use crate::distribution::function::{Signature, VariableSpec};
 use crate::distribution::name::is_name_byte;
@@ -42,7 +43,7 @@ impl Declared<'_> {
         while let Some((variable, unit)) = units.next() {
             bytes = bytes.saturating_add(variable.len()).saturating_add(unit.len()).saturating_add(7);
         }
-        if bytes == 0 || !cfg!(feature = "help") { 0 } else { bytes.saturating_add(2) }
+        if bytes == 0 || !HELP { 0 } else { bytes.saturating_add(2) }
     }
 }
 
@@ -115,7 +116,7 @@ impl<'a> Insides<'a> {
             };
             return Self { least: if kind.is_fixed() { longest } else { head }, longest, rest, wrong: "" };
         }
-        if !cfg!(feature = "nested") {
+        if !NESTED {
             return Self::wrong("lists and structs in structs need the feature `nested` of the core");
         }
         if depth >= DEPTH {

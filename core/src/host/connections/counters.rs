@@ -1,8 +1,11 @@
 //! What a link counts: one counter for each reason to drop, refuse or defer.
 
-crate::counters::counters! {
+use crate::ability::{DETAILS, STREAMS};
+use crate::counters::{Counter, counters};
+
+counters! {
     /// What a link counts (paper: "message monitoring").
-    pub enum LinkCounter {
+    pub enum LinkCounter[counted()] {
         /// Frames received.
         FramesReceived,
         /// Bytes received.
@@ -88,37 +91,35 @@ crate::counters::counters! {
         /// Leases of calls of this unit that it released because the peer answered no renewal for the length of the lease.
         RenewalsUnanswered,
         /// Texts or values of failures that were cut or dropped, because they were too long or did not fit the signature.
-        #[cfg(feature = "details")]
         DetailsDropped,
         /// Progress of calls sent.
-        #[cfg(feature = "details")]
         ProgressSent,
         /// Progress of calls received.
-        #[cfg(feature = "details")]
         ProgressReceived,
         /// Progress received of calls that have ended, or that could not be read.
-        #[cfg(feature = "details")]
         ProgressDropped,
         /// Calls of the peer that it gave up while they ran.
-        #[cfg(feature = "details")]
         RunningCancelled,
         /// Cancellations of calls that had ended already.
-        #[cfg(feature = "details")]
         CancelsIgnored,
         /// Values of streams sent to a subscriber.
-        #[cfg(feature = "streams")]
         SamplesSent,
         /// Values of streams received.
-        #[cfg(feature = "streams")]
         SamplesReceived,
         /// Values of streams that a newer one replaced before they were due for a subscriber.
-        #[cfg(feature = "streams")]
         SamplesReplaced,
         /// Values of streams received that this unit does not want, or cannot read.
-        #[cfg(feature = "streams")]
         SamplesDropped,
         /// Subscriptions refused by the access table, or because the peer has as many as it may.
-        #[cfg(feature = "streams")]
         SubscriptionsRefused,
+    }
+}
+
+/// The counters of an ability that is off are left out, as far as they stand last.
+const fn counted() -> usize {
+    match (STREAMS, DETAILS) {
+        (true, _) => <LinkCounter as Counter>::ALL.len(),
+        (false, true) => LinkCounter::SamplesSent as usize,
+        (false, false) => LinkCounter::DetailsDropped as usize,
     }
 }

@@ -2,8 +2,10 @@
 
 use super::permitting::{decide_call, log_refusal};
 use super::{Incoming, Phase, Session};
+use crate::ability::DETAILS;
 use crate::config::Priority;
 use crate::distribution::block;
+use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{REPLY_BYTES, encode_failure, encode_reply};
@@ -13,16 +15,6 @@ use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
 use crate::services::calls::{CallHead, Ticket};
 use crate::services::{Context, Port};
-
-/// What goes with an error to its caller.
-#[cfg(feature = "details")]
-type Details<'a> = Option<&'a crate::distribution::failure::Failure>;
-#[cfg(feature = "details")]
-const NO_DETAILS: Details<'static> = None;
-#[cfg(not(feature = "details"))]
-type Details<'a> = core::marker::PhantomData<&'a ()>;
-#[cfg(not(feature = "details"))]
-const NO_DETAILS: Details<'static> = core::marker::PhantomData;
 
 impl<P: Port> Session<P> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
@@ -129,7 +121,7 @@ impl<P: Port> Session<P> {
         ticket: Ticket,
         result: Result<&ParametersView, Error>,
     ) -> Result<(), Error> {
-        self.answer_with(cx, ticket, result, NO_DETAILS)
+        self.answer_with(cx, ticket, result, None)
     }
 
     /// One piece of code for answers with and without details.
@@ -138,7 +130,7 @@ impl<P: Port> Session<P> {
         cx: &mut Context<'_, P>,
         ticket: Ticket,
         result: Result<&ParametersView, Error>,
-        details: Details<'_>,
+        failure: Option<&Failure>,
     ) -> Result<(), Error> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
         // Before the answer leaves: one that says it was reset is true.
@@ -155,7 +147,7 @@ impl<P: Port> Session<P> {
             let sent = match result {
                 Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
                 Ok(_) => Ok(()),
-                Err(error) => self.send_failure(cx, &head, error, details),
+                Err(error) => self.send_failure(cx, &head, error, failure.filter(|_| DETAILS)),
             };
             // Returned before the call is closed: the port tries again, and the lease goes on meanwhile.
             if let Err(error @ Error::Full(_)) = sent {
@@ -207,17 +199,6 @@ impl<P: Port> Session<P> {
             }
             sent => sent,
         }
-    }
-
-    #[cfg(not(feature = "details"))]
-    fn send_failure(
-        &mut self,
-        cx: &mut Context<'_, P>,
-        head: &CallHead,
-        error: Error,
-        _: Details<'_>,
-    ) -> Result<(), Error> {
-        self.send_error(cx, head.id, head.priority, head.wants_reply, error)
     }
 
     pub(super) fn send_error(

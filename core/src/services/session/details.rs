@@ -4,6 +4,7 @@
 //! code; progress is sent when nothing waits to be sent, or not at all; a cancellation is heard once and answered by nothing.
 
 use super::{Event, Phase, ReplyBlock, Results, Session};
+use crate::ability::{Ability, Begins, DETAILS, Details};
 use crate::config::{PROGRESS_INTERVAL, Priority};
 use crate::distribution::block;
 use crate::distribution::failure::Failure;
@@ -21,7 +22,8 @@ use crate::services::{Context, Port};
 use crate::time::Instant;
 
 /// The details of one link.
-pub(super) struct Details {
+#[derive(Clone, Copy)]
+pub(super) struct OfCalls {
     /// Calls that run were given up, and the port has yet to be told.
     cancelled: bool,
     /// Those of the failure that came last.
@@ -33,6 +35,7 @@ pub(super) struct Details {
 }
 
 /// Where the details of a failure lie.
+#[derive(Clone, Copy)]
 struct Recorded {
     message: Span,
     step: u32,
@@ -41,11 +44,12 @@ struct Recorded {
     function: Option<(Slot, Generation)>,
 }
 
-impl Details {
-    pub(super) const fn new() -> Self {
-        Self { cancelled: false, failure: None, progress_due: Instant::START, progress_waits: false }
-    }
+impl Begins for OfCalls {
+    const BEGIN: &'static Self =
+        &Self { cancelled: false, failure: None, progress_due: Instant::START, progress_waits: false };
+}
 
+impl OfCalls {
     pub(super) fn deadline(&self) -> Instant {
         match (self.cancelled, self.progress_waits) {
             (true, _) => Instant::START,
@@ -68,7 +72,7 @@ impl<P: Port> Session<P> {
     /// Values come with replies alone. `lent` is what was lent to the [`receive`](Self::receive) that returned the event.
     pub fn failure(&mut self, lent: &[u8]) -> Option<Failure> {
         let Recorded { message, code, function, .. } =
-            self.details.failure.take().filter(|recorded| recorded.step == self.step)?;
+            self.details.get_mut()?.failure.take().filter(|recorded| recorded.step == self.step)?;
         let FailureDetails { text, values } = FailureDetails::of(self.link.view(message, lent))?;
         let mut failure = Failure::new(code, text);
         let mut is_whole = !failure.is_cut();
@@ -86,7 +90,7 @@ impl<P: Port> Session<P> {
 
     /// Before the message is dealt with, since the call is forgotten then.
     pub(super) fn note_failure(&mut self, message: Span, lent: &[u8]) {
-        self.details.failure = None;
+        self.details.change(|details| details.failure = None);
         let bytes = self.link.view(message, lent);
         if FailureDetails::of(bytes).is_none() {
             return;
@@ -95,7 +99,7 @@ impl<P: Port> Session<P> {
         let pending = self.requests.waiting_for(CallId(u32::from_le_bytes([a, b, c, d])));
         let function = pending.map(|pending| (pending.slot, pending.generation));
         let code = u16::from_le_bytes([low, high]);
-        self.details.failure = Some(Recorded { message, step: self.step, code, function });
+        self.details.change(|details| details.failure = Some(Recorded { message, step: self.step, code, function }));
     }
 
     /// Answers with an error. What exceeds a limit is left out, the values first; so is all but the code where there is no
@@ -176,11 +180,11 @@ impl<P: Port> Session<P> {
             // What gathers goes first, and nothing is to wait behind what this sends.
             self.flush(cx);
             if self.link.queued() > 0 {
-                self.details.progress_due = cx.now + PROGRESS_INTERVAL;
+                self.details.change(|details| details.progress_due = cx.now + PROGRESS_INTERVAL);
             }
         }
         if cx.now < self.details.progress_due {
-            self.details.progress_waits = true;
+            self.details.change(|details| details.progress_waits = true);
             return Err(Error::Full(Limit::SendQueue));
         }
         self.send(cx, Priority::Low, PROGRESS_BYTES.saturating_add(length), &mut |writer| {
@@ -188,7 +192,7 @@ impl<P: Port> Session<P> {
             block::write(specs, values, writer);
         })?;
         self.link.counters.count(LinkCounter::ProgressSent);
-        self.details.progress_due = cx.now + PROGRESS_INTERVAL;
+        self.details.change(|details| details.progress_due = cx.now + PROGRESS_INTERVAL);
         Ok(())
     }
 
@@ -212,7 +216,7 @@ impl<P: Port> Session<P> {
                 declares && block::check(values.specs, values.bytes).is_ok()
             });
         self.link.counters.count(if is_known { LinkCounter::ProgressReceived } else { LinkCounter::ProgressDropped });
-        reported.filter(|_| is_known).map(|reported| Event::Progress(id, reported))
+        reported.filter(|_| is_known).and_then(Details::of).map(|reported| Event::Progress(id, reported))
     }
 
     // --- cancellation
@@ -222,7 +226,7 @@ impl<P: Port> Session<P> {
     pub(super) fn send_cancel(&mut self, cx: &mut Context<'_, P>, pending: &Pending) {
         // A stop is not taken back: its handler runs, however late it comes.
         let stops = self.theirs.function(pending.slot).is_some_and(|function| function.attributes.stop);
-        if self.phase == Phase::Live && !stops {
+        if DETAILS && self.phase == Phase::Live && !stops {
             let body = SessionBody::cancel(&Release { call: pending.id.0, class: pending.class });
             self.link.send_frame(&Frame::Session(&body));
             self.flush(cx);
@@ -237,7 +241,7 @@ impl<P: Port> Session<P> {
             Ok(false) => {}
             Ok(true) => {
                 self.link.counters.count(LinkCounter::RunningCancelled);
-                self.details.cancelled = true;
+                self.details.change(|details| details.cancelled = true);
             }
             Err(_) if self.calls.has_arrived(class, call) && !self.calls.is_waiting(class, call) => {
                 self.link.counters.count(LinkCounter::CancelsIgnored);
@@ -249,13 +253,13 @@ impl<P: Port> Session<P> {
 
     /// What the port is to be told, from [`poll`](Self::poll).
     pub(super) fn poll_details(&mut self, now: Instant) -> Option<Event> {
-        self.details.progress_waits &= now < self.details.progress_due;
+        self.details.change(|details| details.progress_waits &= now < details.progress_due);
         if !self.details.cancelled {
             return None;
         }
         let ticket = self.calls.take_cancelled();
-        self.details.cancelled = ticket.is_some();
-        ticket.map(Event::Cancelled)
+        self.details.change(|details| details.cancelled = ticket.is_some());
+        ticket.and_then(Details::of).map(Event::Cancelled)
     }
 
     /// Whether the caller of a running call has given it up; also where the call has ended.

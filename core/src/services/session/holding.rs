@@ -186,7 +186,6 @@ impl<P: Port> Session<P> {
             let is_late = pending.deadline <= cx.now;
             let counter = if is_late { LinkCounter::CallsTimedOut } else { LinkCounter::CallsCancelled };
             self.link.counters.count(counter);
-            #[cfg(feature = "details")]
             self.send_cancel(cx, pending);
         }
         self.release_call(cx, id, pending);

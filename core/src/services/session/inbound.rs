@@ -5,6 +5,7 @@ use super::permitting::may_publish;
 use super::publishing::Advertised;
 use super::timing::sent_at_earliest;
 use super::{Event, Phase, Session, close_reason};
+use crate::ability::{DETAILS, STREAMS};
 use crate::config::{EMERGENCY_BYTES, Mode, Priority};
 use crate::distribution::function::{Attributes, Signature, VariableSpecs};
 use crate::distribution::function_list::{Function, Generation, Slot};
@@ -284,8 +285,7 @@ impl<P: Port> Session<P> {
                 None
             }
             Some(SessionBody::Release(release)) => self.released(cx, release),
-            #[cfg(feature = "details")]
-            Some(SessionBody::Cancel(release)) => self.cancel_arrived(cx, release),
+            Some(SessionBody::Cancel(release)) if DETAILS => self.cancel_arrived(cx, release),
             Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
             Some(SessionBody::Message(priority, message)) => {
                 match (Priority::from_wire(priority), Message::decode(message)) {
@@ -313,7 +313,8 @@ impl<P: Port> Session<P> {
                 }
                 None
             }
-            None => self.unreadable_datagram(),
+            // Nothing is decoded of an ability that is off.
+            Some(SessionBody::Cancel(_)) | None => self.unreadable_datagram(),
         }
     }
 
@@ -330,8 +331,9 @@ impl<P: Port> Session<P> {
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
-        #[cfg(feature = "details")]
-        self.note_failure(span, lent);
+        if DETAILS {
+            self.note_failure(span, lent);
+        }
         match Message::decode(self.link.view(span, lent)) {
             Some(Message::Request(header, block)) => {
                 let block = span.last(block.len());
@@ -345,13 +347,11 @@ impl<P: Port> Session<P> {
                 self.release_call(cx, CallId(id), None);
                 Some(Event::Failed(CallId(id), error))
             }
-            #[cfg(feature = "streams")]
-            Some(Message::Sample(header, block)) => {
+            Some(Message::Sample(header, block)) if STREAMS => {
                 let block = span.last(block.len());
                 self.sample_arrived(cx.now, &header, block, lent)
             }
-            #[cfg(feature = "details")]
-            Some(Message::Progress(id, block)) => {
+            Some(Message::Progress(id, block)) if DETAILS => {
                 let block = span.last(block.len());
                 self.progress_arrived(CallId(id), block, lent)
             }
@@ -359,7 +359,7 @@ impl<P: Port> Session<P> {
                 let items = span.last(items.len());
                 self.controls_arrived(cx, items, lent)
             }
-            None => {
+            Some(Message::Sample(..) | Message::Progress(..)) | None => {
                 self.close(cx, CloseReason::Protocol);
                 None
             }
@@ -459,13 +459,11 @@ impl<P: Port> Session<P> {
             Control::Actuator { slot, latch, last } => {
                 Some(Event::Actuator { slot: Slot(slot), state: ActuatorState { latch, last } })
             }
-            #[cfg(feature = "streams")]
-            Control::Subscribe { slot, generation, interval } => {
+            Control::Subscribe { slot, generation, interval } if STREAMS => {
                 self.subscription_arrived(cx, Slot(slot), Generation(generation), interval);
                 None
             }
-            #[cfg(feature = "streams")]
-            Control::Subscribed { slot, generation, interval, bytes, refusal } => {
+            Control::Subscribed { slot, generation, interval, bytes, refusal } if STREAMS => {
                 let granted =
                     super::GrantedStream { interval: crate::time::Duration::from_millis(interval.into()), bytes };
                 self.subscription_answered(Slot(slot), Generation(generation), granted, refusal)
@@ -477,6 +475,7 @@ impl<P: Port> Session<P> {
             Control::LeaseEnded { call, why } => {
                 self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })
             }
+            Control::Subscribe { .. } | Control::Subscribed { .. } => None,
         };
         (left, event)
     }
@@ -575,8 +574,7 @@ impl<P: Port> Session<P> {
             Advertised::Earlier => return Err(Error::StaleFunction),
             Advertised::Now => function?,
         };
-        #[cfg(feature = "streams")]
-        if function.attributes.stream.is_some() {
+        if function.attributes.is_stream() {
             return Err(Error::UnknownFunction);
         }
         if cx.access.is_some() {

@@ -17,7 +17,6 @@
 
 mod answering;
 mod consulting;
-#[cfg(feature = "details")]
 mod details;
 mod granting;
 mod holding;
@@ -30,16 +29,15 @@ mod pinging;
 mod proving;
 mod publishing;
 mod renewing;
-#[cfg(feature = "streams")]
 mod streaming;
 mod timing;
 
 pub use inbound::{Receipt, ReplyBlock, Results};
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
-#[cfg(feature = "streams")]
 pub use streaming::{Granted as GrantedStream, Sample};
 
+use crate::ability::{Ability, DETAILS, Details, STREAMS, State, Streams};
 use crate::config::{Constraints, HELLO_TIMEOUT, LEASES, LINK_BUFFER_BYTES, Mode, Priority};
 use crate::counters::Counters;
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
@@ -145,17 +143,13 @@ pub enum Event {
         state: ActuatorState,
     },
     /// What a call of this unit tells while it runs; [`Session::progress_values`] shows the values.
-    #[cfg(feature = "details")]
-    Progress(CallId, Results),
+    Progress(CallId, <Details as Ability>::Of<Results>),
     /// The caller has given up a call that runs: its handler is to be told, and the answer reaches no one.
-    #[cfg(feature = "details")]
-    Cancelled(Ticket),
+    Cancelled(<Details as Ability>::Of<Ticket>),
     /// A value of a stream of the peer.
-    #[cfg(feature = "streams")]
-    Sample(Sample),
+    Sample(<Streams as Ability>::Of<Sample>),
     /// What became of a subscription to a stream of the peer; after an error it has ended.
-    #[cfg(feature = "streams")]
-    Subscribed(Slot, Result<GrantedStream, Error>),
+    Subscribed(Slot, <Streams as Ability>::Of<Result<GrantedStream, Error>>),
     /// The peer answered a [`Session::ping`].
     Answered,
     /// The link has ended; every call in flight and every lease has been reported before.
@@ -240,10 +234,8 @@ pub struct Session<P: Port> {
     held: heapless::Vec<Held, LEASES>,
     answered: holding::Answered,
     releases: holding::Releases,
-    #[cfg(feature = "streams")]
-    streaming: streaming::Streaming,
-    #[cfg(feature = "details")]
-    details: details::Details,
+    streaming: State<streaming::Streaming, { STREAMS as usize }>,
+    details: State<details::OfCalls, { DETAILS as usize }>,
     /// The newest call that was to move something.
     last_order: Option<(Slot, CallId)>,
     /// How often something was received, by which [`Results`] are known to be the last ones.
@@ -295,10 +287,8 @@ impl<P: Port> Session<P> {
             held: heapless::Vec::new(),
             answered: holding::Answered::new(),
             releases: holding::Releases::new(),
-            #[cfg(feature = "streams")]
-            streaming: streaming::Streaming::new(),
-            #[cfg(feature = "details")]
-            details: details::Details::new(),
+            streaming: State::NEW,
+            details: State::NEW,
             last_order: None,
             step: 0,
         }
@@ -528,8 +518,9 @@ impl<P: Port> Session<P> {
         self.pump_renewal(cx);
         self.send_releases(cx);
         self.pump(cx);
-        #[cfg(feature = "streams")]
-        self.send_samples(cx);
+        if STREAMS {
+            self.send_samples(cx);
+        }
     }
 
     /// Changes the limits of this unit; the peer is told.

@@ -1,6 +1,7 @@
 //! The way down: a request becomes a message, checked against what the peer published and the limits that it told.
 
 use super::{Phase, Session};
+use crate::ability::DETAILS;
 use crate::config::{DATAGRAM_BYTES, EMERGENCY_BYTES, Priority};
 use crate::distribution::block::{self, Put, SliceWriter};
 use crate::distribution::function::Signature;
@@ -47,7 +48,6 @@ pub struct RequestOptions {
     /// Its place among the calls of its link, where it was [made](Session::make) before it is sent; now if none.
     pub made: Option<Made>,
     /// Tell what the call tells while it runs, if its function declares that.
-    #[cfg(feature = "details")]
     pub progress: bool,
 }
 
@@ -62,7 +62,6 @@ impl RequestOptions {
             take_over: false,
             operator: false,
             made: None,
-            #[cfg(feature = "details")]
             progress: false,
         }
     }
@@ -166,8 +165,7 @@ impl<P: Port> Session<P> {
         }
         let function = self.theirs.named(callee.name()).ok_or(Error::UnknownFunction)?;
         callee.check(function.signature).map_err(|found| Error::Mismatch(found.part))?;
-        #[cfg(feature = "streams")]
-        if function.attributes.stream.is_some() {
+        if function.attributes.is_stream() {
             return Err(Error::UnknownFunction);
         }
         let priority = options.priority.unwrap_or(function.attributes.priority);
@@ -186,10 +184,8 @@ impl<P: Port> Session<P> {
         }
         let (stamp, since) = self.clock.stamp(cx.now);
         let remaining = options.timeout.unwrap_or(self.constraints.request_timeout);
-        #[cfg(feature = "details")]
-        let wants_progress = wants_reply && options.progress && function.signature.progress().next().is_some();
-        #[cfg(not(feature = "details"))]
-        let wants_progress = false;
+        let wants_progress =
+            DETAILS && wants_reply && options.progress && function.signature.progress().next().is_some();
         let header = RequestHeader {
             id: 0,
             slot: function.slot,

@@ -1,7 +1,9 @@
 //! Which of this unit's functions one peer has been told of, and what it is still to be told.
 
 use super::LEAST_MESSAGE_BYTES;
+use super::streaming::Subscription;
 use super::{Phase, Session};
+use crate::ability::{HELP, STREAMS, State};
 use crate::config::{Priority, SIGNATURE_BYTES};
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::{Generation, Slot};
@@ -29,8 +31,7 @@ pub struct Publication {
     /// What the peer has left of the rate that it may call at.
     bucket: Bucket,
     /// Of a stream.
-    #[cfg(feature = "streams")]
-    subscription: super::streaming::Subscription,
+    subscription: State<Subscription, { STREAMS as usize }>,
 }
 
 /// Whether a peer may call a function.
@@ -167,13 +168,11 @@ impl<S: Storage> Publishing<S> {
     }
 
     /// What the peer wants of a stream.
-    #[cfg(feature = "streams")]
-    pub(super) fn subscription(&mut self, slot: Slot) -> Option<&mut super::streaming::Subscription> {
-        self.table.get_mut(usize::from(slot.0)).map(|publication| &mut publication.subscription)
+    pub(super) fn subscription(&mut self, slot: Slot) -> Option<&mut Subscription> {
+        self.table.get_mut(usize::from(slot.0))?.subscription.get_mut()
     }
 
     /// How many streams the peer is subscribed to.
-    #[cfg(feature = "streams")]
     pub(super) fn count_subscriptions(&self) -> u16 {
         self.table.iter().filter(|publication| publication.subscription.is_active()).count() as u16
     }
@@ -263,8 +262,9 @@ impl<P: Port> Session<P> {
             let serial = self.publishing.serial;
             self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
         }
-        #[cfg(feature = "streams")]
-        self.pump_streams(cx);
+        if STREAMS {
+            self.pump_streams(cx);
+        }
     }
 
     /// Whether the peer may be told what is published: it has proven itself to this end, which dialled, or the link is live.
@@ -284,9 +284,10 @@ impl<P: Port> Session<P> {
     /// Whether something waits for room.
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
-        let advertised = publishing.acknowledgement_due.is_none() && self.ends.is_empty() && !self.obedience.has_news;
-        #[cfg(feature = "streams")]
-        let advertised = advertised && !self.streaming.has_news();
+        let advertised = publishing.acknowledgement_due.is_none()
+            && self.ends.is_empty()
+            && !self.obedience.has_news
+            && !(STREAMS && self.streaming.has_news());
         publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !advertised
     }
 
@@ -337,8 +338,7 @@ impl<P: Port> Session<P> {
                 Some(function) => {
                     let actuator = self.actuator_of(cx, function.handler);
                     let whole = function.signature.as_bytes();
-                    let least =
-                        if cfg!(feature = "help") { function.signature.without_help().as_bytes() } else { whole };
+                    let least = if HELP { function.signature.without_help().as_bytes() } else { whole };
                     let control = Control::Publish {
                         slot: slot.0,
                         generation: function.generation.0,

@@ -7,6 +7,7 @@
 use super::permitting::decide;
 use super::publishing::Advertised;
 use super::{Event, Phase, Results, Session};
+use crate::ability::{Ability, Begins, Streams};
 use crate::config::Priority;
 use crate::distribution::block;
 use crate::distribution::function_list::{Function, Generation, Slot};
@@ -66,13 +67,12 @@ impl Subscription {
     }
 }
 
-impl Default for Subscription {
-    fn default() -> Self {
-        Self::NONE
-    }
+impl Begins for Subscription {
+    const BEGIN: &'static Self = &Self::NONE;
 }
 
 /// The streams of one link.
+#[derive(Clone, Copy)]
 pub(super) struct Streaming {
     /// Subscriptions of the peer.
     active: u16,
@@ -88,19 +88,19 @@ pub(super) struct Streaming {
     wishes_due: bool,
 }
 
-impl Streaming {
-    pub(super) const fn new() -> Self {
-        Self {
-            active: 0,
-            first: 0,
-            due: Instant::FAR_FUTURE,
-            blocked: None,
-            paid: Instant::START,
-            answers_due: false,
-            wishes_due: false,
-        }
-    }
+impl Begins for Streaming {
+    const BEGIN: &'static Self = &Self {
+        active: 0,
+        first: 0,
+        due: Instant::FAR_FUTURE,
+        blocked: None,
+        paid: Instant::START,
+        answers_due: false,
+        wishes_due: false,
+    };
+}
 
+impl Streaming {
     /// When a sample can be made, where so many bytes wait on the link.
     pub(super) fn deadline(&self, queued: usize) -> Instant {
         match self.blocked {
@@ -146,11 +146,11 @@ impl<P: Port> Session<P> {
         if self.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        let known = self.theirs.named(stream).filter(|function| function.attributes.stream.is_some());
+        let known = self.theirs.named(stream).filter(|function| function.attributes.is_stream());
         let slot = known.ok_or(Error::UnknownFunction)?.slot;
         if let Some(wish) = self.theirs.wish_mut(slot) {
             wish.interval = interval;
-            self.streaming.wishes_due = true;
+            self.streaming.change(|streaming| streaming.wishes_due = true);
         }
         self.pump_streams(cx);
         Ok(slot)
@@ -161,13 +161,13 @@ impl<P: Port> Session<P> {
     pub fn stream_changed(&mut self, now: Instant) -> bool {
         let wanted = self.streaming.active > 0;
         if wanted {
-            self.streaming.due = self.streaming.due.min(now);
+            self.streaming.change(|streaming| streaming.due = streaming.due.min(now));
         }
         wanted
     }
 
     /// Streams of this unit that the peer is subscribed to.
-    pub const fn subscriptions(&self) -> u16 {
+    pub fn subscriptions(&self) -> u16 {
         self.streaming.active
     }
 
@@ -175,7 +175,7 @@ impl<P: Port> Session<P> {
     pub(super) fn pump_streams(&mut self, cx: &mut Context<'_, P>) {
         while self.streaming.wishes_due {
             let Some((slot, generation, interval)) = self.theirs.untold_wish() else {
-                self.streaming.wishes_due = false;
+                self.streaming.change(|streaming| streaming.wishes_due = false);
                 break;
             };
             if !self.send_control(cx, &Control::Subscribe { slot: slot.0, generation: generation.0, interval }) {
@@ -186,7 +186,8 @@ impl<P: Port> Session<P> {
             }
         }
         if self.streaming.answers_due {
-            self.streaming.answers_due = !self.send_answers(cx);
+            let are_due = !self.send_answers(cx);
+            self.streaming.change(|streaming| streaming.answers_due = are_due);
         }
     }
 
@@ -234,9 +235,10 @@ impl<P: Port> Session<P> {
         let answer = Some(granted.err().unwrap_or(SubscriptionRefusal::None));
         let interval = granted.unwrap_or(NO_SUBSCRIPTION);
         *subscription = Subscription { interval, version, generation, answer, due };
-        self.streaming.active = self.publishing.count_subscriptions();
-        self.streaming.answers_due = true;
-        self.streaming.due = cx.now;
+        let active = self.publishing.count_subscriptions();
+        self.streaming.change(|streaming| {
+            (streaming.active, streaming.answers_due, streaming.due) = (active, true, cx.now);
+        });
         self.pump_streams(cx);
     }
 
@@ -267,7 +269,7 @@ impl<P: Port> Session<P> {
     ) -> Option<Function<'f, dyn crate::services::lease::Service>> {
         let function = cx.functions.lookup(slot, generation).ok()?;
         let is_advertised = matches!(self.publishing.advertised(slot, generation), Advertised::Now);
-        (is_advertised && function.attributes.stream.is_some()).then_some(function)
+        (is_advertised && function.attributes.is_stream()).then_some(function)
     }
 
     fn decide_stream(
@@ -281,8 +283,7 @@ impl<P: Port> Session<P> {
     /// Sends each value that is due, as far as the stream is empty: so none is ever before a call that this end sends later, and
     /// one that waits is the newest when it leaves.
     pub(super) fn send_samples(&mut self, cx: &mut Context<'_, P>) {
-        self.streaming.due = Instant::FAR_FUTURE;
-        self.streaming.blocked = None;
+        self.streaming.change(|streaming| (streaming.due, streaming.blocked) = (Instant::FAR_FUTURE, None));
         if self.streaming.active == 0 || self.phase != Phase::Live {
             return;
         }
@@ -296,16 +297,16 @@ impl<P: Port> Session<P> {
                 continue;
             }
             match self.attempt(cx, slot, &subscription) {
-                Attempt::Sent => self.streaming.first = index.saturating_add(1),
+                Attempt::Sent => self.streaming.change(|streaming| streaming.first = index.saturating_add(1)),
                 Attempt::Later(due) => next = next.min(due),
                 Attempt::Ended(why) => self.end_subscription(slot, why),
                 Attempt::Blocked => {
-                    self.streaming.blocked = Some(cx.now);
+                    self.streaming.change(|streaming| streaming.blocked = Some(cx.now));
                     break;
                 }
             }
         }
-        self.streaming.due = next;
+        self.streaming.change(|streaming| streaming.due = next);
         self.pump_streams(cx);
     }
 
@@ -374,7 +375,7 @@ impl<P: Port> Session<P> {
             self.link.counters.add(LinkCounter::SamplesSent, 1);
             let second = (total as u64).saturating_mul(SECOND);
             let cost = second.checked_div(u64::from(self.constraints.stream_bytes)).unwrap_or(SECOND);
-            self.streaming.paid = cx.now + Duration::from_micros(cost);
+            self.streaming.change(|streaming| streaming.paid = cx.now + Duration::from_micros(cost));
         }
         if subscription.version != 0 {
             let replaced = version.wrapping_sub(subscription.version).saturating_sub(1);
@@ -395,9 +396,10 @@ impl<P: Port> Session<P> {
         if let Some(subscription) = self.publishing.subscription(slot) {
             *subscription =
                 Subscription { answer: Some(why), generation: subscription.generation, ..Subscription::NONE };
-            self.streaming.answers_due = true;
+            self.streaming.change(|streaming| streaming.answers_due = true);
         }
-        self.streaming.active = self.publishing.count_subscriptions();
+        let active = self.publishing.count_subscriptions();
+        self.streaming.change(|streaming| streaming.active = active);
     }
 
     /// A value of a stream of the peer.
@@ -420,7 +422,8 @@ impl<P: Port> Session<P> {
         self.link.counters.add(LinkCounter::SamplesReceived, 1);
         let age = micros(now.as_micros()).saturating_sub(made);
         let age = Duration::from_micros(u64::try_from(age).unwrap_or(0));
-        Some(Event::Sample(Sample { slot, age, values: Results { slot, generation, block, step: self.step } }))
+        let values = Results { slot, generation, block, step: self.step };
+        Streams::of(Sample { slot, age, values }).map(Event::Sample)
     }
 
     /// What became of a subscription of this unit.
@@ -435,14 +438,18 @@ impl<P: Port> Session<P> {
         let wish = self.theirs.wish_mut(slot).filter(|wish| wish.interval != NO_SUBSCRIPTION)?;
         let error = match refusal {
             SubscriptionRefusal::None if granted.interval >= millis(NO_SUBSCRIPTION) => return None,
-            SubscriptionRefusal::None => return Some(Event::Subscribed(slot, Ok(granted))),
+            SubscriptionRefusal::None => return event(slot, Ok(granted)),
             SubscriptionRefusal::Unknown => Error::StaleFunction,
             SubscriptionRefusal::NotAllowed => Error::NotAllowed,
             SubscriptionRefusal::Full => Error::Full(Limit::Subscriptions),
         };
         (wish.interval, wish.advertised) = (NO_SUBSCRIPTION, NO_SUBSCRIPTION);
-        Some(Event::Subscribed(slot, Err(error)))
+        event(slot, Err(error))
     }
+}
+
+fn event(slot: Slot, result: Result<Granted, Error>) -> Option<Event> {
+    Streams::of(result).map(|result| Event::Subscribed(slot, result))
 }
 
 const fn millis(interval: u32) -> Duration {

@@ -2,6 +2,7 @@
 
 use super::granting::expire_granted;
 use super::{CHALLENGE_DATAGRAMS, Event, Phase, Session, close_code};
+use crate::ability::{DETAILS, STREAMS};
 use crate::bytes::copy;
 use crate::config::{DATAGRAM_BYTES, GATHER};
 use crate::distribution::datagram;
@@ -108,10 +109,8 @@ impl<P: Port> Session<P> {
                     timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal).min(timers.release);
                 let own = own.min(self.obedience.next);
                 let own = own.min(self.renewal.deadline(self.dialed));
-                #[cfg(feature = "streams")]
-                let own = own.min(self.streaming.deadline(self.link.queued()));
-                #[cfg(feature = "details")]
-                let own = own.min(self.details.deadline());
+                let own = if STREAMS { own.min(self.streaming.deadline(self.link.queued())) } else { own };
+                let own = if DETAILS { own.min(self.details.deadline()) } else { own };
                 own.min(self.requests.deadline()).min(self.liveness.deadline())
             }
         }
@@ -142,14 +141,12 @@ impl<P: Port> Session<P> {
         }
         if let Some(pending) = self.requests.expire(cx.now) {
             let id = pending.id;
-            #[cfg(feature = "details")]
             self.send_cancel(cx, &pending);
             self.release_call(cx, id, Some(pending));
             self.link.counters.count(LinkCounter::CallsTimedOut);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
         }
-        #[cfg(feature = "details")]
-        if let Some(event) = self.poll_details(cx.now) {
+        if DETAILS && let Some(event) = self.poll_details(cx.now) {
             return Some(event);
         }
         // From here on only frames are sent; what the port has to do for others was returned above, one event a call.
@@ -173,8 +170,7 @@ impl<P: Port> Session<P> {
         self.poll_renewal(cx);
         self.poll_obedience(cx);
         self.look_for_peer(cx);
-        #[cfg(feature = "streams")]
-        if cx.now >= self.streaming.deadline(self.link.queued()) {
+        if STREAMS && cx.now >= self.streaming.deadline(self.link.queued()) {
             self.send_samples(cx);
         }
         match self.phase {
