@@ -5,11 +5,12 @@
 //! their length as u32, four bytes of zero, then the bytes, padded with zeros to 8. There is one encoding of each
 //! list of values; anything else is malformed. Lists and records are in [`nested`].
 
-use super::function::{RawSpec, VariableSpecs};
-use super::nested;
-use super::parameters::{ParametersView, Type, Value, bytes_of_variable};
-use super::value::saturate;
-use crate::bytes::{copy, is_text};
+use super::function::Signature;
+use super::nested::{self, is_canonical, split};
+use super::parameters::ParametersView;
+use super::spec::{self, RawSpec, VariableSpecs, bytes_of_variable, padding_after};
+use super::value::{Value, saturate};
+use crate::bytes::copy;
 use crate::config::VARIABLES;
 use crate::error::{Error, Limit};
 
@@ -109,7 +110,7 @@ pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut imp
 pub fn longest(specs: VariableSpecs<'_>) -> Option<usize> {
     specs.raw().try_fold(0_usize, |sum, spec| {
         if spec.kind.is_nested() {
-            return sum.checked_add(nested::longest(spec)?);
+            return sum.checked_add(spec::longest(spec)?);
         }
         let head = if spec.kind.is_fixed() { 0 } else { 8 };
         sum.checked_add(head)?.checked_add(spec.kind.bytes_of(spec.size)?.checked_next_multiple_of(8)?)
@@ -226,7 +227,7 @@ impl Room {
     fn take_nested(&mut self, to: &ParametersView, index: u8, spec: RawSpec<'_>, bytes: &[u8]) -> Result<(), Error> {
         let Some(own) = to.named(spec.name) else {
             self.take(to, index, spec, spec.size)?;
-            self.needed = self.needed.saturating_add(bytes.len().saturating_sub(nested::least(spec)));
+            self.needed = self.needed.saturating_add(bytes.len().saturating_sub(spec::least(spec)));
             return Ok(());
         };
         let value = Value { index, kind: spec.kind, size: spec.size, inner: spec.inner, bytes };
@@ -238,7 +239,7 @@ impl Room {
     /// The same before the value is known.
     fn take_any_nested(&mut self, to: &ParametersView, index: u8, spec: RawSpec<'_>) -> Result<(), Error> {
         match to.named(spec.name) {
-            Some(own) if nested::can_be(spec, own.raw_spec(), nested::Bounds::Free) => Ok(()),
+            Some(own) if spec::can_be(spec, own.raw_spec(), spec::Bounds::Free) => Ok(()),
             Some(_) => Err(Error::WrongType { index }),
             None => self.take(to, index, spec, spec.size),
         }
@@ -301,29 +302,6 @@ fn commit(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersVie
     Ok(())
 }
 
-/// The value at the start of `block`, and what follows it; `None` if it is cut off, too long or not padded with zeros.
-pub(super) fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
-    let (length, rest) = if spec.kind.is_fixed() {
-        (spec.kind.bytes_of(spec.size)?, block)
-    } else {
-        let (&head, rest) = block.split_first_chunk::<8>()?;
-        // The upper half is the four bytes of zero, so that a longer value fails here.
-        let length = u32::try_from(u64::from_le_bytes(head)).ok().filter(|&length| length <= spec.size)?;
-        (length as usize, rest)
-    };
-    let (value, rest) = rest.split_at_checked(length)?;
-    let (padding, rest) = rest.split_at_checked(padding_after(length))?;
-    padding.iter().all(|&byte| byte == 0).then_some((value, rest))
-}
-
-pub(super) fn is_canonical(kind: Type, value: &[u8]) -> bool {
-    match kind {
-        Type::String => is_text(value),
-        Type::Bool => value.iter().all(|&byte| byte <= 1),
-        Type::Int | Type::Float | Type::Bytes | Type::List | Type::Record => true,
-    }
-}
-
 #[inline]
 fn encoded_length(value: Value<'_>) -> usize {
     let head = if value.kind().is_fixed() { 0 } else { 8 };
@@ -331,9 +309,17 @@ fn encoded_length(value: Value<'_>) -> usize {
     bytes.saturating_add(head).saturating_add(padding_after(bytes))
 }
 
-/// Bytes of zero after `length` bytes, so that the next value starts at a multiple of 8.
-pub(super) const fn padding_after(length: usize) -> usize {
-    length.wrapping_neg() & 7
+impl ParametersView {
+    /// Replaces all variables by the arguments of a function, then its other results, each 0, `false` or empty: in the order
+    /// in which a service gets them.
+    #[doc(hidden)]
+    pub fn lay_out(&mut self, function: Signature<'_>) -> Result<(), Error> {
+        self.clear();
+        for spec in function.arguments().raw() {
+            self.add_checked(spec)?;
+        }
+        prepare_results(function.results(), self)
+    }
 }
 
 #[cfg(test)]

@@ -130,9 +130,6 @@ controls! {
     }
 }
 
-/// As the interval of a subscription: there is none.
-pub const NO_SUBSCRIPTION: u32 = u32::MAX;
-
 /// Why a subscription was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]

@@ -12,11 +12,10 @@ use crate::config::{SIGNATURE_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
 pub use super::attributes::{Attributes, Flag};
-use super::help;
 use super::name::check_name;
-use super::nested;
-use super::parameters::{ParametersView, Type, bytes_of_variable};
-use super::text::{self, ParseError};
+use super::parameters::ParametersView;
+pub use super::spec::{VariableSpec, VariableSpecs};
+use super::spec::{bytes_of_variable, check_inner};
 use super::value::saturate;
 
 /// An own function's signature.
@@ -43,61 +42,10 @@ pub struct Signature<'a> {
     bytes: &'a [u8],
 }
 
-/// Name, type and size of one argument or result, or of a field of a record.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct VariableSpec<'a> {
-    /// Its name.
-    pub name: &'a str,
-    /// Its type.
-    pub kind: Type,
-    /// Its size: exactly this many numbers or truth values, at most this many bytes of a string or bytes, at most this many
-    /// elements of a list, or the number of a record's fields.
-    pub size: u32,
-    /// What a list or record is made of, as it stands in a signature; empty for other types.
-    pub inner: &'a [u8],
-}
-
-/// A [`VariableSpec`] with an unvalidated name, for comparison only: validating UTF-8 would dominate the cost of a
-/// short request.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct RawSpec<'a> {
-    pub(super) name: &'a [u8],
-    pub(super) kind: Type,
-    pub(super) size: u32,
-    pub(super) inner: &'a [u8],
-}
-
-/// The arguments or the results of a [`Signature`], in its order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct VariableSpecs<'a> {
-    pub(super) left: u8,
-    pub(super) rest: &'a [u8],
-}
-
 impl Definition {
     /// A function without arguments and results.
     pub fn new(name: &str) -> Result<Self, Error> {
         Builder::new(name).map(Builder::finish)
-    }
-
-    /// A function from its text form, as in `go_to(position: int[2]) -> (done: bool)`.
-    ///
-    /// ```
-    /// let go_to = cara_core::Definition::parse("go_to(position: int[2]) -> (done: bool)").unwrap();
-    /// assert_eq!((go_to.name(), go_to.signature().arguments().count()), ("go_to", 1));
-    /// ```
-    pub fn parse(text: &str) -> Result<Self, ParseError> {
-        text::parse(text)
-    }
-
-    /// A stream from its text form, as in `pose(position: float[2])`: a function without arguments whose results are the values.
-    ///
-    /// ```
-    /// let pose = cara_core::Definition::stream("pose(position: float[2])").unwrap();
-    /// assert_eq!(pose.to_string(), "pose() -> (position: float[2])");
-    /// ```
-    pub fn stream(text: &str) -> Result<Self, ParseError> {
-        text::parse_stream(text)
     }
 
     /// The same function with the variables of `parameters` as its arguments; their values don't matter.
@@ -175,6 +123,9 @@ fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_
     })
 }
 
+/// The number of the section that is for people; whatever has a greater one is behind it.
+pub(super) const HELP_SECTION: u8 = 3;
+
 /// What a signature may declare behind its results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Section {
@@ -194,7 +145,7 @@ impl<'a> Signature<'a> {
         let (name, arguments, results) = Self::split(bytes).ok_or(Error::Malformed)?;
         let whole = Self { bytes };
         // What a later version may have behind it is of no use.
-        let with_help = whole.in_front_of(help::SECTION.saturating_add(1));
+        let with_help = whole.in_front_of(HELP_SECTION.saturating_add(1));
         let has_room = HELP && with_help.bytes.len() <= SIGNATURE_BYTES;
         let this = if has_room { with_help } else { whole.without_help() };
         if this.bytes.len() > SIGNATURE_BYTES {
@@ -234,7 +185,7 @@ impl<'a> Signature<'a> {
 
     /// What people read is not in it.
     pub(crate) fn without_help(self) -> Self {
-        self.in_front_of(help::SECTION)
+        self.in_front_of(HELP_SECTION)
     }
 
     /// All in front of this section and those with greater numbers.
@@ -311,120 +262,6 @@ impl<'a> Signature<'a> {
             }
         }
         Some((name, arguments, results))
-    }
-}
-
-impl<'a> VariableSpecs<'a> {
-    /// Bytes of a `Parameters` that holds all of them.
-    pub fn parameters_bytes(self) -> u32 {
-        let bytes = self.raw().try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec)?));
-        bytes.map_or(u32::MAX, saturate)
-    }
-
-    /// The variable of this name.
-    pub fn named(mut self, name: &str) -> Option<VariableSpec<'a>> {
-        self.find(|spec| spec.name == name)
-    }
-
-    /// The same, without a look at the names.
-    pub(super) fn raw(mut self) -> impl Iterator<Item = RawSpec<'a>> + Clone {
-        core::iter::from_fn(move || self.next_raw())
-    }
-
-    #[inline]
-    pub(super) fn next_raw(&mut self) -> Option<RawSpec<'a>> {
-        self.left = self.left.checked_sub(1)?;
-        let (spec, rest) = RawSpec::split(self.rest)?;
-        self.rest = rest;
-        Some(spec)
-    }
-
-    #[inline]
-    fn of_checked(bytes: Option<&'a [u8]>) -> Self {
-        match bytes.and_then(<[u8]>::split_first) {
-            Some((&left, rest)) => Self { left, rest },
-            None => Self { left: 0, rest: &[] },
-        }
-    }
-
-    /// What follows the variables, none of which is read.
-    #[inline]
-    fn behind(&self) -> Option<&'a [u8]> {
-        (0..self.left).try_fold(self.rest, |rest, _| {
-            let (&[kind, length, size @ ..], rest) = rest.split_first_chunk::<6>()?;
-            let rest = rest.get(usize::from(length)..)?;
-            match Type::from_wire(kind) {
-                Some(kind) if kind.is_nested() => nested::behind(kind, u32::from_le_bytes(size), rest),
-                _ => Some(rest),
-            }
-        })
-    }
-
-    fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
-        let (&count, start) = bytes.split_first()?;
-        let mut rest = start;
-        for _ in 0..count {
-            rest = VariableSpec::split(rest)?.1;
-        }
-        Some((Self { left: count, rest: start }, rest))
-    }
-}
-
-impl<'a> Iterator for VariableSpecs<'a> {
-    type Item = VariableSpec<'a>;
-
-    fn next(&mut self) -> Option<VariableSpec<'a>> {
-        self.left = self.left.checked_sub(1)?;
-        let (spec, rest) = VariableSpec::split(self.rest)?;
-        self.rest = rest;
-        Some(spec)
-    }
-
-    fn size_hint(&self) -> (usize, Option<usize>) {
-        (0, Some(usize::from(self.left)))
-    }
-}
-
-impl<'a> RawSpec<'a> {
-    #[inline]
-    pub(super) fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
-        let (&[kind, length, size @ ..], rest) = bytes.split_first_chunk::<6>()?;
-        let (name, rest) = rest.split_at_checked(usize::from(length))?;
-        let (kind, size) = (Type::from_wire(kind)?, u32::from_le_bytes(size));
-        let (inner, rest) = if kind.is_nested() { nested::split_inner(kind, size, rest)? } else { (&[][..], rest) };
-        Some((Self { name, kind, size, inner }, rest))
-    }
-}
-
-impl<'a> VariableSpec<'a> {
-    /// A variable that is no list or record.
-    pub const fn flat(name: &'a str, kind: Type, size: u32) -> Self {
-        Self { name, kind, size, inner: &[] }
-    }
-
-    /// What a list's elements are, without a name; `None` for another type.
-    pub fn element(&self) -> Option<Self> {
-        self.raw().element().map(|element| Self {
-            name: "",
-            kind: element.kind,
-            size: element.size,
-            inner: element.inner,
-        })
-    }
-
-    /// A record's fields; none for another type.
-    pub fn fields(&self) -> VariableSpecs<'a> {
-        self.raw().fields()
-    }
-
-    pub(super) const fn raw(&self) -> RawSpec<'a> {
-        RawSpec { name: self.name.as_bytes(), kind: self.kind, size: self.size, inner: self.inner }
-    }
-
-    fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
-        let (RawSpec { name, kind, size, inner }, rest) = RawSpec::split(bytes)?;
-        let name = core::str::from_utf8(name).ok()?;
-        Some((Self { name, kind, size, inner }, rest))
     }
 }
 
@@ -536,7 +373,7 @@ impl Builder {
 
     fn variable(&mut self, list_at: usize, spec: VariableSpec<'_>) -> Result<(), Error> {
         check_name(spec.name)?;
-        nested::check_inner(spec.raw())?;
+        check_inner(spec.raw())?;
         let end = self.bytes.len().saturating_add(spec.name.len()).saturating_add(spec.inner.len()).saturating_add(6);
         let count_of_results = usize::from(self.results_at.is_none());
         if end.saturating_add(count_of_results) > SIGNATURE_BYTES {
@@ -575,33 +412,6 @@ fn check_same(argument: VariableSpec<'_>, result: VariableSpec<'_>, position: us
         return Err(Error::WrongSize { index, expected: argument.size, found: result.size });
     }
     Ok(())
-}
-
-impl core::str::FromStr for Definition {
-    type Err = ParseError;
-    fn from_str(text: &str) -> Result<Self, ParseError> {
-        Self::parse(text)
-    }
-}
-
-impl fmt::Display for VariableSpec<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: ", self.name)?;
-        nested::show(f, self.raw())
-    }
-}
-
-impl fmt::Display for VariableSpecs<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("(")?;
-        for (index, spec) in self.enumerate() {
-            if index > 0 {
-                f.write_str(", ")?;
-            }
-            fmt::Display::fmt(&spec, f)?;
-        }
-        f.write_str(")")
-    }
 }
 
 impl fmt::Display for Signature<'_> {

@@ -4,13 +4,10 @@
 //! passes them over: type u8 of a text, length u8, what it is u32 little-endian, text. 0 is the help; 1 is a unit behind the
 //! name of its variable and a blank, as `position m`.
 
-use super::function::{Definition, Signature, VariableSpec, VariableSpecs};
-use super::parameters::Type;
+use super::function::{Definition, HELP_SECTION, Signature, VariableSpec, VariableSpecs};
+use super::value::Type;
 use crate::config::{HELP_BYTES, UNIT_BYTES};
 use crate::error::{Error, Limit};
-
-/// The number of the section; whatever has a greater one is behind it.
-pub(super) const SECTION: u8 = 3;
 
 /// What a line is.
 const HELP: u32 = 0;
@@ -65,7 +62,7 @@ impl Definition {
     fn with_line(mut self, is_unit: bool, parts: &[&str]) -> Result<Self, Error> {
         let section_at = self.signature().without_help().as_bytes().len();
         let length = parts.iter().fold(0_usize, |length, part| length.saturating_add(part.len()));
-        let begin: &[u8] = if self.bytes.len() == section_at { &[SECTION, 0] } else { &[] };
+        let begin: &[u8] = if self.bytes.len() == section_at { &[HELP_SECTION, 0] } else { &[] };
         let head = head(is_unit, length);
         let pieces = [begin, &head].into_iter().chain(parts.iter().map(|part| part.as_bytes()));
         for piece in pieces {
@@ -102,7 +99,7 @@ impl<'a> Signature<'a> {
 
     /// The lines in the form of variables, whose names are the texts.
     fn lines(&self) -> impl Iterator<Item = VariableSpec<'a>> + use<'a> {
-        self.section(SECTION)
+        self.section(HELP_SECTION)
     }
 }
 

@@ -3,8 +3,9 @@
 //! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
+pub use super::control::SubscriptionRefusal;
 pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome, trace_id};
-pub use super::control::{NO_SUBSCRIPTION, SubscriptionRefusal};
+pub use super::table::NO_SUBSCRIPTION;
 
 use super::block::Put;
 use super::function_list::{Generation, Slot};

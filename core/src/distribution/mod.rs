@@ -23,6 +23,7 @@ pub mod name;
 pub mod nested;
 pub mod parameters;
 pub mod presence;
+mod spec;
 mod table;
 pub mod text;
 pub mod typed;

@@ -10,12 +10,10 @@ use core::ops::{Deref, DerefMut};
 use crate::config::{PARAMETERS_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
-use super::block::prepare_results;
-use super::function::{RawSpec, Signature, VariableSpec};
 use super::name::check_name;
-use super::nested;
 pub use super::nested::{Elements, Fields};
-pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
+use super::spec::{self, RawSpec, VariableSpec};
+pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value, Variable};
 use super::value::{read_elements, saturate};
 pub use super::writer::{ListWriter, RecordWriter, Slot};
 use crate::bytes::{are_same, copy, move_down, rotate_up};
@@ -72,19 +70,6 @@ struct Entry {
 
 impl Entry {
     const EMPTY: Self = Self { value_at: 0, size: 0, length: 0, name_length: 0, kind: Type::Int, inner_length: 0 };
-}
-
-/// One variable of a [`ParametersView`], borrowed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Variable<'a> {
-    /// Its name.
-    pub name: &'a str,
-    /// Its type.
-    pub kind: Type,
-    /// Its declared size.
-    pub size: u32,
-    /// Its value.
-    pub value: Value<'a>,
 }
 
 impl Parameters {
@@ -319,22 +304,11 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
 impl ParametersView {
     fn add_variable(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
         check_name(spec.name)?;
-        nested::check_inner(spec.raw())?;
+        spec::check_inner(spec.raw())?;
         if self.find(spec.name.as_bytes()).is_some() {
             return Err(Error::NameTaken);
         }
         self.add_checked(spec.raw())
-    }
-
-    /// Replaces all variables by the arguments of a function, then its other results, each 0, `false` or empty: in the order
-    /// in which a service gets them.
-    #[doc(hidden)]
-    pub fn lay_out(&mut self, function: Signature<'_>) -> Result<(), Error> {
-        self.clear();
-        for spec in function.arguments().raw() {
-            self.add_checked(spec)?;
-        }
-        prepare_results(function.results(), self)
     }
 
     /// The value of the variable in a place; [`Error::UnknownVariable`] where there is none.
@@ -350,7 +324,7 @@ impl ParametersView {
 
     /// Adds a variable whose name may be one, and is not there.
     pub(super) fn add_checked(&mut self, spec: RawSpec<'_>) -> Result<(), Error> {
-        let nested = if spec.kind.is_nested() { nested::least(spec) } else { 0 };
+        let nested = if spec.kind.is_nested() { spec::least(spec) } else { 0 };
         let target = self.reserve(spec, nested)?;
         if spec.kind.is_fixed() || spec.kind.is_nested() {
             target.bytes.fill(0);
@@ -538,14 +512,6 @@ impl Arena for [u8] {
     fn view_mut(parameters: &mut ParametersView) -> &mut ParametersView {
         parameters
     }
-}
-
-/// Bytes of a [`Parameters`] that one variable takes; `None` where that exceeds the address space.
-pub(super) fn bytes_of_variable(spec: RawSpec<'_>) -> Option<usize> {
-    if spec.kind.is_nested() {
-        return nested::least(spec).checked_add(spec.inner.len())?.checked_add(spec.name.len());
-    }
-    spec.kind.bytes_of(spec.size)?.checked_add(spec.name.len())
 }
 
 impl<const BYTES: usize> Deref for ParametersInner<[u8; BYTES]> {

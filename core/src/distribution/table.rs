@@ -5,7 +5,6 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::attributes::Attributes;
-use super::control::NO_SUBSCRIPTION;
 use super::function::Signature;
 use super::value::saturate;
 use crate::ability::{Begins, STREAMS, State};
@@ -65,6 +64,9 @@ pub struct Entry<H = ()> {
     pub(super) wish: State<Wish, { STREAMS as usize }>,
     pub(super) function: Option<Stored<H>>,
 }
+
+/// As the interval of a subscription: there is none.
+pub const NO_SUBSCRIPTION: u32 = u32::MAX;
 
 /// What a unit wants of a stream of its peer: the interval of a subscription in milliseconds, or [`NO_SUBSCRIPTION`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -11,7 +11,7 @@ use crate::error::{Error, Limit};
 
 use super::function::{Builder, Definition, VariableSpec};
 use super::name::is_name_byte;
-use super::parameters::Type;
+use super::value::Type;
 use crate::ability::{DETAILS, NESTED};
 use crate::config::{DEPTH, SIGNATURE_BYTES};
 
@@ -81,8 +81,37 @@ impl fmt::Display for Expected {
     }
 }
 
+impl Definition {
+    /// A function from its text form, as in `go_to(position: int[2]) -> (done: bool)`.
+    ///
+    /// ```
+    /// let go_to = cara_core::Definition::parse("go_to(position: int[2]) -> (done: bool)").unwrap();
+    /// assert_eq!((go_to.name(), go_to.signature().arguments().count()), ("go_to", 1));
+    /// ```
+    pub fn parse(text: &str) -> Result<Self, ParseError> {
+        parse(text)
+    }
+
+    /// A stream from its text form, as in `pose(position: float[2])`: a function without arguments whose results are the values.
+    ///
+    /// ```
+    /// let pose = cara_core::Definition::stream("pose(position: float[2])").unwrap();
+    /// assert_eq!(pose.to_string(), "pose() -> (position: float[2])");
+    /// ```
+    pub fn stream(text: &str) -> Result<Self, ParseError> {
+        parse_stream(text)
+    }
+}
+
+impl core::str::FromStr for Definition {
+    type Err = ParseError;
+    fn from_str(text: &str) -> Result<Self, ParseError> {
+        Self::parse(text)
+    }
+}
+
 /// Reads a signature; see [`Definition::parse`].
-pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
+fn parse(text: &str) -> Result<Definition, ParseError> {
     let mut parser = Parser { text: text.as_bytes(), position: 0 };
     let (at, name) = parser.name()?;
     let mut builder = Builder::new(name).map_err(|error| explain(at, error))?;
@@ -105,7 +134,7 @@ pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
 }
 
 /// Reads a stream; see [`Definition::stream`].
-pub(super) fn parse_stream(text: &str) -> Result<Definition, ParseError> {
+fn parse_stream(text: &str) -> Result<Definition, ParseError> {
     let mut parser = Parser { text: text.as_bytes(), position: 0 };
     let (at, name) = parser.name()?;
     let mut builder = Builder::new(name).map_err(|error| explain(at, error))?;

@@ -8,8 +8,8 @@ use core::fmt;
 
 use super::function::{Builder, Definition};
 use super::function::{Signature, VariableSpec, VariableSpecs};
-use super::nested::{self, Bounds};
 use super::parameters::{Elements, Fields, FromValue, Parameters, ParametersView, Slot, Type};
+use super::spec::{self, Bounds};
 use super::value::{Element, Value};
 use crate::ability::{DETAILS, HELP};
 use crate::bytes::are_same;
@@ -348,20 +348,20 @@ impl Mismatch {
         let found = |name: &str, part, here: Option<VariableSpec<'_>>, there: Option<VariableSpec<'_>>| {
             let mut variable = heapless::String::try_from(name).unwrap_or_default();
             let bounds = if part == Part::Argument { Bounds::Free } else { Bounds::Fit };
-            let (here, there) = nested::difference(here, there, bounds, &mut variable);
+            let (here, there) = spec::difference(here, there, bounds, &mut variable);
             let function = heapless::String::try_from(ours.name()).unwrap_or_default();
             Self { function, variable, part, ours: here, theirs: there }
         };
         for wanted in theirs.arguments() {
             let here = ours.arguments().named(wanted.name);
-            if !here.is_some_and(|here| nested::can_be(here.raw(), wanted.raw(), Bounds::Free)) {
+            if !here.is_some_and(|here| spec::can_be(here.raw(), wanted.raw(), Bounds::Free)) {
                 return Err(found(wanted.name, Part::Argument, here, Some(wanted)));
             }
         }
         let given = |ours: VariableSpecs<'_>, theirs: VariableSpecs<'_>, part| {
             for value in ours {
                 let there = theirs.named(value.name);
-                if !there.is_some_and(|there| nested::can_be(there.raw(), value.raw(), Bounds::Fit)) {
+                if !there.is_some_and(|there| spec::can_be(there.raw(), value.raw(), Bounds::Fit)) {
                     return Err(found(value.name, part, Some(value), there));
                 }
             }

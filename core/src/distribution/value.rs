@@ -342,3 +342,16 @@ pub(crate) fn read_elements<T: Element>(value: Value<'_>, elements: &mut [T]) ->
 pub(crate) fn saturate(length: usize) -> u32 {
     u32::try_from(length).unwrap_or(u32::MAX)
 }
+
+/// One variable of a [`ParametersView`](super::parameters::ParametersView), borrowed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Variable<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// Its type.
+    pub kind: Type,
+    /// Its declared size.
+    pub size: u32,
+    /// Its value.
+    pub value: Value<'a>,
+}

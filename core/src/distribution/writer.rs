@@ -4,11 +4,10 @@
 //! What a list or record is made of stands in the same arena. It is read by its place there, step by step, since a slice of
 //! it would forbid writing.
 
-use super::block::padding_after;
-use super::function::RawSpec;
-use super::nested::{self, LIST_HEAD};
-use super::parameters::{IntoValue, ParametersView, Target};
-use super::value::{Type, saturate};
+use super::nested;
+use super::parameters::ParametersView;
+use super::spec::{LIST_HEAD, RawSpec, padding_after, split_element};
+use super::value::{IntoValue, Target, Type, saturate};
 use crate::ability::{Ability, NESTED, Nested};
 use crate::bytes::copy;
 use crate::error::{Error, Limit};
@@ -314,7 +313,7 @@ fn list(
     }
     put(view, at, &[0; LIST_HEAD])?;
     let start = at.saturating_add(LIST_HEAD);
-    let element = view.arena().get(made.inner_at..).and_then(nested::split_element);
+    let element = view.arena().get(made.inner_at..).and_then(split_element);
     let (kind, size, behind) = element.ok_or(Error::Malformed)?;
     let inner_at = view.arena().len().saturating_sub(behind.len());
     let element = Made { kind, size, inner_at };

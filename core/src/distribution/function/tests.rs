@@ -12,6 +12,7 @@ use std::{format, vec};
 
 use proptest::prelude::*;
 
+use super::super::value::Type;
 use super::*;
 use crate::distribution::parameters::Parameters;
 

@@ -3,10 +3,10 @@
 use super::Units;
 use crate::ability::{HELP, NESTED};
 use crate::config::{DEPTH, FAILURE_VALUES_BYTES, HELP_BYTES, NAME_BYTES, SIGNATURE_BYTES, UNIT_BYTES, VARIABLES};
-use crate::distribution::function::{Signature, VariableSpec};
+use crate::distribution::function::{HELP_SECTION, Signature, VariableSpec};
 use crate::distribution::name::is_name_byte;
 use crate::distribution::parameters::Type;
-use crate::distribution::{help, nested};
+use crate::distribution::{help, spec};
 
 /// All variables of a function.
 #[derive(Clone, Copy, Debug)]
@@ -126,7 +126,7 @@ impl<'a> Insides<'a> {
     }
 
     const fn of_list(size: u32, rest: &'a [u8], depth: usize) -> Self {
-        let Some((kind, element_size, rest)) = nested::split_element(rest) else {
+        let Some((kind, element_size, rest)) = spec::split_element(rest) else {
             return Self::wrong("a list has no element");
         };
         let element = Self::of(kind, element_size, rest, depth.saturating_add(1));
@@ -446,7 +446,7 @@ const fn put_help<'a>(to: &'a mut [u8], declared: &Declared<'_>) -> &'a mut [u8]
     while units.next().is_some() {
         lines = lines.saturating_add(1);
     }
-    let mut to = put(to, &[help::SECTION, lines]);
+    let mut to = put(to, &[HELP_SECTION, lines]);
     if !declared.help.is_empty() {
         to = put(put(to, &help::head(false, declared.help.len())), declared.help.as_bytes());
     }
