@@ -5,9 +5,11 @@ use super::claim::Claim;
 use super::compact::{Reader, Writer};
 use super::hello::ClaimReport;
 use super::items::{Item, Malformed};
-use super::message::CONTROL;
 use crate::ability::STREAMS;
 use crate::error::Error;
+
+/// The kind of a message that has control items.
+pub(super) const CONTROL: u8 = 3;
 
 /// Makes [`Control`] of its table: each row is the item's kind, the variant and its fields in their order.
 macro_rules! controls {

@@ -17,9 +17,9 @@
 
 use super::authenticator::{Authenticator, CODE_BYTES};
 use super::compact::{Reader, Writer};
-use super::hello::{ClaimReport, Manager, kind};
+use super::hello::{ClaimReport, Manager};
 use super::identity::{Epoch, Fleet, Identity, Role};
-use super::items::{self, Items, Malformed};
+use super::items::{self, Items, Malformed, kind};
 use crate::config::{Mode, VERSIONS, Versions};
 use crate::host::mailman::LinkId;
 

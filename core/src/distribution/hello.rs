@@ -14,34 +14,12 @@ use serde::{Deserialize, Serialize};
 use super::authenticator::CODE_BYTES;
 use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
-use super::items::{Items, Malformed};
+use super::items::{Items, Malformed, kind};
 use crate::config::{Constraints, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
 use crate::distribution::claim::{Claim, TaggedClaim};
 
 /// Bytes before the items.
 const PREFIX_BYTES: usize = 20;
-
-/// Kinds of items that hello, who-has and announce have. One namespace, so that a kind means the same in all of them.
-pub(super) mod kind {
-    /// Identity and epoch of the sender.
-    pub(in crate::distribution) const UNIT: u16 = 1;
-    /// The manager that the sender belongs to, or looks for.
-    pub(in crate::distribution) const WANTED: u16 = 2;
-    /// What a session needs of this link.
-    pub(in crate::distribution) const LINK: u16 = 3;
-    /// What the sender takes.
-    pub(in crate::distribution) const LIMITS: u16 = 4;
-    /// A search.
-    pub(in crate::distribution) const SEARCH: u16 = 5;
-    /// Nodes that stay silent.
-    pub(in crate::distribution) const KNOWN: u16 = 6;
-    /// An answer.
-    pub(in crate::distribution) const ANSWER: u16 = 7;
-    /// The claim of a manager.
-    pub(in crate::distribution) const CLAIM: u16 = 8;
-    /// The highest claim of the reader's identity that the sender has obeyed.
-    pub(in crate::distribution) const OBEYED: u16 = 9;
-}
 
 /// Which manager an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]

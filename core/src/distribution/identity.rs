@@ -5,7 +5,7 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::compact::{Reader, Writer};
-use super::hello::kind;
+use super::items::kind;
 use super::name::is_hidden;
 use crate::config::NODE_NAME_BYTES;
 use crate::error::Error;

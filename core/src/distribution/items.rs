@@ -11,6 +11,28 @@
 
 use super::compact::Reader;
 
+/// Kinds of items that hello, who-has and announce have. One namespace, so that a kind means the same in all of them.
+pub(super) mod kind {
+    /// Identity and epoch of the sender.
+    pub(in crate::distribution) const UNIT: u16 = 1;
+    /// The manager that the sender belongs to, or looks for.
+    pub(in crate::distribution) const WANTED: u16 = 2;
+    /// What a session needs of this link.
+    pub(in crate::distribution) const LINK: u16 = 3;
+    /// What the sender takes.
+    pub(in crate::distribution) const LIMITS: u16 = 4;
+    /// A search.
+    pub(in crate::distribution) const SEARCH: u16 = 5;
+    /// Nodes that stay silent.
+    pub(in crate::distribution) const KNOWN: u16 = 6;
+    /// An answer.
+    pub(in crate::distribution) const ANSWER: u16 = 7;
+    /// The claim of a manager.
+    pub(in crate::distribution) const CLAIM: u16 = 8;
+    /// The highest claim of the reader's identity that the sender has obeyed.
+    pub(in crate::distribution) const OBEYED: u16 = 9;
+}
+
 /// Every item begins at a multiple of this, counted from the first one.
 pub(crate) const ALIGNMENT: usize = 4;
 /// Kind and length.

@@ -8,6 +8,7 @@ pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, Ord
 pub use super::table::NO_SUBSCRIPTION;
 
 use super::block::Put;
+use super::control::CONTROL;
 use super::function_list::{Generation, Slot};
 use crate::ability::{DETAILS, STREAMS};
 use crate::config::Priority;
@@ -18,7 +19,6 @@ use crate::time::Duration;
 
 const REQUEST: u8 = 1;
 const REPLY: u8 = 2;
-pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
 const PROGRESS: u8 = 5;
 const SAMPLE: u8 = 6;
