@@ -3,7 +3,7 @@
 //! Each peer gets a server process and a client process of its own, pinned when they start. The scheduler tells the
 //! clients in turn to make a block of calls (A B C A B C …), so that whatever else the machine does meets all of them
 //! alike, and compares each block with the floor's block of the same turn. `floor_again` is the floor a second time:
-//! its ratio shows how far two equal things differ here. `docs/performance.md` describes every row.
+//! its ratio shows how far two equal things differ here. `results.rs` describes every row.
 //!
 //! Only a release build measures anything: `cargo xtask bench --help`.
 
