@@ -57,7 +57,7 @@
 //! ```
 //!
 //! When no task runs any more, the lease stops a vehicle, since a motor's interrupt reads it; when a handler or a task
-//! hangs, the watchdog does. See `docs/notes/embassy-port.md`.
+//! hangs, the watchdog does. See `docs/boards.md`, "What stops the motors".
 
 #![no_std]
 

@@ -18,7 +18,7 @@
 //! | `Kept` | something waits here that does not read; or the clock finds no further call | `Pool` |
 //! | `Serving` | the clock finds that the handler takes long | `Offered` or `Pool` |
 //!
-//! All else changes nothing. Reasons and figures: `docs/notes/reading-a-link.md`.
+//! All else changes nothing.
 
 use cara_core::services::requests::CallId;
 use cara_core::time::{Duration, Instant};

@@ -643,7 +643,7 @@ fn an_order_is_not_sent_to_a_function_without_lists() {
     agv.stop();
 }
 
-/// Bytes of an order's block, of JSON and of postcard. `docs/notes/typed.md` has them.
+/// Bytes of an order's block, of JSON and of postcard.
 #[test]
 fn an_order_of_50_nodes_takes_so_many_bytes() {
     let order = Order::of_50_nodes();
@@ -656,8 +656,8 @@ fn an_order_of_50_nodes_takes_so_many_bytes() {
     assert_eq!((block, json, postcard), (Ok(13_360), 20_082, 5_546));
 }
 
-/// Prints how long an order takes to be written and read again, in each form, and by a call to another unit and back; with
-/// `--release --nocapture` for `docs/notes/typed.md`.
+/// Prints how long an order takes to be written and read again, in each form, and by a call to another unit and back: run it with
+/// `--release --nocapture`.
 #[test]
 fn an_order_of_50_nodes_is_timed() {
     let order = Order::of_50_nodes();

@@ -1,6 +1,6 @@
 //! Claims: which of two managers of one identity commands. Only what has been proven counts: a hello behind its handshake, the
 //! answer to a question of this unit, and of a fence only one whose tag is genuine. Nothing that one peer says ends more than its
-//! own link. The states are in `docs/notes/claims.md`.
+//! own link. The states are in `docs/wire.md`, "Claims".
 
 use super::{Node, NodeCounter};
 use crate::config::OBEYED_MANAGERS;

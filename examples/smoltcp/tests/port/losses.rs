@@ -1,5 +1,5 @@
 //! Links that end although both ends are alive, on a network that loses frames: none may, at any share of loss below
-//! 10 %. The figures are in `docs/notes/false-losses.md`:
+//! 10 %. The figures are in `docs/performance.md`:
 //! `CARA_VEHICLE_HOURS=400 cargo test --release -p cara-smoltcp --test port losses -- --nocapture`
 
 use std::ops::AddAssign;

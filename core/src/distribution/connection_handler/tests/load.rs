@@ -1,4 +1,4 @@
-//! What discovery costs a network, and how long it takes: the figures of `docs/notes/discovery-load.md`.
+//! What discovery costs a network, and how long it takes: the figures of `docs/performance.md`.
 //! Print them with `cargo test -p cara-core --lib connection_handler::tests::load -- --nocapture --test-threads 1`.
 
 use std::println;
