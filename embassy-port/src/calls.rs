@@ -8,6 +8,7 @@ use core::task::{Context, Poll};
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
+use cara_core::services::Port;
 use cara_core::services::call::{self, Call, Callee, Caller, Dynamic, Outgoing};
 use cara_core::services::requests::{CallId, Made};
 use cara_core::services::session::RequestOptions;
@@ -19,6 +20,7 @@ use crate::handle::Handle;
 use crate::link::InFlight;
 use crate::machine::Machine;
 use crate::peer::Peer;
+use crate::port::Board;
 use crate::time::{now, timer};
 
 /// How long a request waits for room at a time.
@@ -28,6 +30,12 @@ const PAUSE: Duration = Duration::from_millis(5);
 pub type CallError<F = ()> = call::CallError<F, details::Kept>;
 
 impl<T> Peer<T> {
+    /// An error of the compiler in a unit that calls others without the feature.
+    pub(crate) const MAY_CALL: () = assert!(
+        Board::CALLS,
+        "a unit that calls others or reads their streams needs the feature `call` of cara-embassy"
+    );
+
     /// A call of a function by name, whose results update `parameters`: to be awaited, or [sent](Call::send) without waiting.
     /// Nothing happens before. On an error the parameters are unchanged.
     ///
@@ -83,6 +91,7 @@ impl<T> Drop for Pending<T> {
 
 impl<T> Pending<T> {
     fn new(peer: &Peer<T>, options: &RequestOptions) -> Result<Self, Error> {
+        let () = Peer::<T>::MAY_CALL;
         let link = peer.link()?;
         let made = peer.unit.act(|machine| machine.with(link, |session, _| session.make()));
         let timeout = options.timeout.unwrap_or(peer.unit.constraints().request_timeout);
@@ -155,6 +164,7 @@ impl<T> Caller for Peer<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, CallError> {
+        let () = Self::MAY_CALL;
         let link = self.link()?;
         let sent = self
             .unit

@@ -18,6 +18,7 @@ impl Port for Board {
     type Cipher = LinkCipher;
     type Endpoint = SocketAddrV4;
     const MANAGES: bool = cfg!(feature = "manager");
+    const CALLS: bool = cfg!(feature = "call");
 }
 
 pub(crate) type LinkSession = Session<Board>;

@@ -86,6 +86,7 @@ impl<T> Peer<T> {
     ) -> Result<Subscription<T>, Error> {
         let stream = Name::try_from(stream).map_err(|_| Error::BadName)?;
         {
+            let () = Self::MAY_CALL;
             let state = &mut *cell.state.borrow_mut();
             if state.wanted.is_some() {
                 return Err(Error::Full(Limit::Subscriptions));

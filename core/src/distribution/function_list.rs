@@ -174,7 +174,7 @@ impl<S: Storage> TheirFunctionList<S> {
         let signature = match Signature::decode(signature) {
             Ok(signature) => signature,
             Err(error) => {
-                self.skipped = self.skipped.saturating_add(1);
+                self.skip();
                 return Err(error);
             }
         };
@@ -191,9 +191,14 @@ impl<S: Storage> TheirFunctionList<S> {
             put = self.put(slot, generation, attributes, signature.without_help().as_bytes());
         }
         if put.is_err() {
-            self.skipped = self.skipped.saturating_add(1);
+            self.skip();
         }
         put
+    }
+
+    /// The peer has published a function that is not kept.
+    pub(crate) const fn skip(&mut self) {
+        self.skipped = self.skipped.saturating_add(1);
     }
 
     /// Removes what is in a slot; `false` if nothing was.

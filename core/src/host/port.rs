@@ -16,6 +16,8 @@ pub trait Port: 'static {
     /// Whether its units may be m_units. Where none is, what only they do (answers to searches, links that are accepted, claims that
     /// are raised) is left out of the program.
     const MANAGES: bool = true;
+    /// Whether its units call functions of others. Where none does, it keeps none of their functions, and counts them as skipped.
+    const CALLS: bool = true;
 }
 
 /// Slices of a port's storage.

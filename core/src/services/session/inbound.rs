@@ -280,7 +280,7 @@ impl<P: Port> Session<P> {
                 }
                 None
             }
-            Some(SessionBody::Renewed(call)) => {
+            Some(SessionBody::Renewed(call)) if P::CALLS => {
                 self.was_renewed(cx.now, CallId(call));
                 None
             }
@@ -313,8 +313,8 @@ impl<P: Port> Session<P> {
                 }
                 None
             }
-            // Nothing is decoded of an ability that is off.
-            Some(SessionBody::Cancel(_)) | None => self.unreadable_datagram(),
+            // Nothing of an ability that is off: none is decoded, or nothing was asked for.
+            Some(SessionBody::Cancel(_) | SessionBody::Renewed(_)) | None => self.unreadable_datagram(),
         }
     }
 
@@ -331,7 +331,7 @@ impl<P: Port> Session<P> {
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
-        if DETAILS {
+        if DETAILS && P::CALLS {
             self.note_failure(span, lent);
         }
         match Message::decode(self.link.view(span, lent)) {
@@ -339,19 +339,19 @@ impl<P: Port> Session<P> {
                 let block = span.last(block.len());
                 self.request_arrived(cx, priority, &header, block, lent, arguments)
             }
-            Some(Message::Reply(id, result)) => {
+            Some(Message::Reply(id, result)) if P::CALLS => {
                 let block = result.map(|block| span.last(block.len()));
                 self.reply_arrived(cx, CallId(id), block)
             }
-            Some(Message::Failure(id, error)) => {
+            Some(Message::Failure(id, error)) if P::CALLS => {
                 self.release_call(cx, CallId(id), None);
                 Some(Event::Failed(CallId(id), error))
             }
-            Some(Message::Sample(header, block)) if STREAMS => {
+            Some(Message::Sample(header, block)) if STREAMS && P::CALLS => {
                 let block = span.last(block.len());
                 self.sample_arrived(cx.now, &header, block, lent)
             }
-            Some(Message::Progress(id, block)) if DETAILS => {
+            Some(Message::Progress(id, block)) if DETAILS && P::CALLS => {
                 let block = span.last(block.len());
                 self.progress_arrived(CallId(id), block, lent)
             }
@@ -359,7 +359,7 @@ impl<P: Port> Session<P> {
                 let items = span.last(items.len());
                 self.controls_arrived(cx, items, lent)
             }
-            Some(Message::Sample(..) | Message::Progress(..)) | None => {
+            Some(Message::Reply(..) | Message::Failure(..) | Message::Sample(..) | Message::Progress(..)) | None => {
                 self.close(cx, CloseReason::Protocol);
                 None
             }
@@ -420,6 +420,11 @@ impl<P: Port> Session<P> {
             }
         };
         let event = match control {
+            Control::Publish { .. } if !P::CALLS => {
+                self.theirs.skip();
+                self.link.counters.count(LinkCounter::FunctionsSkipped);
+                None
+            }
             Control::Publish { slot, generation, attributes, signature } => {
                 let kept = Attributes::decode(attributes)
                     .map(|attributes| self.theirs.insert(Slot(slot), Generation(generation), attributes, signature));
@@ -436,7 +441,9 @@ impl<P: Port> Session<P> {
                 None
             }
             Control::Withdraw { slot } => {
-                self.theirs.remove(Slot(slot));
+                if P::CALLS {
+                    self.theirs.remove(Slot(slot));
+                }
                 None
             }
             Control::ListEnd { serial } => {
@@ -456,14 +463,14 @@ impl<P: Port> Session<P> {
                 }
                 None
             }
-            Control::Actuator { slot, latch, last } => {
+            Control::Actuator { slot, latch, last } if P::CALLS => {
                 Some(Event::Actuator { slot: Slot(slot), state: ActuatorState { latch, last } })
             }
             Control::Subscribe { slot, generation, interval } if STREAMS => {
                 self.subscription_arrived(cx, Slot(slot), Generation(generation), interval);
                 None
             }
-            Control::Subscribed { slot, generation, interval, bytes, refusal } if STREAMS => {
+            Control::Subscribed { slot, generation, interval, bytes, refusal } if STREAMS && P::CALLS => {
                 let granted =
                     super::GrantedStream { interval: crate::time::Duration::from_millis(interval.into()), bytes };
                 self.subscription_answered(Slot(slot), Generation(generation), granted, refusal)
@@ -472,10 +479,13 @@ impl<P: Port> Session<P> {
                 self.claim_arrived(cx, &report);
                 None
             }
-            Control::LeaseEnded { call, why } => {
+            Control::LeaseEnded { call, why } if P::CALLS => {
                 self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })
             }
-            Control::Subscribe { .. } | Control::Subscribed { .. } => None,
+            Control::Subscribe { .. }
+            | Control::Subscribed { .. }
+            | Control::Actuator { .. }
+            | Control::LeaseEnded { .. } => None,
         };
         (left, event)
     }

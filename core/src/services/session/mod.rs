@@ -516,7 +516,9 @@ impl<P: Port> Session<P> {
     pub fn writable(&mut self, cx: &mut Context<'_, P>) {
         self.flush(cx);
         self.pump_renewal(cx);
-        self.send_releases(cx);
+        if P::CALLS {
+            self.send_releases(cx);
+        }
         self.pump(cx);
         if STREAMS {
             self.send_samples(cx);

@@ -173,7 +173,7 @@ impl<P: Port> Session<P> {
 
     /// Tells the peer what this unit wants of its streams, and what became of its own wishes.
     pub(super) fn pump_streams(&mut self, cx: &mut Context<'_, P>) {
-        while self.streaming.wishes_due {
+        while P::CALLS && self.streaming.wishes_due {
             let Some((slot, generation, interval)) = self.theirs.untold_wish() else {
                 self.streaming.change(|streaming| streaming.wishes_due = false);
                 break;

@@ -111,7 +111,8 @@ impl<P: Port> Session<P> {
                 let own = own.min(self.renewal.deadline(self.dialed));
                 let own = if STREAMS { own.min(self.streaming.deadline(self.link.queued())) } else { own };
                 let own = if DETAILS { own.min(self.details.deadline()) } else { own };
-                own.min(self.requests.deadline()).min(self.liveness.deadline())
+                let own = if P::CALLS { own.min(self.requests.deadline()) } else { own };
+                own.min(self.liveness.deadline())
             }
         }
     }
@@ -139,7 +140,9 @@ impl<P: Port> Session<P> {
         {
             return Some(Event::LeaseExpired(slot));
         }
-        if let Some(pending) = self.requests.expire(cx.now) {
+        if P::CALLS
+            && let Some(pending) = self.requests.expire(cx.now)
+        {
             let id = pending.id;
             self.send_cancel(cx, &pending);
             self.release_call(cx, id, Some(pending));
@@ -153,13 +156,14 @@ impl<P: Port> Session<P> {
         if self.has_news() {
             self.pump(cx);
         }
-        if cx.now >= self.timers.release {
+        if P::CALLS && cx.now >= self.timers.release {
             self.send_releases(cx);
         }
         if cx.now >= self.timers.gathered {
             self.flush(cx);
         }
-        if cx.now >= self.timers.renewal
+        if P::CALLS
+            && cx.now >= self.timers.renewal
             && let Some(event) = self.renew_leases(cx)
         {
             return Some(event);
@@ -241,7 +245,9 @@ impl<P: Port> Session<P> {
                 return Some(Event::LeaseExpired(granted.slot));
             }
         }
-        if let Some(id) = self.requests.interrupt() {
+        if P::CALLS
+            && let Some(id) = self.requests.interrupt()
+        {
             return Some(Event::Reply(id, Err(Error::Interrupted)));
         }
         self.link.release(cx.buffers);

@@ -16,6 +16,8 @@ pub mod echo;
 pub mod least;
 pub mod led;
 mod log;
+#[cfg(feature = "call")]
+mod mechanic;
 pub mod provision;
 #[cfg(feature = "streams")]
 mod streams;
@@ -24,12 +26,14 @@ pub mod tasks;
 #[cfg(feature = "warehouse")]
 pub mod warehouse;
 
+#[cfg(feature = "call")]
+pub use mechanic::call_mechanic;
+
 use core::sync::atomic::{AtomicBool, Ordering};
 
 use cara_apps::agv::{BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, RESET, STOP, TICK};
-use cara_apps::mechanic;
 use cara_core::config::Priority;
-use cara_core::error::{Cause, Error};
+use cara_core::error::Error;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::{Latch, Lease, Stage};
 use cara_embassy::{
@@ -215,35 +219,6 @@ pub async fn drive(vehicle: Vehicle) -> ! {
             _ => {}
         }
     }
-}
-
-/// Calls a mechanic each time that the button is pressed, once the manager offers one.
-pub async fn call_mechanic(vehicle: Vehicle, mut pressed: impl AsyncFnMut()) -> ! {
-    loop {
-        pressed().await;
-        vehicle.wait_until(|vehicle| vehicle.nodes_offering("call_mechanic").next().is_some()).await;
-        match ask_mechanic(vehicle).await {
-            Ok(_minutes) => info!("a mechanic comes in {} minutes", _minutes),
-            Err(_error) => info!("no mechanic: ask the {}", who_must_act(&_error)),
-        }
-    }
-}
-
-/// Texts of errors stay out of the image.
-fn who_must_act(error: &Error) -> &'static str {
-    match error.cause() {
-        Cause::Configuration => "programmer",
-        Cause::Peer => "manager",
-        Cause::Resource => "programmer for more room, or wait",
-        Cause::Transport => "network",
-    }
-}
-
-async fn ask_mechanic(vehicle: Vehicle) -> Result<i64, Error> {
-    let mut arguments = mechanic::arguments()?;
-    arguments.set_value("fault", "a wheel squeaks")?;
-    vehicle.block_request("call_mechanic", &mut arguments).await?;
-    arguments.variable("minutes")
 }
 
 #[cfg(test)]

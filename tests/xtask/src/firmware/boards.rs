@@ -138,10 +138,15 @@ impl Board {
         let chosen = |feature, is_chosen: bool| is_chosen.then_some(feature);
         let features: Vec<&str> = match self.feature {
             Some(feature) => vec![feature],
-            None => [chosen("defmt", image.has_logs), chosen("secure", image.is_secured), image.feature]
-                .into_iter()
-                .flatten()
-                .collect(),
+            None => [
+                chosen("call", image.program == "agv"),
+                chosen("defmt", image.has_logs),
+                chosen("secure", image.is_secured),
+                image.feature,
+            ]
+            .into_iter()
+            .flatten()
+            .collect(),
         };
         let build = build.args(["--no-default-features"]);
         features.iter().fold(build, |build, feature| build.args(["--features", feature])).stream()?;

@@ -10,14 +10,17 @@ use crate::error::{CloseReason, Error};
 use crate::services::Context;
 use crate::time::{Duration, Instant};
 
-/// A manager and an AGV on one network. Every buffer must have come back when it is dropped.
-pub(super) struct Pair {
-    pub(super) manager: Side,
-    pub(super) agv: Side,
+/// A manager and an AGV on one network.
+pub(super) type Pair = PairOf<true>;
+
+/// The same, whose units may call others or may not. Every buffer must have come back when it is dropped.
+pub(super) struct PairOf<const CALLS: bool> {
+    pub(super) manager: Side<CALLS>,
+    pub(super) agv: Side<CALLS>,
     elapsed: Duration,
 }
 
-impl Pair {
+impl<const CALLS: bool> PairOf<CALLS> {
     /// Two ends whose connection is open, and nothing sent yet.
     pub(super) fn connected(setup: &Setup) -> Self {
         Self::prepared(setup, |_| ())
@@ -130,7 +133,7 @@ impl Pair {
     }
 
     fn next_deadline(&self) -> Duration {
-        let due = |side: &Side| side.session.deadline().since(Instant::START + side.base);
+        let due = |side: &Side<CALLS>| side.session.deadline().since(Instant::START + side.base);
         due(&self.manager).min(due(&self.agv))
     }
 
@@ -152,7 +155,7 @@ impl Pair {
     }
 }
 
-impl Drop for Pair {
+impl<const CALLS: bool> Drop for PairOf<CALLS> {
     fn drop(&mut self) {
         if std::thread::panicking() {
             return;

@@ -49,23 +49,24 @@ impl Access for Table {
 }
 
 /// The port of these tests.
-pub(super) enum Tested {}
+pub(super) enum Tested<const CALLS: bool = true> {}
 
-impl Port for Tested {
+impl<const CALLS: bool> Port for Tested<CALLS> {
     type Storage = Boxed;
     type Cipher = Plain;
     type Endpoint = SocketAddr;
+    const CALLS: bool = CALLS;
 }
 
 /// A hub that can be kept from deciding.
-pub(super) struct Lobby {
-    pub(super) hub: Hub<Tested>,
+pub(super) struct Lobby<const CALLS: bool = true> {
+    pub(super) hub: Hub<Tested<CALLS>>,
     pub(super) waits: bool,
     pub(super) entered: usize,
 }
 
-impl Door<Tested> for Lobby {
-    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Tested>)) {
+impl<const CALLS: bool> Door<Tested<CALLS>> for Lobby<CALLS> {
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Tested<CALLS>>)) {
         self.entered += 1;
         if !self.waits {
             act(&mut self.hub);
@@ -74,9 +75,9 @@ impl Door<Tested> for Lobby {
 }
 
 /// One end.
-pub(super) struct Side {
+pub(super) struct Side<const CALLS: bool = true> {
     pub(super) now: Instant,
-    pub(super) session: Session<Tested>,
+    pub(super) session: Session<Tested<CALLS>>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) pool: Pool<Boxed>,
     /// Who may do what here.
@@ -87,7 +88,7 @@ pub(super) struct Side {
     pub(super) ran: Vec<Started>,
     /// Calls that wait for an answer of the test.
     pub(super) held: Vec<Incoming>,
-    pub(super) hub: Lobby,
+    pub(super) hub: Lobby<CALLS>,
     pub(super) inbox: Vec<u8>,
     /// What comes stays in the inbox.
     pub(super) holds_back: bool,
@@ -124,7 +125,7 @@ macro_rules! context {
 }
 pub(super) use context;
 
-impl Side {
+impl<const CALLS: bool> Side<CALLS> {
     pub(super) fn new(setup: &Setup, agv: bool, address: u8) -> Self {
         let constraints = if agv { setup.agv } else { setup.manager };
         // The clocks of the two ends have nothing in common.
