@@ -220,8 +220,8 @@ pub enum CloseReason {
     /// The connection could not be opened.
     #[error("the connection could not be opened: is the peer's port reachable?")]
     DialFailed = 9,
-    /// Request ids ran out; the pair connects again.
-    #[error("request ids ran out: the link is opened again, repeat the request")]
+    /// Request ids ran out, or keys that are not renewed; the pair connects again.
+    #[error("request ids or keys ran out: the link is opened again, repeat the request")]
     Exhausted = 10,
     /// The other end ended the link before it had proven its identity, so the reason it gave is ignored.
     #[error("the other end left before it proved its identity: has it the key of this pair, and the same version?")]

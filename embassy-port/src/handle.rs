@@ -12,6 +12,7 @@ use cara_core::distribution::connection_handler::{Finding, NodeCounter};
 use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::Port;
 use cara_core::services::access::Access;
 use cara_core::time::Duration;
 
@@ -20,6 +21,7 @@ use crate::event::UnitEvent;
 use crate::handler::Hook;
 use crate::lease::LeaseWatch;
 use crate::machine::{Machine, Shared};
+use crate::port::Board;
 
 /// A unit, for any task of the executor that its runner runs on. Copies are the same unit.
 pub struct Handle<T: 'static = ()> {
@@ -165,6 +167,7 @@ impl<T> Handle<T> {
 
     /// Another access table, or none: in force when this returns.
     pub fn set_access(&self, table: Option<&'static dyn Access>) {
+        const { assert!(Board::HAS_ACCESS, "an access table needs the feature `access` of cara-embassy") };
         self.act(|machine| {
             machine.access = Table(table);
             machine.each_link(|session, cx| {

@@ -19,6 +19,10 @@ impl Port for Board {
     type Endpoint = SocketAddrV4;
     const MANAGES: bool = cfg!(feature = "manager");
     const CALLS: bool = cfg!(feature = "call");
+    const DISCOVERS: bool = cfg!(feature = "discover");
+    const HAS_ACCESS: bool = cfg!(feature = "access");
+    const RENEWS_KEYS: bool = cfg!(feature = "rekey");
+    const TAKES_DATAGRAM_REQUESTS: bool = cfg!(feature = "datagram-requests");
 }
 
 pub(crate) type LinkSession = Session<Board>;

@@ -7,17 +7,17 @@ use core::net::SocketAddrV4;
 use cara_core::config::{HANDSHAKE_LIFE, LINK_BUFFER_BYTES, Mode};
 use cara_core::counters::Counters;
 use cara_core::distribution::claim::Claim;
-use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order};
+use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::datagram::SEARCH_BYTES;
 use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
-use cara_core::services::CallHead;
 use cara_core::services::hub::Hub;
 use cara_core::services::lease::Latch;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::session::{Publication, SessionStorage};
+use cara_core::services::{CallHead, Port};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;
 use embassy_net::Stack;
@@ -128,7 +128,8 @@ pub trait Memory<T> {
 /// searches again when there is an address again. One unit fits on one stack.
 ///
 /// [`Error::DoesNotFit`] when the memory cannot hold the constraints, [`Error::PortInUse`] when the discovery port
-/// is bound already.
+/// is bound already, [`Error::BadConstraint`] for a unit without its manager's address or with an access table where the feature
+/// `discover` or `access` is off.
 ///
 /// # Panics
 /// In embassy-net, when the stack was made with fewer sockets than [`Limits::sockets`] asks for.
@@ -240,6 +241,10 @@ impl<
     ) -> Result<(Handle<T>, Runner<T>), Error> {
         config.node.constraints = config.constraints.unwrap_or(const { Self::LIMITS.constraints() });
         Self::LIMITS.fit(&config.node.constraints)?;
+        let has_address = matches!(config.node.target, Target::Fixed(..));
+        if !Board::DISCOVERS && !has_address || !Board::HAS_ACCESS && config.access.0.is_some() {
+            return Err(Error::BadConstraint);
+        }
         if config.security.0.mode() == Mode::Plain {
             warning!("this unit is INSECURE: anybody on the network can read what it says, and can speak as its peers");
         }

@@ -18,6 +18,14 @@ pub trait Port: 'static {
     const MANAGES: bool = true;
     /// Whether its units call functions of others. Where none does, it keeps none of their functions, and counts them as skipped.
     const CALLS: bool = true;
+    /// Whether its units search, answer searches and dial what they find. Where they do not, each has a manager at a fixed address.
+    const DISCOVERS: bool = true;
+    /// Whether an access table is asked. Where none is, a joined node may do everything.
+    const HAS_ACCESS: bool = true;
+    /// Whether a live link gets new keys. Where it does not, a link ends when its keys are worn, and is dialled again.
+    const RENEWS_KEYS: bool = true;
+    /// Whether requests in datagrams are taken: best-effort ones, and the second copies of emergencies.
+    const TAKES_DATAGRAM_REQUESTS: bool = true;
 }
 
 /// Slices of a port's storage.

@@ -228,6 +228,13 @@ pub struct Context<'c, P: Port> {
     pub keys: &'c mut dyn Keys<P>,
 }
 
+impl<'c, P: Port> Context<'c, P> {
+    /// The access table, where the port asks one.
+    pub(crate) const fn table(&self) -> Option<&'c dyn access::Access> {
+        if P::HAS_ACCESS { self.access } else { None }
+    }
+}
+
 /// Looks up the key of a pair.
 pub trait Keys<P: Port> {
     /// The key of this unit and the peer that a hello names, with freshly drawn bytes; `None` where there is none. The hello

@@ -19,6 +19,8 @@ pub(crate) enum Image {
     Agv,
     /// The least unit.
     Unit,
+    /// The same, whose settings say where its manager is.
+    UnitFixed,
     /// The bare TCP echo.
     Echo,
 }
@@ -28,17 +30,21 @@ const ROUNDS: u32 = 3;
 /// Where the echo listens, and how much it is sent.
 pub(crate) const ECHO_PORT: u16 = 7777;
 const ECHO_BYTES: usize = 20_000;
+/// Where a board's settings may name the manager.
+const MANAGER: &str = "10.77.0.1:4000";
+const MANAGER_PORT: u16 = 4000;
 /// The board looks at its stack every second, the echo every five.
 const LOOKED: Duration = Duration::from_secs(6);
 
 /// Puts an image under load and prints the board's line about its stack, `stack N of M bytes`.
 pub(crate) fn run(bench: &Bench, image: Image) -> Result<()> {
     let cable = bench.cable()?;
-    let board = bench.board(&cable, &Who::agv(17))?;
+    let manager_address = (image == Image::UnitFixed).then_some(MANAGER);
+    let board = bench.board(&cable, &Who { manager_address, ..Who::agv(17) })?;
     for round in 0..ROUNDS {
         match image {
             Image::Agv => vehicle(bench, &board, &cable, round)?,
-            Image::Unit => least(bench, &board, &cable)?,
+            Image::Unit | Image::UnitFixed => least(bench, &board, &cable)?,
             Image::Echo => echo(&cable)?,
         }
     }
@@ -94,7 +100,7 @@ fn least(bench: &Bench, board: &Board, cable: &Cable) -> Result<()> {
     let who = Who::agv(17);
     let mut line = board.line();
     for loss in [Loss::OfManager, Loss::OfCable] {
-        let manager = Manager::start(&bench.keys)?;
+        let manager = Manager::of(bench.keys.give(Manager::builder()?.tcp_port(MANAGER_PORT))?)?;
         manager.offer_mechanic()?;
         let unit = manager.meet_offering(&who, "add")?;
         for number in 0..10 {

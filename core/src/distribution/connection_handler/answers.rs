@@ -288,7 +288,7 @@ impl<P: Port> Node<P> {
         let dials = known.listens.is_some() && known.identity.role() == Role::MUnit;
         let smaller = self.config.identity < known.identity;
         match self.config.target {
-            Target::Manager(_) => {
+            Target::Manager(_) if P::DISCOVERS => {
                 if failed == 0 {
                     // It has just been heard, so it may have moved: search soon, however long it was away.
                     self.search.attempt = 0;
@@ -300,11 +300,11 @@ impl<P: Port> Node<P> {
                 let back_off = back_off(failed);
                 let at = now + back_off + self.random.jitter(back_off);
                 self.table.schedule(place, at, Task::Dial);
-                if failed == MOVED_AFTER {
+                if P::DISCOVERS && failed == MOVED_AFTER {
                     self.look_around(now);
                 }
             }
-            Target::Everybody | Target::Fixed(..) => {}
+            Target::Everybody | Target::Manager(_) | Target::Fixed(..) => {}
         }
     }
 }

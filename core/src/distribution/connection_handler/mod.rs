@@ -332,8 +332,8 @@ impl<P: Port> Node<P> {
 
     /// When [`poll`](Self::poll) has something to do next.
     pub fn next_deadline(&self) -> Instant {
-        let others = self.answers.next().min(self.hints.next()).min(self.table.next_due());
-        self.search.next().min(self.claims.next()).min(others)
+        let own = self.claims.next().min(self.table.next_due());
+        if P::DISCOVERS { own.min(self.answers.next()).min(self.hints.next()).min(self.search.next()) } else { own }
     }
 
     /// Does what is due. Returns one command at a time; call it until it returns `None`.
@@ -365,15 +365,20 @@ impl<P: Port> Node<P> {
             }
         }
         self.poll_claims(now, mailman, authenticator);
-        self.poll_answers(now, mailman, authenticator);
-        self.poll_hints(now, mailman, authenticator);
-        self.poll_search(now, mailman, authenticator);
+        if P::DISCOVERS {
+            self.poll_answers(now, mailman, authenticator);
+            self.poll_hints(now, mailman, authenticator);
+            self.poll_search(now, mailman, authenticator);
+        }
         None
     }
 
     /// Takes a datagram that arrived at any of the unit's sockets and is [for no session](crate::distribution::datagram::for_session)
     /// of this unit.
     pub fn datagram(&mut self, now: Instant, from: P::Endpoint, bytes: &[u8], authenticator: &dyn Authenticator) {
+        if !P::DISCOVERS {
+            return self.counters.count(NodeCounter::DatagramNotForUs);
+        }
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
             Ok(Datagram::WhoHas(who_has)) => {
                 self.counters.add(NodeCounter::DatagramItemsSkipped, who_has.skipped.into());

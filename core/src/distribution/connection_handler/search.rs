@@ -135,6 +135,7 @@ impl<P: Port> Node<P> {
         match (&self.config.target, self.table.joined()) {
             (Target::Fixed(..), 0) => self.dial_target(now),
             (Target::Fixed(..), _) => {}
+            _ if !P::DISCOVERS => {}
             _ => {
                 let allowed = self.budget.allowed_at(now);
                 self.search.explicit = Some(self.search.explicit.unwrap_or(allowed));
@@ -171,7 +172,7 @@ impl<P: Port> Node<P> {
 
     /// Searches again after a loss: an s_unit listens for this long first. `None`: the link was lost at once.
     pub(super) fn search_again(&mut self, now: Instant, listening: Option<Duration>) {
-        if self.table.joined() > 0 {
+        if !P::DISCOVERS || self.table.joined() > 0 {
             return;
         }
         self.search.nonce = fresh(&mut self.random);

@@ -45,7 +45,7 @@ impl<P: Port> Session<P> {
         cx: &mut Context<'_, P>,
         arguments: &mut ParametersView,
     ) -> Option<Result<Incoming, Error>> {
-        let (functions, now, access, remote) = (cx.functions, cx.now, cx.access, self.remote.as_ref());
+        let (functions, now, access, remote) = (cx.functions, cx.now, cx.table(), self.remote.as_ref());
         let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
             if head.deadline <= now {
                 return Err(Error::Expired);

@@ -225,8 +225,8 @@ impl<P: Port> Session<P> {
             (Inbound::Confirm(span), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
                 self.confirmation_arrived(cx, span, lent)
             }
-            (Inbound::Proof(span), Phase::Live) => self.proof_on_live(cx, span, lent),
-            (Inbound::Confirm(span), Phase::Live) => self.confirmation_on_live(cx, span, lent),
+            (Inbound::Proof(span), Phase::Live) if P::RENEWS_KEYS => self.proof_on_live(cx, span, lent),
+            (Inbound::Confirm(span), Phase::Live) if P::RENEWS_KEYS => self.confirmation_on_live(cx, span, lent),
             // Answered in the stream as well: only a reply that has passed the same queue shows that the stream moves.
             (Inbound::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
@@ -287,7 +287,7 @@ impl<P: Port> Session<P> {
             Some(SessionBody::Release(release)) => self.released(cx, release),
             Some(SessionBody::Cancel(release)) if DETAILS => self.cancel_arrived(cx, release),
             Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
-            Some(SessionBody::Message(priority, message)) => {
+            Some(SessionBody::Message(priority, message)) if P::TAKES_DATAGRAM_REQUESTS => {
                 match (Priority::from_wire(priority), Message::decode(message)) {
                     (Some(priority), Some(Message::Request(header, block))) => {
                         let block = span.last(block.len());
@@ -314,7 +314,9 @@ impl<P: Port> Session<P> {
                 None
             }
             // Nothing of an ability that is off: none is decoded, or nothing was asked for.
-            Some(SessionBody::Cancel(_) | SessionBody::Renewed(_)) | None => self.unreadable_datagram(),
+            Some(SessionBody::Cancel(_) | SessionBody::Renewed(_) | SessionBody::Message(..)) | None => {
+                self.unreadable_datagram()
+            }
         }
     }
 
@@ -587,7 +589,7 @@ impl<P: Port> Session<P> {
         if function.attributes.is_stream() {
             return Err(Error::UnknownFunction);
         }
-        if cx.access.is_some() {
+        if cx.table().is_some() {
             self.permit_call(cx, &function, priority, header.takes_over)?;
         }
         if priority != Priority::Emergency && !function.attributes.stop {

@@ -45,7 +45,7 @@ impl<P: Port> Session<P> {
         self.publishing.fill_buckets();
         self.cut_forbidden_leases(cx);
         let remote = self.remote.as_ref();
-        self.theirs.show_only(|name| decide(cx.access, remote, name, Verb::Publish).is_allowed());
+        self.theirs.show_only(|name| decide(cx.table(), remote, name, Verb::Publish).is_allowed());
         self.end_of_changes(cx)
     }
 
@@ -60,12 +60,12 @@ impl<P: Port> Session<P> {
 
     /// Whether the peer sees a function: one that it may call, or list.
     pub(super) fn may_see(&self, cx: &Context<'_, P>, slot: Slot) -> bool {
-        cx.access.is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
+        cx.table().is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
     }
 
     fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
         let function = cx.functions.function(slot);
-        function.is_none_or(|function| decide(cx.access, self.remote.as_ref(), function.name(), verb).is_allowed())
+        function.is_none_or(|function| decide(cx.table(), self.remote.as_ref(), function.name(), verb).is_allowed())
     }
 
     /// A request has arrived for a function that the peer was told of, and there is a table: may it be called, and so soon?
@@ -76,7 +76,7 @@ impl<P: Port> Session<P> {
         priority: Priority,
         takes_over: bool,
     ) -> Result<(), Error> {
-        match decide_call(cx.access, self.remote.as_ref(), function.name(), takes_over) {
+        match decide_call(cx.table(), self.remote.as_ref(), function.name(), takes_over) {
             Decision::Denied => Err(Error::NotAllowed),
             Decision::Allowed { rate: None, .. } => Ok(()),
             // A stop never comes too often, nor does another emergency.
@@ -97,8 +97,8 @@ pub(super) fn may_publish<P: Port>(
     signature: &[u8],
 ) -> bool {
     // What cannot be read is refused by the list.
-    let Some(signature) = cx.access.and_then(|_| Signature::decode(signature).ok()) else { return true };
-    let allowed = decide(cx.access, remote, signature.name(), Verb::Publish).is_allowed();
+    let Some(signature) = cx.table().and_then(|_| Signature::decode(signature).ok()) else { return true };
+    let allowed = decide(cx.table(), remote, signature.name(), Verb::Publish).is_allowed();
     if !allowed {
         log_refusal(cx, remote, refusals, signature.name(), "publish");
     }
@@ -114,7 +114,7 @@ pub(super) fn log_refusal<P: Port>(
     verb: &str,
 ) {
     let Some(count) = refusals.count(cx.now) else { return };
-    if cx.access.is_some_and(|access| access.may_log(cx.now)) {
+    if cx.table().is_some_and(|access| access.may_log(cx.now)) {
         refusals.was_logged(cx.now);
         let (name, id) = remote.map_or(("", 0), |remote| (remote.hello.identity.name(), remote.hello.identity.id()));
         warning!("{}/{} may not {} {}: {} refused", name, id, verb, function, count);

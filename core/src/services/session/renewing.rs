@@ -87,6 +87,9 @@ impl<P: Port> Session<P> {
 
     /// Does what is due of the renewal.
     pub(super) fn poll_renewal(&mut self, cx: &mut Context<'_, P>) {
+        if !P::RENEWS_KEYS {
+            return self.end_with_keys(cx);
+        }
         if cx.now >= self.renewal.forget {
             self.link.cipher().forget_previous();
             self.renewal.forget = Instant::FAR_FUTURE;
@@ -102,6 +105,19 @@ impl<P: Port> Session<P> {
             // A peer that keeps the link alive and does not go on would leave it under worn keys for ever.
             true => self.close(cx, CloseReason::HelloTimeout),
             false => self.pump_renewal(cx),
+        }
+    }
+
+    /// In place of a renewal the end that dialled ends the link, to dial it again: as long as the keys last not while anything moves.
+    fn end_with_keys(&mut self, cx: &mut Context<'_, P>) {
+        let Step::Resting { due } = self.renewal.step else { return };
+        if !self.dialed() || cx.now < due && !self.link.cipher().is_worn() {
+            return;
+        }
+        if self.moves() && !self.link.cipher().is_worn() {
+            self.renewal.step = Step::Resting { due: cx.now + SHORTEST_HANDSHAKE_LIFE };
+        } else {
+            self.close(cx, CloseReason::Exhausted);
         }
     }
 
@@ -124,6 +140,9 @@ impl<P: Port> Session<P> {
 
     /// Sends what waits for room.
     pub(super) fn pump_renewal(&mut self, cx: &mut Context<'_, P>) {
+        if !P::RENEWS_KEYS {
+            return;
+        }
         let sent = match self.renewal.step {
             Step::Resting { .. } | Step::Awaiting { .. } => return,
             Step::Telling { message, .. } if self.dialed() => self.link.send_frames(&[Frame::Proof(&message)]),
@@ -221,7 +240,7 @@ impl<P: Port> Session<P> {
 
     /// A datagram has been opened; the first one under a new key lets the one before go.
     pub(super) fn datagram_opened(&mut self, now: Instant) {
-        if self.renewal.forget != Instant::FAR_FUTURE && self.link.cipher().hears_newest() {
+        if P::RENEWS_KEYS && self.renewal.forget != Instant::FAR_FUTURE && self.link.cipher().hears_newest() {
             self.renewal.forget = self.renewal.forget.min(now + PREVIOUS_KEY_LIFE);
         }
     }

@@ -277,7 +277,7 @@ impl<P: Port> Session<P> {
         cx: &Context<'_, P>,
         stream: &Function<'_, dyn crate::services::lease::Service>,
     ) -> Decision {
-        decide(cx.access, self.remote.as_ref(), stream.name(), Verb::Call)
+        decide(cx.table(), self.remote.as_ref(), stream.name(), Verb::Call)
     }
 
     /// Sends each value that is due, as far as the stream is empty: so none is ever before a call that this end sends later, and

@@ -16,7 +16,7 @@ pub mod echo;
 pub mod least;
 pub mod led;
 mod log;
-#[cfg(feature = "call")]
+#[cfg(feature = "agv")]
 mod mechanic;
 pub mod provision;
 #[cfg(feature = "streams")]
@@ -26,7 +26,7 @@ pub mod tasks;
 #[cfg(feature = "warehouse")]
 pub mod warehouse;
 
-#[cfg(feature = "call")]
+#[cfg(feature = "agv")]
 pub use mechanic::call_mechanic;
 
 use core::sync::atomic::{AtomicBool, Ordering};

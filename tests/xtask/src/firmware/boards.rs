@@ -41,6 +41,10 @@ impl Image {
         Self { name, program, has_logs: true, is_secured: false, feature: None }
     }
 
+    const fn named(self, name: &'static str) -> Self {
+        Self { name, ..self }
+    }
+
     const fn secured(self) -> Self {
         Self { is_secured: true, ..self }
     }
@@ -70,15 +74,22 @@ const EMULATED: &[Image] = &[
     Image::plain("agv-plain", "agv"),
     STREAMS,
     WAREHOUSE,
-    Image::plain("unit-secured", "unit").secured(),
-    Image::plain("unit", "unit"),
+    UNIT.secured().named("unit-secured"),
+    UNIT,
+    FIXED,
     ECHO,
     Image::plain("agv-quiet", "agv").secured().quiet(),
     Image { name: "agv-streams-quiet", ..STREAMS }.quiet(),
-    Image::plain("unit-secured-quiet", "unit").secured().quiet(),
-    Image::plain("unit-quiet", "unit").quiet(),
+    UNIT.secured().quiet().named("unit-secured-quiet"),
+    UNIT.quiet().named("unit-quiet"),
+    FIXED.secured().quiet().named("unit-fixed-secured-quiet"),
+    FIXED.quiet().named("unit-fixed-quiet"),
     Image::plain("echo-quiet", "echo").quiet(),
 ];
+/// The least unit, which finds its manager.
+const UNIT: Image = Image { feature: Some("discover"), ..Image::plain("unit", "unit") };
+/// The same, whose settings say where its manager is.
+pub(crate) const FIXED: Image = Image::plain("unit-fixed", "unit");
 /// The AGV of the emulated board with its streams.
 pub(crate) const STREAMS: Image = Image { name: "agv-streams", feature: Some("streams"), ..AGV };
 /// A vehicle of the warehouse.
@@ -139,7 +150,7 @@ impl Board {
         let features: Vec<&str> = match self.feature {
             Some(feature) => vec![feature],
             None => [
-                chosen("call", image.program == "agv"),
+                chosen("agv", matches!(image.program, "agv" | "warehouse")),
                 chosen("defmt", image.has_logs),
                 chosen("secure", image.is_secured),
                 image.feature,

@@ -95,7 +95,8 @@ fn stack(path: &Path, image: &Image) -> Result<Option<u64>> {
         return Ok(None);
     }
     let insecure = (!image.is_secured).then_some("--insecure");
-    let (code, output) = tests(path)?.args(insecure).args(["stack", image.program]).output()?;
+    let load = if image.name == boards::FIXED.name { image.name } else { image.program };
+    let (code, output) = tests(path)?.args(insecure).args(["stack", load]).output()?;
     match code {
         Some(0) => {}
         Some(NOT_ALLOWED) => {

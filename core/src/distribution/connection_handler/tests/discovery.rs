@@ -448,6 +448,40 @@ fn a_fixed_address_is_dialled_without_any_broadcast() {
     assert!(outbox.broadcasts.is_empty());
 }
 
+/// Units that search for nothing.
+enum Placed {}
+
+impl Port for Placed {
+    type Storage = crate::storage::Boxed;
+    type Cipher = Plain;
+    type Endpoint = SocketAddr;
+    const DISCOVERS: bool = false;
+}
+
+#[test]
+fn where_nothing_is_discovered_the_address_is_dialled_and_nobody_is_heard() {
+    let (to, depot) = (address(8, 7_000), m_unit(MANAGER, MANAGER_ID));
+    let config = NodeConfig { target: Target::Fixed(manager(), to), ..s_unit("agv", 1) };
+    let mut node: Node<Placed> = Node::new(Instant::START, config, storage(2));
+    let mut outbox = Outbox::default();
+    let mut dials = 0;
+    while dials < 5 {
+        let now = node.next_deadline();
+        if let Some(action) = node.poll(now, &mut outbox, &Plain) {
+            assert_eq!(action, Command::Dial { to, identity: Some(depot.identity.clone()) });
+            node.dialing(Some(&depot.identity), LinkId(0));
+            let seeker = search_of(&s_unit("agv", 2), 1);
+            for heard in [announce_bytes(&announce_of(&depot, 1, 0)), who_has_bytes(&seeker)] {
+                node.datagram(now, address(1, 7_001), &heard, &Plain);
+            }
+            node.left(now + Duration::from_secs(1), LinkId(0), CloseReason::DialFailed);
+            dials += 1;
+        }
+    }
+    assert_eq!(node.counters.value(NodeCounter::DatagramNotForUs), 10);
+    assert_eq!((outbox.broadcasts.len(), outbox.sent.len()), (0, 0));
+}
+
 #[test]
 fn a_full_managers_broadcast_is_no_invitation() {
     let mut node = node(s_unit("agv", 1));

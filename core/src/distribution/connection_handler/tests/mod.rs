@@ -114,7 +114,7 @@ pub(super) fn slice<T: Default>(count: usize) -> Box<[T]> {
     (0..count).map(|_| T::default()).collect()
 }
 
-pub(super) fn storage(nodes: usize) -> NodeStorage<InMemory> {
+pub(super) fn storage<P: Port<Storage = crate::storage::Boxed, Endpoint = SocketAddr>>(nodes: usize) -> NodeStorage<P> {
     NodeStorage { nodes: slice(nodes), order: slice(nodes), links: slice(nodes * 2), findings: slice(4) }
 }
 

@@ -27,7 +27,7 @@ use crate::time::Duration;
 /// What is called without options goes on while it is wanted, if its function has a lease.
 const WANTED: RequestOptions = RequestOptions::renewing(Renew::Process);
 
-impl<const CALLS: bool> Side<CALLS> {
+impl<const WHOLE: bool> Side<WHOLE> {
     pub(super) fn counter(&self, counter: LinkCounter) -> u64 {
         self.session.counters().value(counter)
     }

@@ -13,14 +13,14 @@ use crate::time::{Duration, Instant};
 /// A manager and an AGV on one network.
 pub(super) type Pair = PairOf<true>;
 
-/// The same, whose units may call others or may not. Every buffer must have come back when it is dropped.
-pub(super) struct PairOf<const CALLS: bool> {
-    pub(super) manager: Side<CALLS>,
-    pub(super) agv: Side<CALLS>,
+/// The same, whose units can do everything or only serve. Every buffer must have come back when it is dropped.
+pub(super) struct PairOf<const WHOLE: bool> {
+    pub(super) manager: Side<WHOLE>,
+    pub(super) agv: Side<WHOLE>,
     elapsed: Duration,
 }
 
-impl<const CALLS: bool> PairOf<CALLS> {
+impl<const WHOLE: bool> PairOf<WHOLE> {
     /// Two ends whose connection is open, and nothing sent yet.
     pub(super) fn connected(setup: &Setup) -> Self {
         Self::prepared(setup, |_| ())
@@ -133,7 +133,7 @@ impl<const CALLS: bool> PairOf<CALLS> {
     }
 
     fn next_deadline(&self) -> Duration {
-        let due = |side: &Side<CALLS>| side.session.deadline().since(Instant::START + side.base);
+        let due = |side: &Side<WHOLE>| side.session.deadline().since(Instant::START + side.base);
         due(&self.manager).min(due(&self.agv))
     }
 
@@ -155,7 +155,7 @@ impl<const CALLS: bool> PairOf<CALLS> {
     }
 }
 
-impl<const CALLS: bool> Drop for PairOf<CALLS> {
+impl<const WHOLE: bool> Drop for PairOf<WHOLE> {
     fn drop(&mut self) {
         if std::thread::panicking() {
             return;

@@ -107,12 +107,12 @@ pub(super) fn nonce(agv: bool) -> u64 {
 }
 
 /// The hub of an end whose manager has this name.
-pub(super) fn hub<const CALLS: bool>(
+pub(super) fn hub<const WHOLE: bool>(
     agv: bool,
     manager: &str,
     constraints: Constraints,
     datagrams: bool,
-) -> Hub<Tested<CALLS>> {
+) -> Hub<Tested<WHOLE>> {
     let target = if agv { Target::Manager(Manager::new(manager, 1).unwrap()) } else { Target::Everybody };
     let identity = if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit(manager, 1) }.unwrap();
     // What decides whether a peer is taken is the hub's, and what its hello says of limits the link's.

@@ -48,25 +48,27 @@ impl Access for Table {
     }
 }
 
-/// The port of these tests.
-pub(super) enum Tested<const CALLS: bool = true> {}
+/// The port of these tests: of units that can do everything, or that only serve.
+pub(super) enum Tested<const WHOLE: bool = true> {}
 
-impl<const CALLS: bool> Port for Tested<CALLS> {
+impl<const WHOLE: bool> Port for Tested<WHOLE> {
     type Storage = Boxed;
     type Cipher = Plain;
     type Endpoint = SocketAddr;
-    const CALLS: bool = CALLS;
+    const CALLS: bool = WHOLE;
+    const HAS_ACCESS: bool = WHOLE;
+    const TAKES_DATAGRAM_REQUESTS: bool = WHOLE;
 }
 
 /// A hub that can be kept from deciding.
-pub(super) struct Lobby<const CALLS: bool = true> {
-    pub(super) hub: Hub<Tested<CALLS>>,
+pub(super) struct Lobby<const WHOLE: bool = true> {
+    pub(super) hub: Hub<Tested<WHOLE>>,
     pub(super) waits: bool,
     pub(super) entered: usize,
 }
 
-impl<const CALLS: bool> Door<Tested<CALLS>> for Lobby<CALLS> {
-    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Tested<CALLS>>)) {
+impl<const WHOLE: bool> Door<Tested<WHOLE>> for Lobby<WHOLE> {
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Tested<WHOLE>>)) {
         self.entered += 1;
         if !self.waits {
             act(&mut self.hub);
@@ -75,9 +77,9 @@ impl<const CALLS: bool> Door<Tested<CALLS>> for Lobby<CALLS> {
 }
 
 /// One end.
-pub(super) struct Side<const CALLS: bool = true> {
+pub(super) struct Side<const WHOLE: bool = true> {
     pub(super) now: Instant,
-    pub(super) session: Session<Tested<CALLS>>,
+    pub(super) session: Session<Tested<WHOLE>>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) pool: Pool<Boxed>,
     /// Who may do what here.
@@ -88,7 +90,7 @@ pub(super) struct Side<const CALLS: bool = true> {
     pub(super) ran: Vec<Started>,
     /// Calls that wait for an answer of the test.
     pub(super) held: Vec<Incoming>,
-    pub(super) hub: Lobby<CALLS>,
+    pub(super) hub: Lobby<WHOLE>,
     pub(super) inbox: Vec<u8>,
     /// What comes stays in the inbox.
     pub(super) holds_back: bool,
@@ -125,7 +127,7 @@ macro_rules! context {
 }
 pub(super) use context;
 
-impl<const CALLS: bool> Side<CALLS> {
+impl<const WHOLE: bool> Side<WHOLE> {
     pub(super) fn new(setup: &Setup, agv: bool, address: u8) -> Self {
         let constraints = if agv { setup.agv } else { setup.manager };
         // The clocks of the two ends have nothing in common.
