@@ -1,7 +1,6 @@
 //! Builder of a unit: identity first, then whatever differs from the defaults.
 
 use std::fmt;
-use std::hash::{BuildHasher, Hasher, RandomState};
 use std::marker::PhantomData;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -28,6 +27,7 @@ use crate::handle::{Handle, MUnit, Owner, SUnit};
 use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
 use crate::storage::{filled, filled_with};
+use crate::sys;
 use crate::sys::datagram::Datagrams;
 use crate::sys::interfaces::Interfaces;
 use crate::sys::stream::Listener;
@@ -342,12 +342,12 @@ impl<T: Send + 'static, R> Builder<T, R> {
         let config = NodeConfig {
             identity: self.identity,
             fleet: self.fleet,
-            epoch: Epoch(random()),
+            epoch: Epoch(sys::random()),
             target: self.target,
             tcp_port: listener.as_ref().map_or(0, Listener::port),
             udp_port: datagrams.own_port(),
             constraints: self.constraints,
-            seed: random(),
+            seed: sys::random(),
         };
         let mut node = Node::new(threads.thread_pool().clock.now(), config, node_storage(nodes, maximum_links));
         if let Some(m_units) = self.m_units {
@@ -467,11 +467,6 @@ pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {
             .contains(&constraints.keep_alive)
         && constraints.calls_per_peer > 0;
     if sound { Ok(()) } else { Err(Error::BadConstraint) }
-}
-
-/// Bits that differ from process to process and from call to call, without a dependency for them.
-pub(crate) fn random() -> u64 {
-    RandomState::new().build_hasher().finish()
 }
 
 pub(crate) fn manager(name: &str, id: u32) -> Result<Target<SocketAddr>, Error> {

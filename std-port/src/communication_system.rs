@@ -89,7 +89,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The TCP port on which the unit takes connections, for s_units that are told a fixed address.
     pub fn tcp_port(&self) -> u16 {
-        self.engine().tcp_port()
+        self.engine().sockets.tcp_port()
     }
 
     /// How many s_units are connected and have published their list (paper, listing line 3).

@@ -248,12 +248,12 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// The claim of an m_unit, or the highest that an s_unit has obeyed.
     pub fn claim(&self) -> Claim {
-        self.engine().hub().hub.node.claim()
+        self.engine().hub.lock().hub.node.claim()
     }
 
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
-        self.engine().hub().hub.node.identity().clone()
+        self.engine().hub.lock().hub.node.identity().clone()
     }
 
     /// The fleet that it belongs to.
@@ -263,7 +263,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// Which of its runs this is: peers tell a restart by it.
     pub fn epoch(&self) -> Epoch {
-        self.engine().hub().hub.node.epoch()
+        self.engine().hub.lock().hub.node.epoch()
     }
 
     /// Time since it was made.
@@ -273,17 +273,17 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// Whether its links are secured, with keys, or plain.
     pub fn mode(&self) -> Mode {
-        self.engine().mode()
+        self.engine().keys().mode()
     }
 
     /// The UDP port of broadcasts.
     pub fn discovery_port(&self) -> u16 {
-        self.engine().discovery_port()
+        self.engine().sockets.datagrams.discovery_port()
     }
 
     /// The interfaces that it uses, with those that are down, as they were at most a few seconds ago.
     pub fn interfaces(&self) -> Vec<Interface> {
-        self.engine().interfaces().to_vec()
+        self.engine().sockets.datagrams.targets().to_vec()
     }
 
     /// Searches for nodes, or for the manager, now (paper, listing line 6).
@@ -318,7 +318,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
-        *self.engine().hub().hub.node.constraints()
+        *self.engine().hub.lock().hub.node.constraints()
     }
 
     /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
@@ -411,7 +411,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// What happened in discovery and membership.
     pub fn node_counted(&self, counter: NodeCounter) -> u64 {
-        self.engine().hub().hub.node.counters.value(counter)
+        self.engine().hub.lock().hub.node.counters.value(counter)
     }
 
     /// Everything that is counted, for the unit and for each node that it knows, in the text form that Prometheus reads:
@@ -423,7 +423,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// The last refusals, here or there.
     pub fn findings(&self) -> Vec<Finding> {
-        self.engine().hub().hub.node.findings().cloned().collect()
+        self.engine().hub.lock().hub.node.findings().cloned().collect()
     }
 
     /// Time since a refusal.

@@ -51,7 +51,7 @@ impl Heart {
                 engine.release_beats(beats);
             }
         };
-        Self { word, beats: word.beats(), clock: engine.clock(), release: Box::new(release) }
+        Self { word, beats: word.beats(), clock: engine.driver.clock(), release: Box::new(release) }
     }
 
     /// The loop has come round.

@@ -144,7 +144,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     /// The lease of a service that has none.
     fn never(&self) -> LeaseWatch {
-        LeaseWatch::new(Arc::default(), self.engine.clock())
+        LeaseWatch::new(Arc::default(), self.engine.driver.clock())
     }
 
     /// What several services [move](ServiceOptions::moves), with the hook that makes it safe: see
@@ -154,7 +154,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     }
 
     fn make_actuator(&self, hook: Arc<Safe>, then: Option<Arc<Hook<T>>>) -> Result<Actuator, Error> {
-        let (lease, clock) = (Arc::<ServiceLease>::default(), self.engine.clock());
+        let (lease, clock) = (Arc::<ServiceLease>::default(), self.engine.driver.clock());
         let then = then.map(|then| self.engine.afterwards(then)).transpose()?;
         let late = self.engine.hooks_late();
         let safe = Arc::new(SafeHook::start(Parts { lease: lease.clone(), clock, hook, then, late })?);

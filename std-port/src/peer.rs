@@ -163,7 +163,7 @@ impl<T: Send + 'static> Peer<T> {
     /// The claim of the manager of this unit's name that it obeys instead, and where the node is: it refuses this unit until this one's
     /// claim is the higher one. `None` otherwise.
     pub fn under(&self) -> Option<(Claim, SocketAddr)> {
-        let cell = self.engine.hub();
+        let cell = self.engine.hub.lock();
         let known = cell.hub.node.node(self.identity())?;
         known.under().map(|claim| (claim, *known.address()))
     }
@@ -185,7 +185,7 @@ impl<T: Send + 'static> Peer<T> {
 
     /// The constraints in force towards this node: the unit's own, unless they were changed for it.
     pub fn constraints(&self) -> Constraints {
-        let unit = *self.engine.hub().hub.node.constraints();
+        let unit = *self.engine.hub.lock().hub.node.constraints();
         self.cell.constraints(unit)
     }
 

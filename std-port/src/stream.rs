@@ -357,7 +357,7 @@ impl<T: Send + 'static> Subscription<T> {
     /// The next value for a task, which is woken when one has come and the pace lets it through, when the node has refused, and
     /// when this unit is stopped.
     #[cfg(feature = "async")]
-    pub(crate) fn poll_next(&mut self, waker: &Waker, alarm: &mut Alarm<T>) -> Poll<Result<Sample, Error>> {
+    pub(crate) fn poll_next(&mut self, waker: &Waker, alarm: &mut Alarm) -> Poll<Result<Sample, Error>> {
         let engine = &self.peer.engine;
         let now = engine.now();
         let is_early = self.due > now;

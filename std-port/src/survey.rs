@@ -28,7 +28,6 @@ mod keys;
 mod ports;
 
 use std::collections::HashSet;
-use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io;
 use std::net::{SocketAddr, SocketAddrV4, UdpSocket};
 use std::time::{Duration, Instant};
@@ -47,6 +46,7 @@ pub use self::ports::Ports;
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Epoll, Events, Interest};
 use crate::sys::interfaces::Interfaces;
+use crate::sys::random;
 pub use cara_core::config::{VERSIONS, Versions};
 
 /// Most lives of units that are kept; beyond them only those that are kept already are counted on.
@@ -349,11 +349,6 @@ fn send(voice: &UdpSocket, to: SocketAddr, bytes: &[u8]) -> io::Result<()> {
 
 fn is_earlier(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::Interrupted | io::ErrorKind::ConnectionRefused)
-}
-
-/// Bits that differ from call to call.
-fn random() -> u64 {
-    RandomState::new().build_hasher().finish()
 }
 
 fn network(error: io::Error) -> Error {

@@ -46,13 +46,13 @@ impl<T: Send + 'static> TheirStream<T> {
 pub struct SampleStream<T: Send + 'static = ()> {
     subscription: Subscription<T>,
     /// Goes off when the handle's pace lets another value through.
-    alarm: Alarm<T>,
+    alarm: Alarm,
     ended: bool,
 }
 
 impl<T: Send + 'static> SampleStream<T> {
     fn new(subscription: Subscription<T>) -> Self {
-        let alarm = Alarm::new(subscription.engine().clone());
+        let alarm = Alarm::new(subscription.engine().driver.clone());
         Self { subscription, alarm, ended: false }
     }
 

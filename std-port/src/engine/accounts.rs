@@ -67,7 +67,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Everything that is counted for the unit as a whole.
     pub(crate) fn readings(&self) -> Vec<Reading> {
         let (links, held) = self.sum_links();
-        let node = self.hub().hub.node.counters.clone();
+        let node = self.hub.lock().hub.node.counters.clone();
         let mut readings: Vec<_> = of(Group::Node, &node).chain(of(Group::Links, &links)).collect();
         readings.extend(self.port_readings(&held));
         readings

@@ -1,16 +1,15 @@
 //! Times at which tasks are woken: a future has no thread that could wait, so the clock of its unit wakes it.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 use std::task::Waker;
 
 use cara_core::time::Instant;
 
-use super::Engine;
 use crate::locks::lock;
 
 /// Names an alarm that is set: its time, and its number among all that were ever set.
-type Key = (Instant, u64);
+pub(super) type Key = (Instant, u64);
 
 /// The alarms of a unit, the earliest first. Each belongs to a future in the application's memory, which bounds them.
 #[derive(Default)]
@@ -23,7 +22,7 @@ struct Due {
 }
 
 impl Alarms {
-    fn set(&self, at: Instant, waker: Waker) -> Key {
+    pub(super) fn set(&self, at: Instant, waker: Waker) -> Key {
         let mut due = lock(&self.0);
         due.count += 1;
         let key = (at, due.count);
@@ -32,12 +31,12 @@ impl Alarms {
     }
 
     /// Whether an alarm has not gone off, and is for this task.
-    fn is_set(&self, key: Key, waker: &Waker) -> bool {
+    pub(super) fn is_set(&self, key: Key, waker: &Waker) -> bool {
         lock(&self.0).wakers.get(&key).is_some_and(|known| known.will_wake(waker))
     }
 
     /// The waker of an alarm that has not gone off, to be dropped without the lock.
-    fn cancel(&self, key: Key) -> Option<Waker> {
+    pub(super) fn cancel(&self, key: Key) -> Option<Waker> {
         lock(&self.0).wakers.remove(&key)
     }
 
@@ -53,6 +52,14 @@ impl Alarms {
         lock(&self.0).wakers.first_key_value().map_or(Instant::FAR_FUTURE, |((at, _), _)| *at)
     }
 
+    /// Wakes the tasks whose time has come; returns when the next one's does.
+    pub(super) fn sound(&self, now: Instant) -> Instant {
+        while let Some(waker) = self.take_due(now) {
+            waker.wake();
+        }
+        self.next()
+    }
+
     fn take_due(&self, now: Instant) -> Option<Waker> {
         let mut due = lock(&self.0);
         let first = due.wakers.first_entry().filter(|first| first.key().0 <= now)?;
@@ -60,53 +67,9 @@ impl Alarms {
     }
 }
 
-/// The alarm of one future: at most one is set at a time, and none is left when it is dropped.
-pub(crate) struct Alarm<T: Send + 'static> {
-    engine: Arc<Engine<T>>,
-    key: Option<Key>,
-}
-
-impl<T: Send + 'static> Alarm<T> {
-    pub(crate) const fn new(engine: Arc<Engine<T>>) -> Self {
-        Self { engine, key: None }
-    }
-
-    /// Wakes the task at `at`, in place of an earlier alarm of this future.
-    pub(crate) fn set(&mut self, at: Instant, waker: &Waker) {
-        if self.key.is_some_and(|key| key.0 == at && self.engine.alarms.is_set(key, waker)) {
-            return;
-        }
-        self.cancel();
-        self.key = Some(self.engine.alarms.set(at, waker.clone()));
-        self.engine.wake_clock_at(at);
-    }
-
-    fn cancel(&mut self) {
-        if let Some(key) = self.key.take() {
-            drop(self.engine.alarms.cancel(key));
-        }
-    }
-}
-
-impl<T: Send + 'static> Drop for Alarm<T> {
-    fn drop(&mut self) {
-        self.cancel();
-    }
-}
-
-impl<T: Send + 'static> Engine<T> {
-    /// Wakes the tasks whose time has come; returns when the next one's does.
-    pub(super) fn sound_alarms(&self) -> Instant {
-        let now = self.now();
-        while let Some(waker) = self.alarms.take_due(now) {
-            waker.wake();
-        }
-        self.alarms.next()
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
     use std::task::Wake;
 

@@ -12,9 +12,9 @@ use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
-use super::alarms::Alarm;
 use super::calling::{PAUSE, worth_waiting};
 use super::details::Canceller;
+use super::driving::Alarm;
 use super::link::{LinkCell, Wake};
 use super::noting::Recorded;
 use super::reader::Cause;
@@ -50,7 +50,7 @@ pub struct Pending<T: Send + 'static> {
     deadline: Instant,
     /// Its place among the calls that move the same thing, however long it waits for room.
     made: Made,
-    alarm: Alarm<T>,
+    alarm: Alarm,
     mark: Option<Mark>,
     /// For the audit log; dropped before the call has ended, it notes that.
     recorded: Option<Recorded>,
@@ -86,7 +86,7 @@ impl<T: Send + 'static> Pending<T> {
             stage: Stage::Unsent,
             deadline: engine.now() + options.timeout.unwrap_or(usual),
             made,
-            alarm: Alarm::new(engine.clone()),
+            alarm: Alarm::new(engine.driver.clone()),
             mark: None,
             recorded: engine.recorded(&link, callee.name(), options),
             link,
@@ -255,7 +255,7 @@ pub(crate) struct CallsToAll<T: Send + 'static> {
     /// Those before this one have ended.
     front: usize,
     unsent: usize,
-    alarm: Alarm<T>,
+    alarm: Alarm,
 }
 
 enum Member<T: Send + 'static> {
@@ -276,7 +276,7 @@ impl<T: Send + 'static> CallsToAll<T> {
             Err(error) => Member::Ended(Err(error.into())),
         };
         let calls: Vec<_> = links.into_iter().map(call).collect();
-        Self { unsent: calls.len(), calls, options, front: 0, alarm: Alarm::new(engine.clone()) }
+        Self { unsent: calls.len(), calls, options, front: 0, alarm: Alarm::new(engine.driver.clone()) }
     }
 
     /// Ready when all have ended. `parameters` lends those of a call, by its place.

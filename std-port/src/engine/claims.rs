@@ -14,12 +14,12 @@ use cara_core::time::Duration;
 use core::net::SocketAddr;
 
 use super::Engine;
-use crate::builder::random;
 use crate::claims::ClaimFile;
 use crate::error::StartError;
 use crate::event::UnitEvent;
 use crate::keys::{KeptClaims, KeptObeyed, KeyRing};
 use crate::locks::lock;
+use crate::sys::random;
 
 /// Claims that wait to be stored; a further one is not.
 const WAITING: usize = 16;
@@ -80,7 +80,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn claim_file(&self) -> Option<ClaimFile> {
-        let (identity, fleet) = self.identity();
+        let (identity, fleet) = self.hub.lock().identity();
         self.claims.folder.as_ref().map(|folder| ClaimFile::of(folder, &identity, fleet))
     }
 
@@ -90,7 +90,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// A live manager of this identity was found before the start: whether this one starts all the same.
     pub(super) fn may_start_beside(&self, at: SocketAddr, running: Option<&ClaimReport>) -> Result<(), StartError> {
-        let (identity, fleet) = self.identity();
+        let (identity, fleet) = self.hub.lock().identity();
         let since = running.map_or(ClaimReport::NEVER, |report| report.since);
         let rests = Duration::from_millis(since.into()) >= TAKE_OVER_REST;
         match self.claims.take_over {
@@ -117,7 +117,7 @@ impl<T: Send + 'static> Engine<T> {
     /// At the start: a unit obeys what it has stored. An m_unit claims above what it has stored and `heard`, and stores that
     /// before anything is sent with it.
     pub(super) fn claim(&self, heard: Claim) -> Result<(), StartError> {
-        let (identity, _) = self.identity();
+        let (identity, _) = self.hub.lock().identity();
         let file = self.claim_file();
         if let Some(file) = &file {
             // Before it is read: what is forgotten later would be written back. Where nothing can be written, nothing can be forgotten.
@@ -137,7 +137,7 @@ impl<T: Send + 'static> Engine<T> {
                 return Err(StartError::NoOwnKey { identity });
             };
             self.store(&kept).map_err(StartError::Claim)?;
-            let mut cell = self.hub();
+            let mut cell = self.hub.lock();
             cell.hub.node.set_claim(tagged);
             if self.claims.take_over != TakeOver::No {
                 cell.hub.node.take_over(self.now());
@@ -145,7 +145,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         if let Some(live) = self.keys().ring() {
             let ring = live.ring();
-            let mut cell = self.hub();
+            let mut cell = self.hub.lock();
             // With other keys than it was obeyed with, a claim does not count.
             kept.obeyed.retain(|obeyed| has_key(&ring, obeyed));
             for KeptObeyed { manager, tagged, .. } in &kept.obeyed {
@@ -162,7 +162,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Does what the node wants done about claims.
     pub(super) fn look_at_claims(&self) {
         loop {
-            let event = self.hub().hub.node.take_claim_event();
+            let event = self.hub.lock().hub.node.take_claim_event();
             match event {
                 None => return,
                 Some(ClaimEvent::Keep(manager, tagged)) => self.leave_to_writer(Job::Keep(manager, tagged)),
@@ -203,8 +203,8 @@ impl<T: Send + 'static> Engine<T> {
 
     fn failed(&self, job: &Job) {
         if let Job::Keep(manager, tagged) = job {
-            self.hub().hub.node.claim_kept(manager, tagged.claim, false);
-            self.wake_clock();
+            self.hub.lock().hub.node.claim_kept(manager, tagged.claim, false);
+            self.driver.wake();
         }
     }
 
@@ -244,7 +244,7 @@ impl<T: Send + 'static> Engine<T> {
         let Some(key) = key else { return self.failed(&Job::Keep(manager, tagged)) };
         let obeyed = KeptObeyed { manager: manager.clone(), tagged, key };
         if kept.obeyed.contains(&obeyed) {
-            return self.hub().hub.node.claim_kept(&manager, tagged.claim, true);
+            return self.hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
         }
         kept.obeyed.retain(|obeyed| obeyed.manager != manager);
         kept.obeyed.push(obeyed);
@@ -252,7 +252,7 @@ impl<T: Send + 'static> Engine<T> {
             Ok(()) => {
                 tracing::info!(claim = %tagged.claim, manager = manager.name(), "a claim is obeyed, and stored");
                 lock(&self.claims.writer).kept = kept;
-                self.hub().hub.node.claim_kept(&manager, tagged.claim, true);
+                self.hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
                 self.look_at_orders();
             }
             Err(error) => {
@@ -274,9 +274,9 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Tells all peers this manager's claim, with a tag of the keys as they are now.
     pub(super) fn announce_claim(&self, claim: Claim) {
-        let (identity, _) = self.identity();
+        let (identity, _) = self.hub.lock().identity();
         let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
-        self.hub().hub.node.set_claim(tagged);
+        self.hub.lock().hub.node.set_claim(tagged);
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.announce_claim(cx));

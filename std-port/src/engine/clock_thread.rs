@@ -1,18 +1,23 @@
 //! The thread that keeps time: timers of links and of the node, datagrams, and new connections. It runs no handlers and no
 //! hooks, never sleeps, and looks at no file: [`look_around`](crate::threads::Driven::look_around) has a thread of its own.
 
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::datagram;
-use cara_core::time::{Duration, Instant};
+use cara_core::distribution::identity::Role;
+use cara_core::time::Instant;
 use core::net::SocketAddr;
 use std::sync::Arc;
 
 use super::Engine;
 use super::link::LinkCell;
-use crate::locks::lock;
+use super::worker::Worker;
+use crate::event::UnitEvent;
+use crate::keys::KeyRing;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
+use crate::sys::epoll::Ready;
 use crate::sys::stream::Accepted;
-use crate::threads::Source;
+use crate::threads::Driven;
 
 /// Datagrams and connections that are taken in a row before timers are looked at again.
 const BATCH: usize = 256;
@@ -47,7 +52,7 @@ impl<T: Send + 'static> Engine<T> {
     /// What a unit moves has been stopped: its links look at their orders now.
     pub(crate) fn look_at_orders(&self) {
         self.links.bring_timers_forward();
-        self.wake_clock();
+        self.driver.wake();
     }
 
     /// Whether none is left.
@@ -60,14 +65,14 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     pub(super) fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
-        if let Some((link, nonce, body)) = datagram::for_session(bytes, self.mode(), self.fleet)
+        if let Some((link, nonce, body)) = datagram::for_session(bytes, self.keys().mode(), self.fleet)
             && let Some(link) = self.link(link)
         {
             return self.session_datagram(&link, from, nonce, body);
         }
         let codes = self.keys().codes();
         let duplicate = {
-            let mut cell = self.hub();
+            let mut cell = self.hub.lock();
             cell.hub.node.datagram(self.now(), from, bytes, &codes);
             cell.hub.node.take_duplicate()
         };
@@ -96,7 +101,7 @@ impl<T: Send + 'static> Engine<T> {
         for _ in 0..BATCH {
             match listener.accept() {
                 Accepted::Stream(stream, address) => {
-                    if lock(&self.short_segments).contains(&address.ip()) {
+                    if self.sockets.shortens(address.ip()) {
                         // The one that it was meant for is there.
                         listener.limit_segments(false);
                     }
@@ -108,41 +113,73 @@ impl<T: Send + 'static> Engine<T> {
                     if self.make_room() {
                         continue;
                     }
-                    self.pause_listening();
+                    self.driver.pause_listening(listener);
                     return;
                 }
             }
         }
     }
-}
 
-/// A unit for which there are no descriptors takes no connections for so long. Its clock goes on.
-const PAUSE: Duration = Duration::from_millis(100);
-
-impl<T: Send + 'static> Engine<T> {
-    fn pause_listening(&self) {
-        let Some(listener) = &self.sockets.listener else { return };
-        self.thread_pool().unwatch(listener);
-        *lock(&self.sockets.listens_at) = Some(self.now() + PAUSE);
+    /// Looks at the file with the keys if it is time; returns when it will be. A peer that is not in the ring any more loses
+    /// its link, also where the ring was taken between two looks.
+    pub(super) fn watch_keys(&self) -> Instant {
+        let (ring, due) = self.key_watch.look(self.now());
+        if let Some(ring) = ring {
+            let claim = {
+                let mut cell = self.hub.lock();
+                cell.hub.node.expect(ring.nodes());
+                cell.hub.node.claim()
+            };
+            self.end_links_without_keys(&ring);
+            // Its tag is of the keys before.
+            if self.hub.lock().identity().0.role() == Role::MUnit && claim != Claim::NONE {
+                self.announce_claim(claim);
+            }
+        }
+        due
     }
 
-    /// Takes connections again when the pause is over; returns when that is.
-    pub(super) fn go_on_listening(&self) -> Instant {
-        let mut at = lock(&self.sockets.listens_at);
-        match *at {
-            Some(due) if due <= self.now() => {
-                let unit_number = self.unit_number();
-                if let Some((listener, unit_number)) = self.sockets.listener.as_ref().zip(unit_number)
-                    && self.thread_pool().watch(unit_number, Source::Listener, listener).is_err()
-                {
-                    *at = Some(self.now() + PAUSE);
-                    return self.now() + PAUSE;
-                }
-                *at = None;
-                Instant::FAR_FUTURE
+    /// A peer that was revoked loses its link.
+    fn end_links_without_keys(&self, ring: &KeyRing) {
+        for link in self.each_link() {
+            let mut state = link.lock();
+            if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
+                self.with(&link, &mut state, |session, cx| session.revoke(cx));
             }
-            Some(due) => due,
-            None => Instant::FAR_FUTURE,
+            self.settle(&link, state);
         }
+    }
+}
+
+impl<T: Send + 'static> Driven for Engine<T> {
+    fn ready(&self, ready: Ready, worker: &mut Worker) {
+        self.link_ready(ready, worker);
+    }
+
+    fn serve_waiting(&self, token: u64, worker: &mut Worker) {
+        self.serve_link(token, worker);
+    }
+
+    fn keep_time(&self) -> Instant {
+        let others = self.poll_node().min(self.driver.go_on_listening(&self.sockets));
+        let look = self.watch_links(others);
+        self.look_at_claims();
+        self.poll_links().min(others).min(look).min(self.driver.alarms.sound(self.now()))
+    }
+
+    fn look_around(&self) -> Instant {
+        let (interfaces, up) = self.sockets.interfaces.look(&self.sockets.datagrams, &self.hub, &self.driver);
+        if let Some(up) = up {
+            self.notify(UnitEvent::NetworkChanged { up });
+        }
+        interfaces.min(self.watch_keys())
+    }
+
+    fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {
+        let _ = self.datagrams_ready(socket, buffer);
+    }
+
+    fn accept(&self) {
+        self.connections_ready();
     }
 }

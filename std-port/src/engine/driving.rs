@@ -1,28 +1,22 @@
-//! The unit among those that its threads drive: how it begins, what wakes it, and how the threads let go of it.
+//! The unit among those that its threads drive: what wakes it, when its futures are woken, and how the threads let go of it.
 
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::task::Waker;
 
-use cara_core::config::Mode;
-use cara_core::distribution::claim::Claim;
-use cara_core::distribution::hello::ClaimReport;
-use cara_core::distribution::identity::{Fleet, Identity};
-use cara_core::error::Error;
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 
-use super::Engine;
-use super::claims::TakeOver;
-use super::worker::Worker;
+use super::alarms::{Alarms, Key};
+use super::sockets::Sockets;
 use crate::clock::Clock;
-use crate::error::StartError;
-use crate::error::system_refused;
+use crate::error::{StartError, system_refused};
+use crate::locks::lock;
 use crate::sys::datagram::Socket;
-use crate::sys::epoll::Ready;
+use crate::sys::stream::Listener;
 use crate::threads::{Driven, Source, ThreadPool, Threads};
 
 /// The threads that drive the unit, and whether they do.
-pub(super) struct Driver {
+pub(crate) struct Driver {
     /// Its own, or those of several units.
     threads: Threads,
     clock: Clock,
@@ -35,16 +29,31 @@ pub(super) struct Driver {
     stopping: AtomicBool,
     /// When the unit was made.
     born: Instant,
+    pub(super) alarms: Alarms,
+    /// When connections are taken again, where there were no descriptors for them.
+    listens_at: Mutex<Option<Instant>>,
 }
+
+/// A unit for which there are no descriptors takes no connections for so long. Its clock goes on.
+const PAUSE: Duration = Duration::from_millis(100);
 
 impl Driver {
     pub(super) fn new(threads: Threads, own_threads: bool, asks_for_itself: bool) -> Self {
         let clock = threads.thread_pool().clock;
-        let (born, stopping) = (clock.now(), AtomicBool::new(false));
-        Self { threads, clock, own_threads, unit_number: OnceLock::new(), asks_for_itself, stopping, born }
+        Self {
+            threads,
+            clock,
+            own_threads,
+            unit_number: OnceLock::new(),
+            asks_for_itself,
+            stopping: AtomicBool::new(false),
+            born: clock.now(),
+            alarms: Alarms::default(),
+            listens_at: Mutex::new(None),
+        }
     }
 
-    pub(super) const fn clock(&self) -> Clock {
+    pub(crate) const fn clock(&self) -> Clock {
         self.clock
     }
 
@@ -60,139 +69,124 @@ impl Driver {
     pub(super) fn stop(&self) -> bool {
         self.stopping.swap(true, Ordering::AcqRel)
     }
-}
 
-impl<T: Send + 'static> Engine<T> {
-    pub(super) fn thread_pool(&self) -> &Arc<ThreadPool> {
-        self.driver.threads.thread_pool()
+    pub(super) fn pool(&self) -> &Arc<ThreadPool> {
+        self.threads.thread_pool()
     }
 
     pub(super) fn unit_number(&self) -> Option<u16> {
-        self.driver.unit_number.get().copied()
+        self.unit_number.get().copied()
     }
 
-    /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
-    /// does not start again.
-    #[cfg(not(feature = "control"))]
-    pub(crate) fn start(self: &Arc<Self>) -> Result<(), StartError> {
-        self.start_unless(|| None)
-    }
-
-    /// Begins, as `start` does, unless a process of this host `holds` what is this unit's, as one does that hangs and
-    /// does not say that it runs.
-    pub(crate) fn start_unless(self: &Arc<Self>, holds: impl FnOnce() -> Option<PathBuf>) -> Result<(), StartError> {
-        if self.is_stopping() {
-            return Err(Error::NotRunning.into());
-        }
-        if self.unit_number().is_some() {
-            return Ok(());
-        }
-        let running = self.running_elsewhere().map_err(system_refused)?;
-        if let Some((at, report)) = &running {
-            self.may_start_beside(*at, report.as_ref())?;
-        }
-        let takes_over = self.claims.take_over != TakeOver::No;
-        if let Some(path) = (self.driver.asks_for_itself && !takes_over).then(holds).flatten() {
-            let (identity, fleet) = self.identity();
-            return Err(StartError::SocketHeld { identity, fleet, path });
-        }
-        self.claim(running.and_then(|(_, report)| report).map_or(Claim::NONE, |report: ClaimReport| report.claim()))?;
-        self.thread_pool().start()?;
-        let unit_number = self.thread_pool().register(self.clone())?;
-        let _ = self.driver.unit_number.set(unit_number);
-        self.watch(unit_number).map_err(system_refused)?;
-        self.warn_of_plain_mode();
-        self.wake_looker();
-        self.wake_clock();
+    /// The threads do from here on what there is to do for the unit.
+    pub(super) fn start(&self, unit: Arc<dyn Driven>, sockets: &Sockets) -> Result<(), StartError> {
+        self.pool().start()?;
+        let unit_number = self.pool().register(unit)?;
+        let _ = self.unit_number.set(unit_number);
+        self.watch(unit_number, sockets).map_err(system_refused)?;
         Ok(())
     }
 
-    pub(super) fn identity(&self) -> (Identity, Fleet) {
-        let node = &self.hub().hub.node;
-        (node.identity().clone(), node.fleet())
-    }
-
-    fn warn_of_plain_mode(&self) {
-        if self.mode() == Mode::Plain {
-            tracing::warn!(
-                unit = %self.hub().hub.node.identity(), discovery_port = self.discovery_port(),
-                "plain mode, without keys: whoever is on the network can read what this unit says, and speak as any unit"
-            );
-        }
-    }
-
-    fn watch(&self, unit_number: u16) -> std::io::Result<()> {
+    fn watch(&self, unit_number: u16, sockets: &Sockets) -> std::io::Result<()> {
         for socket in [Socket::Shared, Socket::Own] {
-            self.thread_pool().watch(unit_number, Source::Datagrams(socket), self.sockets.datagrams.fd(socket))?;
+            self.pool().watch(unit_number, Source::Datagrams(socket), sockets.datagrams.fd(socket))?;
         }
-        self.sockets
-            .listener
-            .as_ref()
-            .map_or(Ok(()), |listener| self.thread_pool().watch(unit_number, Source::Listener, listener))
+        sockets.listener.as_ref().map_or(Ok(()), |listener| self.pool().watch(unit_number, Source::Listener, listener))
     }
 
     /// Something is to be done now, or the time of the next thing has changed.
-    pub(super) fn wake_clock(&self) {
-        self.wake_clock_at(Instant::START);
+    pub(super) fn wake(&self) {
+        self.wake_at(Instant::START);
     }
 
-    pub(super) fn wake_clock_at(&self, at: Instant) {
+    pub(super) fn wake_at(&self, at: Instant) {
         if let Some(unit_number) = self.unit_number() {
-            self.thread_pool().wake_at(unit_number, at);
+            self.pool().wake_at(unit_number, at);
         }
     }
 
     /// Files and interfaces are looked at now.
     pub(super) fn wake_looker(&self) {
         if let Some(unit_number) = self.unit_number() {
-            self.thread_pool().wake_looker(unit_number);
+            self.pool().wake_looker(unit_number);
         }
     }
 
-    /// From here on no thread works for the unit any more, except the one that calls.
-    pub(super) fn release_threads(&self) {
-        for socket in [Socket::Shared, Socket::Own] {
-            self.thread_pool().unwatch(self.sockets.datagrams.fd(socket));
+    /// The unit takes no connections for a while.
+    pub(super) fn pause_listening(&self, listener: &Listener) {
+        self.pool().unwatch(listener);
+        *lock(&self.listens_at) = Some(self.clock.now() + PAUSE);
+    }
+
+    /// Takes connections again when the pause is over; returns when that is.
+    pub(super) fn go_on_listening(&self, sockets: &Sockets) -> Instant {
+        let mut at = lock(&self.listens_at);
+        match *at {
+            Some(due) if due <= self.clock.now() => {
+                if let Some((listener, unit_number)) = sockets.listener.as_ref().zip(self.unit_number())
+                    && self.pool().watch(unit_number, Source::Listener, listener).is_err()
+                {
+                    let again = self.clock.now() + PAUSE;
+                    *at = Some(again);
+                    return again;
+                }
+                *at = None;
+                Instant::FAR_FUTURE
+            }
+            Some(due) => due,
+            None => Instant::FAR_FUTURE,
         }
-        if let Some(listener) = &self.sockets.listener {
-            self.thread_pool().unwatch(listener);
+    }
+
+    /// From here on no thread works for the unit any more, except the one that calls. Then no thread puts a link on the
+    /// clock's list, which `clear` empties.
+    pub(super) fn release_threads(&self, sockets: &Sockets, clear: impl FnOnce() -> usize) {
+        for socket in [Socket::Shared, Socket::Own] {
+            self.pool().unwatch(sockets.datagrams.fd(socket));
+        }
+        if let Some(listener) = &sockets.listener {
+            self.pool().unwatch(listener);
         }
         if let Some(unit_number) = self.unit_number() {
-            self.thread_pool().leave(unit_number);
+            self.pool().leave(unit_number);
         }
-        // No thread puts a link there any more.
-        self.thread_pool().watched.fetch_sub(self.links.watch.clear(), Ordering::Relaxed);
-        if self.driver.own_threads {
-            self.thread_pool().stop();
+        self.pool().watched.fetch_sub(clear(), Ordering::Relaxed);
+        if self.own_threads {
+            self.pool().stop();
         }
     }
 }
 
-impl<T: Send + 'static> Driven for Engine<T> {
-    fn ready(&self, ready: Ready, worker: &mut Worker) {
-        self.link_ready(ready, worker);
+/// The alarm of one future: at most one is set at a time, and none is left when it is dropped.
+pub(crate) struct Alarm {
+    driver: Arc<Driver>,
+    key: Option<Key>,
+}
+
+impl Alarm {
+    pub(crate) const fn new(driver: Arc<Driver>) -> Self {
+        Self { driver, key: None }
     }
 
-    fn serve_waiting(&self, token: u64, worker: &mut Worker) {
-        self.serve_link(token, worker);
+    /// Wakes the task at `at`, in place of an earlier alarm of this future.
+    pub(crate) fn set(&mut self, at: Instant, waker: &Waker) {
+        if self.key.is_some_and(|key| key.0 == at && self.driver.alarms.is_set(key, waker)) {
+            return;
+        }
+        self.cancel();
+        self.key = Some(self.driver.alarms.set(at, waker.clone()));
+        self.driver.wake_at(at);
     }
 
-    fn keep_time(&self) -> Instant {
-        let others = self.poll_node().min(self.go_on_listening());
-        let look = self.watch_links(others);
-        self.look_at_claims();
-        self.poll_links().min(others).min(look).min(self.sound_alarms())
+    fn cancel(&mut self) {
+        if let Some(key) = self.key.take() {
+            drop(self.driver.alarms.cancel(key));
+        }
     }
+}
 
-    fn look_around(&self) -> Instant {
-        self.watch_interfaces().min(self.watch_keys())
-    }
-
-    fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {
-        let _ = self.datagrams_ready(socket, buffer);
-    }
-
-    fn accept(&self) {
-        self.connections_ready();
+impl Drop for Alarm {
+    fn drop(&mut self) {
+        self.cancel();
     }
 }

@@ -1,10 +1,13 @@
 //! Whether there is a network at all: the interfaces that can be used are looked at now and then, and what changes is told.
 
+use std::sync::Mutex;
+
 use cara_core::time::{Duration, Instant};
 
-use super::Engine;
-use crate::event::UnitEvent;
+use super::driving::Driver;
+use super::hub::SharedHub;
 use crate::locks::lock;
+use crate::sys::datagram::Datagrams;
 
 /// A unit that is connected to nobody looks this often; a cable that is plugged in leads to a search at once.
 const ALONE: Duration = Duration::from_secs(3);
@@ -13,28 +16,32 @@ const CONNECTED: Duration = Duration::from_secs(30);
 
 /// What is known of the interfaces.
 #[derive(Debug, Default)]
-pub(super) struct InterfaceWatch {
+pub(super) struct InterfaceWatch(Mutex<Watched>);
+
+#[derive(Debug, Default)]
+struct Watched {
     due: Instant,
     /// Names of those that can be used; `None` before the first look.
     up: Option<Vec<String>>,
 }
 
-impl<T: Send + 'static> Engine<T> {
-    /// Looks at the interfaces if it is time; returns when it will be.
-    pub(super) fn watch_interfaces(&self) -> Instant {
-        let now = self.now();
-        let mut watch = lock(&self.sockets.interfaces);
+impl InterfaceWatch {
+    /// Looks at the interfaces if it is time; returns when it will be, and what subscribers are to hear of: those that
+    /// are up.
+    pub(super) fn look(&self, sockets: &Datagrams, hub: &SharedHub, driver: &Driver) -> (Instant, Option<Vec<String>>) {
+        let now = driver.clock().now();
+        let mut watch = lock(&self.0);
         if now < watch.due {
-            return watch.due;
+            return (watch.due, None);
         }
-        let mut up = self.sockets.datagrams.usable();
+        let mut up = sockets.usable();
         up.sort();
-        let reaches = self.sockets.datagrams.reaches_others(&up);
-        watch.due = now + if self.hub().hub.node.connected() == 0 { ALONE } else { CONNECTED };
+        let reaches = sockets.reaches_others(&up);
+        watch.due = now + if hub.lock().hub.node.connected() == 0 { ALONE } else { CONNECTED };
         let due = watch.due;
         let first = watch.up.is_none();
         if watch.up.as_ref() == Some(&up) {
-            return due;
+            return (due, None);
         }
         watch.up = Some(up.clone());
         drop(watch);
@@ -47,12 +54,9 @@ impl<T: Send + 'static> Engine<T> {
             tracing::info!(?up, "the network interfaces have changed");
         }
         if !first {
-            self.hub().hub.node.network_changed(now);
-            self.wake_clock();
+            hub.lock().hub.node.network_changed(now);
+            driver.wake();
         }
-        if !first || !reaches {
-            self.notify(UnitEvent::NetworkChanged { up });
-        }
-        due
+        (due, (!first || !reaches).then_some(up))
     }
 }

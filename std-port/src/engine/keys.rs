@@ -3,15 +3,14 @@
 use std::sync::{Arc, Mutex, OnceLock};
 
 use cara_core::config::Mode;
-use cara_core::distribution::claim::Claim;
 use cara_core::distribution::hello::Hello;
-use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::identity::Identity;
 use cara_core::services;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::link::{Cipher, Credentials};
 
-use super::Engine;
+use super::driving::Driver;
 use super::link::Linux;
 use crate::keys::{DiscoveryKey, KeyRing, LiveRing, PairKey, draw};
 use crate::locks::Rank;
@@ -120,7 +119,7 @@ impl KeyWatch {
 
     /// Looks at the file if it is time; returns the ring where links have not been held against it yet, and when the file
     /// is looked at next.
-    fn look(&self, now: Instant) -> (Option<Arc<KeyRing>>, Instant) {
+    pub(super) fn look(&self, now: Instant) -> (Option<Arc<KeyRing>>, Instant) {
         let Keys::Ring(live) = &self.keys else { return (None, Instant::FAR_FUTURE) };
         let mut watched = Rank::Leaf.lock(&self.watched);
         if now < watched.due {
@@ -171,44 +170,18 @@ fn refresh(live: &LiveRing) -> bool {
     }
 }
 
-impl<T: Send + 'static> services::Keys<Linux> for &Engine<T> {
-    fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
-        let credentials = self.keys().credentials(&hello.identity);
-        if self.key_watch.bring_forward(self.now()) {
-            self.wake_looker();
-        }
-        credentials
-    }
+/// The keys, for sessions.
+pub(super) struct KeyDoor<'e> {
+    pub(super) watch: &'e KeyWatch,
+    pub(super) driver: &'e Driver,
 }
 
-impl<T: Send + 'static> Engine<T> {
-    /// Looks at the file with the keys if it is time; returns when it will be. A peer that is not in the ring any more loses
-    /// its link, also where the ring was taken between two looks.
-    pub(super) fn watch_keys(&self) -> Instant {
-        let (ring, due) = self.key_watch.look(self.now());
-        if let Some(ring) = ring {
-            let claim = {
-                let mut cell = self.hub();
-                cell.hub.node.expect(ring.nodes());
-                cell.hub.node.claim()
-            };
-            self.end_links_without_keys(&ring);
-            // Its tag is of the keys before.
-            if self.identity().0.role() == Role::MUnit && claim != Claim::NONE {
-                self.announce_claim(claim);
-            }
+impl services::Keys<Linux> for KeyDoor<'_> {
+    fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
+        let credentials = self.watch.keys.credentials(&hello.identity);
+        if self.watch.bring_forward(self.driver.clock().now()) {
+            self.driver.wake_looker();
         }
-        due
-    }
-
-    /// A peer that was revoked loses its link.
-    fn end_links_without_keys(&self, ring: &KeyRing) {
-        for link in self.each_link() {
-            let mut state = link.lock();
-            if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
-                self.with(&link, &mut state, |session, cx| session.revoke(cx));
-            }
-            self.settle(&link, state);
-        }
+        credentials
     }
 }

@@ -11,7 +11,7 @@ use cara_core::services::requests::CallId;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
-use super::alarms::Alarm;
+use super::driving::Alarm;
 use super::link::{LinkCell, LinkState};
 use super::reader::Cause;
 use crate::news::News;
@@ -64,7 +64,7 @@ impl<T: Send + 'static> Engine<T> {
         deadline: Instant,
         mut look: impl FnMut(&mut LinkState) -> Option<Result<R, Error>>,
     ) -> Result<R, Error> {
-        let mut alarm = Alarm::new(self.clone());
+        let mut alarm = Alarm::new(self.driver.clone());
         let mut poll = |cx: &mut Context<'_>| {
             let mut state = link.lock();
             let found = look(&mut state);

@@ -9,17 +9,15 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
-use cara_core::services::hub::{Door, Hub};
 use cara_core::services::lease::ActuatorState;
 use cara_core::services::session::{Event, Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
 
 use super::Engine;
-use super::link::{LinkCell, LinkState, Linux, StdMailman};
+use super::link::{LinkCell, LinkState, StdMailman};
 use super::reader::Cause;
 use crate::event::UnitEvent;
-use crate::locks::lock;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Interest;
@@ -27,56 +25,13 @@ use crate::sys::limits;
 use crate::sys::stream::Stream;
 use crate::threads::DATAGRAM;
 
-/// What the hub's lock protects. Nothing is locked under it.
-pub(crate) struct HubCell {
-    pub(crate) hub: Hub<Linux>,
-    serial: u32,
-    /// The serial of the link that last had an index: what the hub says of an index is meant for that one.
-    serials: HashMap<LinkId, u32>,
-}
-
 /// Descriptors that links which have proven nothing leave to those that do, and to the control socket.
 const KEPT_FOR_PROVEN: u64 = 24;
 /// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
 const KEPT_FOR_OPERATOR: u64 = 20;
 
-/// Hosts that are remembered for the size of their segments. Beyond them all are forgotten, and found again.
-const SHORTENED: usize = 256;
-
 /// The node that a link is dialled for, as far as it is known.
 struct Dialed<'i>(Option<&'i Identity>);
-
-impl HubCell {
-    pub(crate) fn new(hub: Hub<Linux>) -> Self {
-        Self { hub, serial: 0, serials: HashMap::new() }
-    }
-
-    /// The serial of the link that a command is for. Another link may have its index by the time that it is passed on.
-    fn serial_of(&self, command: &Command<SocketAddr>) -> Option<u32> {
-        match command {
-            Command::Dial { .. } => None,
-            Command::Notify(link, _) => self.serials.get(link).copied(),
-        }
-    }
-
-    /// Longest block of parameters that this unit takes.
-    pub(crate) fn longest_message(&self) -> usize {
-        self.hub.node.constraints().message_size as usize
-    }
-}
-
-/// The hub, for sessions: under the lock of one link.
-impl<T: Send + 'static> Door<Linux> for &Engine<T> {
-    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Linux>)) {
-        let due = {
-            let mut cell = self.hub();
-            act(&mut cell.hub);
-            cell.hub.node.next_deadline()
-        };
-        // What concerns other links is passed on by the clock.
-        self.wake_clock_at(due);
-    }
-}
 
 impl<T: Send + 'static> Engine<T> {
     /// Puts a stream into the table of links. `None` when the table is full.
@@ -87,10 +42,8 @@ impl<T: Send + 'static> Engine<T> {
         let now = self.now();
         let storage = self.session_storage();
         let (serial, nonce, constraints) = {
-            let mut cell = self.hub();
-            cell.serial = cell.serial.wrapping_add(1);
-            let serial = cell.serial;
-            cell.serials.insert(id, serial);
+            let mut cell = self.hub.lock();
+            let serial = cell.open(id);
             let node = &mut cell.hub.node;
             if let Some(Dialed(identity)) = dialed {
                 node.dialing(identity, id);
@@ -105,11 +58,11 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(span) = self.key_watch.renews_every() {
             session.renew_every(span);
         }
-        let link = Arc::new(LinkCell::new(self.unit_number()?, id, serial, stream, session, dialed));
+        let link = Arc::new(LinkCell::new(self.driver.unit_number()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
         drop(links);
         let interest = if dialed { Interest::READ_EDGE.and_writable() } else { Interest::READ_EDGE };
-        if self.thread_pool().epoll.add(&link.stream, link.token(), interest).is_err() {
+        if self.driver.pool().epoll.add(&link.stream, link.token(), interest).is_err() {
             link.lock().session.disconnected(CloseReason::DialFailed);
         }
         self.settle(&link, link.lock());
@@ -151,7 +104,7 @@ impl<T: Send + 'static> Engine<T> {
             }
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
             self.settle(&link, state);
-            self.hub().hub.node.counters.add(NodeCounter::GaveWay, 1);
+            self.hub.lock().hub.node.counters.add(NodeCounter::GaveWay, 1);
             return true;
         }
         false
@@ -170,19 +123,19 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
-        let stream = Stream::connect(to, lock(&self.short_segments).contains(&to.ip())).ok();
+        let stream = Stream::connect(to, self.sockets.shortens(to.ip())).ok();
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
-            self.hub().hub.node.dial_failed(self.now(), identity);
+            self.hub.lock().hub.node.dial_failed(self.now(), identity);
             let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
             self.notify(UnitEvent::NotJoined { address: to, peer, reason });
         }
-        self.wake_clock();
+        self.driver.wake();
     }
 
     /// Another live unit has this one's identity.
     pub(super) fn duplicate_heard(&self, address: SocketAddr) {
         let refusal = Refusal::DuplicateIdentity;
-        let own = self.hub().hub.node.identity().clone();
+        let own = self.hub.lock().hub.node.identity().clone();
         warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");
         self.notify(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
     }
@@ -205,7 +158,7 @@ impl<T: Send + 'static> Engine<T> {
     /// The hub has taken the peer, which has its place from here on.
     pub(super) fn joined(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
-        let limit = usize::from(self.hub().hub.node.constraints().maximum_nodes);
+        let limit = usize::from(self.hub.lock().hub.node.constraints().maximum_nodes);
         let peer = self.peers_mut().join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
@@ -267,9 +220,13 @@ impl<T: Send + 'static> Engine<T> {
             let mut state = link.lock();
             // It is not put back.
             state.registration.is_out = false;
-            let _ = self.thread_pool().epoll.remove(&link.stream);
+            let _ = self.driver.pool().epoll.remove(&link.stream);
         }
-        self.note_segments(link, reason);
+        let (host, dialed) = {
+            let state = link.lock();
+            (state.session.address().ip(), state.session.dialed())
+        };
+        self.sockets.note_segments(host, dialed, reason);
         self.retire(link);
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);
@@ -277,30 +234,10 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.notify_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
-        self.hub().hub.node.left(self.now(), link.id, reason);
+        self.hub.lock().hub.node.left(self.now(), link.id, reason);
         self.links.remove(link);
         // The hub may have something to do earlier than before.
-        self.wake_clock();
-    }
-
-    /// Where long packets do not arrive, as it seems, the next streams have short segments. A board cannot limit those of a stream
-    /// that it dials, so the next one that is accepted is limited here.
-    fn note_segments(&self, link: &LinkCell, reason: CloseReason) {
-        let state = link.lock();
-        let (host, dialed) = (state.session.address().ip(), state.session.dialed());
-        drop(state);
-        let mut hosts = lock(&self.short_segments);
-        if reason == (CloseReason::StreamDead { long: true }) {
-            if hosts.len() >= SHORTENED {
-                hosts.clear();
-            }
-            if hosts.insert(host) {
-                tracing::warn!(%host, "long packets seem not to arrive: the next streams to it have segments of 536 bytes");
-            }
-        }
-        if !dialed && hosts.contains(&host) {
-            self.sockets.listener.iter().for_each(|listener| listener.limit_segments(true));
-        }
+        self.driver.wake();
     }
 
     /// Passes on what the hub wants done, to the link that it meant and to no other.
@@ -328,8 +265,8 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Searches for nodes now (paper, listing line 6).
     pub(crate) fn broadcast(&self) {
-        self.hub().hub.node.broadcast(self.now());
-        self.wake_clock();
+        self.hub.lock().hub.node.broadcast(self.now());
+        self.driver.wake();
     }
 
     /// Makes all functions of the unit's list visible: to one node, or to all and those that come later. Returns the
@@ -337,7 +274,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn publish(&self, to: Option<&Identity>) -> Result<Vec<(Arc<LinkCell>, u32)>, Error> {
         let slots: Vec<Slot> = self.functions().iter().map(|function| function.slot).collect();
         {
-            let publications = &mut self.hub().hub.publications;
+            let publications = &mut self.hub.lock().hub.publications;
             for &slot in &slots {
                 match to {
                     None => publications.publish_to_all(slot)?,
@@ -364,7 +301,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Removes a function: its slot's callers learn that it is gone.
     pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
         let (slot, _) = self.functions_mut().remove(name)?;
-        self.hub().hub.publications.withdraw(slot);
+        self.hub.lock().hub.publications.withdraw(slot);
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.withdraw(cx, slot));
@@ -399,17 +336,17 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn poll_node(&self) -> Instant {
         // Before the node's lock: a thread that reads a new key file keeps the ring to itself meanwhile.
         let codes = self.keys().codes();
-        if self.hub().hub.node.searches_at() <= self.now() {
+        if self.hub.lock().hub.node.searches_at() <= self.now() {
             // What others have asked and answered may lie unread for as long as this thread was busy with other units.
             let mut buffer = [0; DATAGRAM];
             let emptied = [Socket::Shared, Socket::Own].map(|socket| self.datagrams_ready(socket, &mut buffer));
             if emptied != [true; 2] {
-                self.hub().hub.node.left_unread();
+                self.hub.lock().hub.node.left_unread();
             }
         }
         loop {
             let (command, serial) = {
-                let mut cell = self.hub();
+                let mut cell = self.hub.lock();
                 let mut mailman = StdMailman { stream: None, datagrams: &self.sockets.datagrams };
                 let Some(command) = cell.hub.node.poll(self.now(), &mut mailman, &codes) else {
                     return cell.hub.node.next_deadline();
@@ -439,7 +376,7 @@ mod tests {
         first.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
         let ended = engine.each_link().remove(0);
-        let serial = engine.hub().serials.get(&ended.id).copied();
+        let serial = engine.hub.lock().serials.get(&ended.id).copied();
         assert!(engine.link_of(ended.id, serial).is_some_and(|link| Arc::ptr_eq(&link, &ended)));
         first.stop();
         until(|| manager.number_of_s_units() == 0);
@@ -450,7 +387,7 @@ mod tests {
         let newcomer = engine.each_link().remove(0);
         assert_eq!((newcomer.id, newcomer.serial != ended.serial), (ended.id, true), "it has the same index");
         assert!(engine.link_of(ended.id, serial).is_none());
-        let its_own = engine.hub().serials.get(&newcomer.id).copied();
+        let its_own = engine.hub.lock().serials.get(&newcomer.id).copied();
         assert!(engine.link_of(newcomer.id, its_own).is_some());
     }
 }

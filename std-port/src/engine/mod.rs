@@ -30,6 +30,7 @@ mod clock_thread;
 pub(crate) mod details;
 mod driving;
 mod events;
+mod hub;
 mod inbound;
 mod interfaces;
 mod keys;
@@ -65,28 +66,27 @@ mod workers;
 pub(crate) use accounts::pairs;
 #[cfg(feature = "metrics")]
 pub(crate) use accounts::{Group, Reading};
-#[cfg(feature = "async")]
-#[cfg(feature = "async")]
-pub(crate) use alarms::Alarm;
 pub(crate) use awaiting::{Answered, CallsToAll, Pending};
 #[cfg(feature = "async")]
+pub(crate) use driving::Alarm;
+#[cfg(feature = "async")]
 pub(crate) use events::Delivered;
+pub(crate) use hub::HubCell;
 pub(crate) use keys::Keys;
-pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
 #[cfg(feature = "async")]
 pub(crate) use tasks::{GivenUp, Spawned};
 pub(crate) use worker::{arena, arena_bytes, room};
 
-use std::collections::HashSet;
-use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{self, AtomicU64};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
 
 use cara_core::config::{Constraints, Mode};
+use cara_core::distribution::claim::Claim;
 use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::Fleet;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
@@ -98,27 +98,29 @@ use cara_core::services::session::{Session, buffer_bytes};
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 
-use crate::clock::Clock;
 use crate::config::Capacities;
 #[cfg(feature = "control")]
 use crate::control::Audit;
+use crate::error::{StartError, system_refused};
 use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::latch::Keeper;
-use crate::locks::{Held, Locked, Rank};
+use crate::locks::{Held, Rank};
 use crate::news::News;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
-use crate::sys::interfaces::Interface;
 use crate::sys::stream::Listener;
 use crate::threads::Threads;
+use claims::TakeOver;
 use driving::Driver;
 use events::Events;
-use keys::KeyWatch;
+use hub::{HubDoor, SharedHub};
+use keys::{KeyDoor, KeyWatch};
 use link::{LinkCell, LinkState, Linux, StdMailman};
 use links::Links;
 use peers::{PeerCell, Peers};
+use presence::SelfSearch;
 use services::Services;
 use sockets::Sockets;
 
@@ -126,14 +128,12 @@ use sockets::Sockets;
 pub(crate) struct Engine<T: 'static> {
     /// For work that is left to another thread.
     me: Weak<Self>,
-    driver: Driver,
+    pub(crate) driver: Arc<Driver>,
     /// Beside the hub, whose lock a session's datagram does not take.
     pub(crate) fleet: Fleet,
-    sockets: Sockets,
-    /// Hosts to which long packets do not come.
-    short_segments: Mutex<HashSet<IpAddr>>,
+    pub(crate) sockets: Sockets,
     links: Links,
-    hub: Mutex<HubCell>,
+    pub(crate) hub: SharedHub,
     peers: RwLock<Peers>,
     services: Services<T>,
     pub(crate) pool: MessagePool,
@@ -145,7 +145,6 @@ pub(crate) struct Engine<T: 'static> {
     #[cfg(feature = "control")]
     audit: Option<Arc<Audit>>,
     events: Events,
-    alarms: alarms::Alarms,
     /// For threads that look for themselves at what has happened.
     pub(crate) news: News,
 }
@@ -174,7 +173,7 @@ pub(crate) struct EngineParts<T: 'static> {
 
 impl<T: Send + 'static> Engine<T> {
     pub(crate) fn new(parts: EngineParts<T>) -> Arc<Self> {
-        let driver = Driver::new(parts.threads, parts.own_threads, parts.asks_for_itself);
+        let driver = Arc::new(Driver::new(parts.threads, parts.own_threads, parts.asks_for_itself));
         let node = &parts.hub.hub.node;
         let latch = Keeper::new(parts.state_folder.as_deref(), node.identity(), node.fleet());
         let stopped = latch.kept().or(parts.starts_stopped.map(|reason| Latch { by: 0, reason }));
@@ -185,10 +184,9 @@ impl<T: Send + 'static> Engine<T> {
             me: me.clone(),
             fleet: parts.hub.hub.node.fleet(),
             sockets: Sockets::new(parts.datagrams, parts.listener),
-            short_segments: Mutex::default(),
             links: Links::new(parts.maximum_links, parts.capacities),
             services: Services::new(parts.functions, parts.state, parts.hub.longest_message()),
-            hub: Mutex::new(parts.hub),
+            hub: SharedHub::new(parts.hub),
             peers: RwLock::new(Peers::default()),
             pool: parts.pool,
             key_watch: KeyWatch::new(parts.keys, driver.born()),
@@ -200,7 +198,6 @@ impl<T: Send + 'static> Engine<T> {
             #[cfg(feature = "control")]
             audit: parts.audit,
             events: Events::default(),
-            alarms: alarms::Alarms::default(),
             news: News::default(),
         })
     }
@@ -214,18 +211,6 @@ impl<T: Send + 'static> Engine<T> {
     #[track_caller]
     pub(crate) fn functions_mut(&self) -> Held<RwLockWriteGuard<'_, FunctionList<Boxed, Handler<T>>>> {
         self.services.functions_mut()
-    }
-
-    /// The node, and what it publishes.
-    #[track_caller]
-    pub(crate) fn hub(&self) -> Locked<'_, HubCell> {
-        Rank::Hub.lock(&self.hub)
-    }
-
-    /// Holds the clock up, from a test that goes on with a call, as no thread of the unit does.
-    #[cfg(test)]
-    fn freeze_hub(&self) -> std::sync::MutexGuard<'_, HubCell> {
-        crate::locks::lock(&self.hub)
     }
 
     /// The nodes that this unit knows.
@@ -277,7 +262,8 @@ impl<T: Send + 'static> Engine<T> {
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let (mut hub, mut keys) = (self, self);
+        let mut hub = HubDoor { hub: &self.hub, driver: &self.driver };
+        let mut keys = KeyDoor { watch: &self.key_watch, driver: &self.driver };
         let mut cx = Context {
             now,
             mailman: &mut mailman,
@@ -288,11 +274,6 @@ impl<T: Send + 'static> Engine<T> {
             keys: &mut keys,
         };
         act(session, &mut cx)
-    }
-
-    /// Where the unit takes connections; 0 for nowhere.
-    pub(crate) fn tcp_port(&self) -> u16 {
-        self.sockets.tcp_port()
     }
 
     /// The link of an id.
@@ -329,7 +310,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         self.make_node_room(constraints.maximum_nodes)?;
         let longest = {
-            let mut cell = self.hub();
+            let mut cell = self.hub.lock();
             cell.hub.node.set_constraints(constraints);
             cell.longest_message()
         };
@@ -347,7 +328,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Changes what differs for one node from the unit's constraints.
     pub(crate) fn set_peer_constraints(&self, peer: &PeerCell, constraints: Constraints) -> Result<(), Error> {
-        let unit = *self.hub().hub.node.constraints();
+        let unit = *self.hub.lock().hub.node.constraints();
         peer.set_constraints(unit, constraints)?;
         if let Some(link) = peer.link() {
             let mut state = link.lock();
@@ -362,19 +343,52 @@ impl<T: Send + 'static> Engine<T> {
         self.now().since(self.driver.born())
     }
 
-    /// Whether it has keys.
-    pub(crate) fn mode(&self) -> Mode {
-        self.keys().mode()
+    /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
+    /// does not start again.
+    #[cfg(not(feature = "control"))]
+    pub(crate) fn start(self: &Arc<Self>) -> Result<(), StartError> {
+        self.start_unless(|| None)
     }
 
-    /// The port of broadcasts.
-    pub(crate) fn discovery_port(&self) -> u16 {
-        self.sockets.datagrams.discovery_port()
+    /// Begins, as `start` does, unless a process of this host `holds` what is this unit's, as one does that hangs and
+    /// does not say that it runs.
+    pub(crate) fn start_unless(self: &Arc<Self>, holds: impl FnOnce() -> Option<PathBuf>) -> Result<(), StartError> {
+        if self.is_stopping() {
+            return Err(Error::NotRunning.into());
+        }
+        if self.driver.unit_number().is_some() {
+            return Ok(());
+        }
+        let running = if self.driver.asks_for_itself {
+            let search =
+                SelfSearch { datagrams: &self.sockets.datagrams, keys: self.keys(), clock: self.driver.clock() };
+            search.running_elsewhere(&self.hub).map_err(system_refused)?
+        } else {
+            None
+        };
+        if let Some((at, report)) = &running {
+            self.may_start_beside(*at, report.as_ref())?;
+        }
+        let takes_over = self.claims.take_over != TakeOver::No;
+        if let Some(path) = (self.driver.asks_for_itself && !takes_over).then(holds).flatten() {
+            let (identity, fleet) = self.hub.lock().identity();
+            return Err(StartError::SocketHeld { identity, fleet, path });
+        }
+        self.claim(running.and_then(|(_, report)| report).map_or(Claim::NONE, |report: ClaimReport| report.claim()))?;
+        self.driver.start(self.clone(), &self.sockets)?;
+        self.warn_of_plain_mode();
+        self.driver.wake_looker();
+        self.driver.wake();
+        Ok(())
     }
 
-    /// The interfaces that are used, with those that are down.
-    pub(crate) fn interfaces(&self) -> Arc<[Interface]> {
-        self.sockets.datagrams.targets()
+    fn warn_of_plain_mode(&self) {
+        if self.keys().mode() == Mode::Plain {
+            tracing::warn!(
+                unit = %self.hub.lock().hub.node.identity(), discovery_port = self.sockets.datagrams.discovery_port(),
+                "plain mode, without keys: whoever is on the network can read what this unit says, and speak as any unit"
+            );
+        }
     }
 
     /// Ends every link in an orderly way and all threads. Within a handler it returns before the threads have ended.
@@ -399,9 +413,9 @@ impl<T: Send + 'static> Engine<T> {
         handlers.iter().filter_map(|handler| handler.executor.as_ref()).for_each(|executor| executor.end());
         #[cfg(feature = "async")]
         self.services.runner.end();
-        self.release_threads();
+        self.driver.release_threads(&self.sockets, || self.links.watch.clear());
         // No clock sounds them any more, and the task of one may hold the unit.
-        self.alarms.clear();
+        self.driver.alarms.clear();
         #[cfg(feature = "async")]
         {
             self.events.end_queues();
@@ -442,12 +456,8 @@ impl<T: Send + 'static> Engine<T> {
         names.iter().filter_map(|name| functions.remove(name).ok()).map(|(_, handler)| handler).collect()
     }
 
-    pub(crate) fn clock(&self) -> Clock {
-        self.driver.clock()
-    }
-
     pub(crate) fn now(&self) -> Instant {
-        self.clock().now()
+        self.driver.clock().now()
     }
 
     pub(crate) fn keys(&self) -> &Keys {

@@ -27,7 +27,7 @@ impl<T: Send + 'static> Engine<T> {
             Some(_) => {
                 // Before the clock is told: it reads the list when it is.
                 self.links.watch.enlist(link.token());
-                self.thread_pool().watched.fetch_add(1, Ordering::Relaxed);
+                self.driver.pool().watched.fetch_add(1, Ordering::Relaxed);
                 self.begin_watch();
             }
         }
@@ -45,9 +45,9 @@ impl<T: Send + 'static> Engine<T> {
         let interest = Interest { readable: wanted.readable, writable: wanted.writable, trigger: Trigger::Edge };
         // A descriptor that cannot be watched is one whose link has ended.
         let set = match (before.is_out, wanted.is_out) {
-            (false, true) => self.thread_pool().epoll.remove(&link.stream),
-            (true, false) => self.thread_pool().epoll.add(&link.stream, link.token(), interest),
-            _ => self.thread_pool().epoll.modify(&link.stream, link.token(), interest),
+            (false, true) => self.driver.pool().epoll.remove(&link.stream),
+            (true, false) => self.driver.pool().epoll.add(&link.stream, link.token(), interest),
+            _ => self.driver.pool().epoll.modify(&link.stream, link.token(), interest),
         };
         if set.is_err() {
             state.registration.is_out = false;
@@ -57,7 +57,7 @@ impl<T: Send + 'static> Engine<T> {
     /// The clock is to look at links, until nothing happens there any more.
     pub(super) fn begin_watch(&self) {
         if self.links.watch.begins() {
-            self.wake_clock();
+            self.driver.wake();
         }
     }
 
@@ -71,10 +71,10 @@ impl<T: Send + 'static> Engine<T> {
         let now = self.now();
         let again = self.links.watch.look(|token| {
             let stays = self.links.of_token(token).is_some_and(|link| self.look_at_link(now, &link));
-            self.thread_pool().watched.fetch_sub(usize::from(!stays), Ordering::Relaxed);
+            self.driver.pool().watched.fetch_sub(usize::from(!stays), Ordering::Relaxed);
             stays
         });
-        if !self.thread_pool().relieve(now, RELIEF) && !again {
+        if !self.driver.pool().relieve(now, RELIEF) && !again {
             return Instant::FAR_FUTURE;
         }
         self.links.watch.go_on();
@@ -103,14 +103,14 @@ impl<T: Send + 'static> Engine<T> {
     fn put_off_look(&self, now: Instant, at: Instant) {
         let look = self.links.watch.next();
         if look >= now + LOOK.divided_by(2)
-            || self.thread_pool().watched.load(Ordering::Relaxed) != 1
-            || !self.thread_pool().has_idle()
+            || self.driver.pool().watched.load(Ordering::Relaxed) != 1
+            || !self.driver.pool().has_idle()
         {
             return;
         }
-        let Some(unit_number) = self.unit_number() else { return };
-        let due = || self.links.next_due().min(self.links.watch.others()).min(self.alarms.next());
-        if let Some(at) = self.thread_pool().put_off(unit_number, look, || due().min(at)) {
+        let Some(unit_number) = self.driver.unit_number() else { return };
+        let due = || self.links.next_due().min(self.links.watch.others()).min(self.driver.alarms.next());
+        if let Some(at) = self.driver.pool().put_off(unit_number, look, || due().min(at)) {
             self.links.watch.put_off(look, at);
         }
     }

@@ -77,7 +77,7 @@ impl<T: Send + 'static> Engine<T> {
         started: Started,
         worker: &mut Worker,
     ) -> Option<(Locked<'l, LinkState>, Instant)> {
-        let occupied = self.thread_pool().occupancy.enter();
+        let occupied = self.driver.pool().occupancy.enter();
         let ran = self.run(link, started, &mut worker.arguments);
         drop(occupied);
         let result = match ran {
@@ -155,7 +155,7 @@ impl<T: Send + 'static> Engine<T> {
     ) {
         let Some(engine) = self.me.upgrade() else { return };
         let executor = functions.function(started.call.slot).and_then(|function| function.handler.executor.clone());
-        let Some(executor) = executor.or_else(|| self.thread_pool().executor()) else { return };
+        let Some(executor) = executor.or_else(|| self.driver.pool().executor()) else { return };
         let link = link.clone();
         executor.run(move || match engine.run(&link, started, &mut arguments) {
             Ran::Over(result) => {
@@ -175,7 +175,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Leaves a link's calls to another thread of the pool.
     pub(super) fn hand_over(&self, link: &LinkCell) {
-        self.thread_pool().hand_over(link.token());
+        self.driver.pool().hand_over(link.token());
     }
 
     fn park(&self, turn: Turn, parked: Parked) {
@@ -186,9 +186,9 @@ impl<T: Send + 'static> Engine<T> {
     /// Calls that were parked and have their turn now are left to the pool.
     pub(super) fn go_on_with_parked(&self) {
         if self.services.state.has_ready()
-            && let Some(unit_number) = self.unit_number()
+            && let Some(unit_number) = self.driver.unit_number()
         {
-            self.thread_pool().hand_over(crate::threads::token(unit_number, u64::MAX));
+            self.driver.pool().hand_over(crate::threads::token(unit_number, u64::MAX));
         }
     }
 

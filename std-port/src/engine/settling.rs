@@ -86,7 +86,7 @@ impl<T: Send + 'static> Engine<T> {
         if deadline < state.timer {
             state.timer = deadline;
             if self.links.set_timer(link.id, deadline) {
-                self.wake_clock_at(deadline);
+                self.driver.wake_at(deadline);
             }
         }
     }

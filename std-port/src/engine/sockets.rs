@@ -1,28 +1,56 @@
 //! The unit's own sockets, and what is known of the network that they are in.
 
+use std::collections::HashSet;
+use std::net::IpAddr;
 use std::sync::Mutex;
 
-use cara_core::time::Instant;
+use cara_core::error::CloseReason;
 
 use super::interfaces::InterfaceWatch;
+use crate::locks::lock;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Listener;
 
-pub(super) struct Sockets {
-    pub(super) datagrams: Datagrams,
+/// Hosts that are remembered for the size of their segments. Beyond them all are forgotten, and found again.
+const SHORTENED: usize = 256;
+
+pub(crate) struct Sockets {
+    pub(crate) datagrams: Datagrams,
     pub(super) listener: Option<Listener>,
-    /// When connections are taken again, where there were no descriptors for them.
-    pub(super) listens_at: Mutex<Option<Instant>>,
-    pub(super) interfaces: Mutex<InterfaceWatch>,
+    /// Hosts to which long packets do not come.
+    short_segments: Mutex<HashSet<IpAddr>>,
+    pub(super) interfaces: InterfaceWatch,
 }
 
 impl Sockets {
     pub(super) fn new(datagrams: Datagrams, listener: Option<Listener>) -> Self {
-        Self { datagrams, listener, listens_at: Mutex::new(None), interfaces: Mutex::default() }
+        Self { datagrams, listener, short_segments: Mutex::default(), interfaces: InterfaceWatch::default() }
     }
 
     /// Where the unit takes connections; 0 for nowhere.
-    pub(super) fn tcp_port(&self) -> u16 {
+    pub(crate) fn tcp_port(&self) -> u16 {
         self.listener.as_ref().map_or(0, Listener::port)
+    }
+
+    /// Whether the streams to a host have short segments.
+    pub(super) fn shortens(&self, host: IpAddr) -> bool {
+        lock(&self.short_segments).contains(&host)
+    }
+
+    /// Where long packets do not arrive, as it seems, the next streams have short segments. A board cannot limit those of a stream
+    /// that it dials, so the next one that is accepted is limited here.
+    pub(super) fn note_segments(&self, host: IpAddr, dialed: bool, reason: CloseReason) {
+        let mut hosts = lock(&self.short_segments);
+        if reason == (CloseReason::StreamDead { long: true }) {
+            if hosts.len() >= SHORTENED {
+                hosts.clear();
+            }
+            if hosts.insert(host) {
+                tracing::warn!(%host, "long packets seem not to arrive: the next streams to it have segments of 536 bytes");
+            }
+        }
+        if !dialed && hosts.contains(&host) {
+            self.listener.iter().for_each(|listener| listener.limit_segments(true));
+        }
     }
 }

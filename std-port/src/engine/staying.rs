@@ -25,7 +25,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Waits on `link` for more calls, as long as they come and are quick, and another thread looks after the rest.
     pub(super) fn stay(&self, link: &Arc<LinkCell>, worker: &mut Worker) {
         let Some((token, _staying)) = self.begin_stay(link) else { return };
-        let _occupied = self.thread_pool().occupancy.enter();
+        let _occupied = self.driver.pool().occupancy.enter();
         while let Some((call, began)) = self.await_call(link, token, worker) {
             let Some((state, now)) = self.serve_one(began, link, call, worker) else { break };
             if state.session.has_next_call() || state.is_paused() {
@@ -44,8 +44,8 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn begin_stay(&self, link: &Arc<LinkCell>) -> Option<(Token, Staying<'_>)> {
-        let served = self.thread_pool().served.fetch_add(1, Ordering::Relaxed);
-        if !self.thread_pool().has_idle() {
+        let served = self.driver.pool().served.fetch_add(1, Ordering::Relaxed);
+        if !self.driver.pool().has_idle() {
             return None;
         }
         let staying = self.links.watch.stay()?;
@@ -68,7 +68,7 @@ impl<T: Send + 'static> Engine<T> {
         self.read_by(now, link, &mut state, Cause::Ends(token));
         let stays = state.reading.is_quick() && !state.is_paused() && state.reading.is_held(token);
         self.settle_at(now, link, state);
-        stays && self.thread_pool().has_idle() && !self.is_stopping()
+        stays && self.driver.pool().has_idle() && !self.is_stopping()
     }
 
     /// Reads until a call is to be run; `None` when nothing comes any more, or the thread is needed elsewhere.
@@ -99,7 +99,7 @@ impl<T: Send + 'static> Engine<T> {
             if let Some(call) = call {
                 return Some((call, now));
             }
-            if !alive || !self.thread_pool().has_idle() || self.is_stopping() {
+            if !alive || !self.driver.pool().has_idle() || self.is_stopping() {
                 return None;
             }
         }

@@ -60,7 +60,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         // The node first: it is to know every link that there can be.
         let longer = node_storage(nodes, links);
-        self.hub().hub.node.grow(longer.nodes, longer.order, longer.links);
+        self.hub.lock().hub.node.grow(longer.nodes, longer.order, longer.links);
         let mut cells = self.links.table_mut();
         let length = cells.len().max(links);
         cells.resize_with(length, || None);

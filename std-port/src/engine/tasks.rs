@@ -14,9 +14,9 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::Incoming;
 
 use super::Engine;
-use super::alarms::Alarm;
 use super::calling::PAUSE;
 use super::details;
+use super::driving::Alarm;
 use super::link::LinkCell;
 use crate::executor::Executor;
 use crate::handler::{self, Begin, Work};
@@ -82,7 +82,7 @@ impl<T: Send + 'static> Engine<T> {
             Ok(work) => (Some(work), Err(Error::Service(ServiceError::NotReady))),
             Err(_) => (None, Err(Error::Service(ServiceError::Panicked))),
         };
-        let alarm = Alarm::new(engine.clone());
+        let alarm = Alarm::new(engine.driver.clone());
         let link = link.clone();
         let (failure, answered) = (None, false);
         let task = Task { engine, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered };
@@ -119,7 +119,7 @@ struct Task<T: Send + 'static> {
     /// It is told that its call is given up, and not dropped.
     to_its_end: bool,
     lease: LeaseEnded,
-    alarm: Alarm<T>,
+    alarm: Alarm,
     /// What it has said of its failure.
     failure: Option<Box<Failure>>,
     answered: bool,

@@ -122,7 +122,7 @@ fn a_proven_link_gives_way_to_none() {
     // The vehicle is silent for as long as the test takes, also on a machine that is slow: neither of its lives is lost.
     let pair = Pair::new(Constraints { keep_alive: LONGEST_KEEP_ALIVE, ..Constraints::M_UNIT }, |_| {});
     let (engine, near, far) = (pair.manager.engine(), pair.near(), pair.far());
-    let dial = || TcpStream::connect((Ipv4Addr::LOCALHOST, engine.tcp_port())).unwrap();
+    let dial = || TcpStream::connect((Ipv4Addr::LOCALHOST, engine.sockets.tcp_port())).unwrap();
     // Another life of the vehicle waits until the first one has been asked, and that one does not answer.
     let frozen = far.freeze();
     let earlier = near.lock().session.hello().unwrap().clone();
@@ -264,8 +264,8 @@ fn nothing_is_left_of_a_call_that_has_timed_out() {
     let open = open;
     for clock_is_held_up in [true, true, false] {
         // The clock ends the call, or the caller does where the clock waits for the node.
-        let held_up = clock_is_held_up.then(|| engine.freeze_hub());
-        engine.wake_clock();
+        let held_up = clock_is_held_up.then(|| engine.hub.freeze());
+        engine.driver.wake();
         // Long enough for the call to be run on a busy machine: one that comes too late is answered.
         let outcome = pair.peer.call("wait", &mut text(1)).with(options(Duration::from_millis(500))).wait();
         assert_eq!(outcome, Err(Error::TimedOut.into()));
@@ -284,12 +284,12 @@ fn what_lies_unread_is_read_before_a_question_goes_out() {
     let mut vehicle = |id| -> Unit {
         let unit = Unit::builder("agv", id, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
         let unit = unit.fleet(fleet).discovery_port(port).insecure().build().unwrap();
-        port = unit.engine().discovery_port();
+        port = unit.engine().sockets.datagrams.discovery_port();
         unit
     };
     // None is started: this thread is their clock.
     let units: Vec<Unit> = (1..=UNITS).map(&mut vehicle).collect();
-    let is_due = |unit: &Unit| unit.engine().hub().hub.node.searches_at() <= unit.engine().now();
+    let is_due = |unit: &Unit| unit.engine().hub.lock().hub.node.searches_at() <= unit.engine().now();
     until(|| units.iter().all(is_due));
     for (index, unit) in units.iter().enumerate() {
         if index > 0 {
@@ -313,7 +313,7 @@ fn a_session_datagram_does_not_take_the_hubs_lock() {
     let received = || near.lock().session.counters().value(LinkCounter::DatagramsReceived);
     std::thread::scope(|scope| {
         // The clock reads nothing meanwhile.
-        let frozen = engine.freeze_hub();
+        let frozen = engine.hub.freeze();
         let before = received();
         let reading = scope.spawn(|| engine.datagram(from, &mut bytes));
         until(|| reading.is_finished());

@@ -21,16 +21,16 @@ const READS: usize = 8;
 impl<T: Send + 'static> Engine<T> {
     /// Whether a call may be run: another thread goes on reading.
     pub(super) fn may_run(&self, quick: bool) -> bool {
-        self.may_run_at_once(quick) || self.thread_pool().may_run()
+        self.may_run_at_once(quick) || self.driver.pool().may_run()
     }
 
     /// Whether a call may be run without another thread being started: one waits, or the handler has been quick, and the
     /// clock looks whether it still is.
     fn may_run_at_once(&self, quick: bool) -> bool {
-        if self.thread_pool().has_idle() {
+        if self.driver.pool().has_idle() {
             return true;
         }
-        let may = quick && self.thread_pool().may_run_quickly();
+        let may = quick && self.driver.pool().may_run_quickly();
         if may {
             self.begin_watch();
         }
@@ -102,7 +102,7 @@ impl<T: Send + 'static> Engine<T> {
             }
         }
         let interest = Interest { writable: state.registration.writable, ..Interest::READ_EDGE };
-        let _ = self.thread_pool().epoll.modify(&link.stream, link.token(), interest);
+        let _ = self.driver.pool().epoll.modify(&link.stream, link.token(), interest);
         call
     }
 

@@ -9,6 +9,8 @@ pub mod interfaces;
 pub mod limits;
 pub(crate) mod stream;
 
+use std::hash::{BuildHasher, Hasher, RandomState};
+
 use cara_core::time::Duration;
 use rustix::time::Timespec;
 
@@ -19,4 +21,9 @@ fn timespec(span: Duration) -> Timespec {
         tv_sec: i64::try_from(micros / 1_000_000).unwrap_or(i64::MAX),
         tv_nsec: i64::try_from((micros % 1_000_000).saturating_mul(1_000)).unwrap_or(0),
     }
+}
+
+/// Bits that differ from process to process and from call to call, without a dependency for them.
+pub(crate) fn random() -> u64 {
+    RandomState::new().build_hasher().finish()
 }
