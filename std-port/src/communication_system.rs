@@ -104,7 +104,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn number_of(&self, role: Role) -> usize {
-        self.engine().peers().of_role(role).filter(|peer| peer.is_introduced()).count()
+        self.engine().nodes.read().of_role(role).filter(|peer| peer.is_introduced()).count()
     }
 
     /// The s_units in the order in which they first published their list, then those that have not published it yet.
@@ -119,10 +119,10 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn of_role(&self, role: Role) -> Vec<Peer<T>> {
-        self.engine().peers().of_role(role).map(|cell| self.peer_of(cell)).collect()
+        self.engine().nodes.read().of_role(role).map(|cell| self.peer_of(cell)).collect()
     }
 
-    fn peer_of(&self, cell: &Arc<crate::engine::peers::PeerCell>) -> Peer<T> {
+    fn peer_of(&self, cell: &Arc<crate::engine::peer_cell::PeerCell>) -> Peer<T> {
         Peer { engine: self.engine().clone(), cell: cell.clone() }
     }
 
@@ -195,7 +195,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The node of a name, an ID number and a role: `None` if it has neither joined nor stands on the [roster](Self::roster).
     pub fn node(&self, identity: &Identity) -> Option<Peer<T>> {
-        self.engine().node_of(identity).map(|cell| self.peer_of(&cell))
+        self.engine().nodes.of(self.engine().keys(), identity).map(|cell| self.peer_of(&cell))
     }
 
     /// The s_units that this manager is expected to have, connected or not: with keys those that its key file lists, in
@@ -209,7 +209,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// # Ok::<(), cara_std::BuildError>(())
     /// ```
     pub fn roster(&self) -> Vec<Peer<T>> {
-        self.engine().roster().iter().map(|cell| self.peer_of(cell)).collect()
+        self.engine().nodes.roster(self.engine().keys()).iter().map(|cell| self.peer_of(cell)).collect()
     }
 
     /// The connected nodes at an IP address.
@@ -223,7 +223,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn only(&self, wanted: impl Fn(&Identity) -> bool) -> Result<Peer<T>, Error> {
-        self.engine().only_node(wanted).map(|cell| self.peer_of(&cell))
+        self.engine().nodes.only(self.engine().keys(), wanted).map(|cell| self.peer_of(&cell))
     }
 
     /// Those of which a call to all has an outcome: the whole roster, and any other node that offers the function.
@@ -236,7 +236,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn connected(&self) -> impl Iterator<Item = Peer<T>> {
-        let peers: Vec<_> = self.engine().peers().connected().map(|cell| self.peer_of(cell)).collect();
+        let peers: Vec<_> = self.engine().nodes.read().connected().map(|cell| self.peer_of(cell)).collect();
         peers.into_iter()
     }
 

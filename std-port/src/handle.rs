@@ -301,7 +301,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
     pub fn end_order(&self, order: &LeaseWatch) -> bool {
         let Some((word, order)) = order.order() else { return false };
         let engine = self.engine();
-        let is_finished = engine.each_link().into_iter().any(|link| {
+        let is_finished = engine.links.all().into_iter().any(|link| {
             let mut state = link.lock();
             let is_finished = engine.with(&link, &mut state, |session, cx| session.end_order(cx, &word.lease, order));
             engine.settle(&link, state);

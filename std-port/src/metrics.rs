@@ -56,7 +56,7 @@ struct PeerSnapshot {
 impl Snapshot {
     fn of<T: Send + 'static>(engine: &Engine<T>, unit: &Identity) -> Self {
         let cells: Vec<_> = {
-            let peers = engine.peers();
+            let peers = engine.nodes.read();
             [Role::SUnit, Role::MUnit]
                 .into_iter()
                 .flat_map(|role| peers.of_role(role).cloned().collect::<Vec<_>>())

@@ -22,7 +22,7 @@ use crate::builder;
 #[cfg(feature = "control")]
 use crate::control::protocol::{DatagramsInfo, LinkInfo};
 use crate::engine::link::LinkCell;
-use crate::engine::peers::PeerCell;
+use crate::engine::peer_cell::PeerCell;
 use crate::engine::{Engine, pairs};
 use crate::growing::{CallParameters, bytes_of_results};
 

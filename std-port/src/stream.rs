@@ -226,7 +226,8 @@ impl<T: Send + 'static> TheirStream<T> {
     /// The last value comes at once. After a reconnection the subscription is made again by itself.
     pub fn subscribe(&self, interval: impl Into<Duration>) -> Subscription<T> {
         let interval = interval.into();
-        let (watched, id) = self.peer.engine.subscribe_to(&self.peer.cell, self.definition.name(), interval);
+        let (watched, id) = self.peer.cell.streams.subscribe(self.definition.name(), interval);
+        self.peer.engine.tell_interval(&self.peer.cell, &watched);
         Subscription { peer: self.peer.clone(), watched, id, interval, seen: 0, due: Instant::START }
     }
 }
@@ -403,7 +404,8 @@ impl<T: Send + 'static> Subscription<T> {
 
 impl<T: Send + 'static> Drop for Subscription<T> {
     fn drop(&mut self) {
-        self.peer.engine.unsubscribe(&self.peer.cell, &self.watched, self.id);
+        self.peer.cell.streams.unsubscribe(&self.watched, self.id);
+        self.peer.engine.tell_interval(&self.peer.cell, &self.watched);
     }
 }
 

@@ -56,17 +56,17 @@ impl Pair {
         until(|| manager.number_of_s_units() == 1);
         let peer = manager.s_unit("agv").unwrap();
         until(|| peer.their_function_list().len() == agv.my_function_list().len());
-        until(|| agv.engine().each_link().first().is_some_and(|link| link.peer.get().is_some()));
+        until(|| agv.engine().links.all().first().is_some_and(|link| link.peer.get().is_some()));
         Self { manager, agv, peer }
     }
 
     /// The manager's end of the link.
     pub(crate) fn near(&self) -> Arc<LinkCell> {
-        self.manager.engine().each_link().remove(0)
+        self.manager.engine().links.all().remove(0)
     }
 
     /// The vehicle's end. As long as its lock is held, the vehicle reads and answers nothing.
     pub(crate) fn far(&self) -> Arc<LinkCell> {
-        self.agv.engine().each_link().remove(0)
+        self.agv.engine().links.all().remove(0)
     }
 }

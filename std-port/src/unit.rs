@@ -39,7 +39,7 @@ impl Unit {
 impl<T: Send + 'static> Unit<T> {
     /// The manager, once it has been met.
     pub fn manager(&self) -> Option<Peer<T>> {
-        let peers = self.engine().peers();
+        let peers = self.engine().nodes.read();
         let cell = peers.of_role(Role::MUnit).next().cloned();
         cell.map(|cell| Peer { engine: self.engine().clone(), cell })
     }

@@ -90,7 +90,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Another table, or none: in force when this returns, and every peer is told what it may see.
     pub(crate) fn set_access(&self, table: Option<AccessTable>) {
         self.guard.set(table);
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             // One that is not live yet may have told its list.
             self.with(&link, &mut state, |session, cx| session.access_changed(cx));
@@ -150,7 +150,7 @@ mod operator {
 
         /// Whether a function of this name stops something, or is an emergency service, at any node.
         fn is_urgent(&self, function: &str) -> bool {
-            self.each_link().iter().any(|link| {
+            self.links.all().iter().any(|link| {
                 let state = link.lock();
                 let known = state.session.their_function_list().named(function);
                 known.is_some_and(|known| known.attributes.is_urgent(known.attributes.priority))

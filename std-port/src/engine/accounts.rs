@@ -11,7 +11,7 @@ use cara_core::host::connections::LinkCounter;
 
 use super::Engine;
 use super::link::LinkCell;
-use super::peers::{LinkCounters, PeerCell};
+use super::peer_cell::{LinkCounters, PeerCell};
 use crate::locks::Rank;
 
 /// What outlives the links, and what is counted outside of the core.
@@ -106,7 +106,7 @@ impl<T: Send + 'static> Engine<T> {
     fn sum_links(&self) -> (LinkCounters, Held) {
         let ended = Rank::Accounts.lock(&self.accounts.ended);
         let (mut sum, mut held) = (ended.clone(), Held::default());
-        for link in self.each_link() {
+        for link in self.links.all() {
             let state = link.lock();
             if !state.retired {
                 sum.merge(state.session.counters());
@@ -129,7 +129,7 @@ impl<T: Send + 'static> Engine<T> {
         let actuators = functions.iter().filter_map(|function| function.handler.actuator.as_ref());
         actuators.for_each(|actuator| actuator.safe.look());
         let pool = self.pool.counters();
-        let connected = self.peers().connected().count() as u64;
+        let connected = self.nodes.read().connected().count() as u64;
         let file = &self.guard.file;
         let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         [

@@ -21,6 +21,7 @@ use super::settling::RETRY;
 use super::worker::READ_BYTES;
 use crate::error::CallError;
 use crate::locks::Locked;
+use crate::storage::filled;
 use crate::sys::stream::{Received, Wait};
 
 /// How long a caller waits at a time for room or for its turn, before it looks again.
@@ -295,6 +296,40 @@ impl<T: Send + 'static> Engine<T> {
         self.settle_at(now, link, state);
     }
 
+    #[expect(clippy::too_many_arguments, reason = "those of a request, and where and when it is made")]
+    /// A request on a link, with more slots for calls if all of those are taken that it has.
+    pub(super) fn request_on(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        state: &mut LinkState,
+        callee: Callee<'_>,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wait: bool,
+    ) -> Result<CallId, CallError> {
+        let mut attempt =
+            || self.with_at(now, link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
+        let mut outcome = attempt();
+        let most = self.links.capacities.calls_in_flight;
+        if outcome == Err(Error::Full(Limit::Calls)) && state.session.call_slots() < most {
+            drop(state.session.lend_calls(filled(most, None)));
+            outcome = self.with(link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
+        }
+        // An operator's is not the program's to ask after.
+        if let Ok(id) = outcome
+            && !options.operator
+            && state.session.last_order().is_some_and(|(_, order)| order == id)
+            && let Some(peer) = link.peer.get()
+        {
+            peer.ordered(callee.name(), state.session.nonce() as u32, id);
+        }
+        outcome.map_err(|error| match error {
+            Error::Mismatch(_) => mismatch(state, callee, error),
+            error => error.into(),
+        })
+    }
+
     /// Nothing waits for a call any more, and what it started is not wanted.
     pub(crate) fn give_up_call(&self, link: &Arc<LinkCell>, id: CallId) {
         let mut state = link.lock();
@@ -304,7 +339,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// A loop has ended: what it wanted is released on all links.
     pub(crate) fn release_beats(&self, beats: Beats) {
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.release_beats(cx, beats));
             self.settle(&link, state);
@@ -320,6 +355,14 @@ impl<T: Send + 'static> Engine<T> {
 /// Why a call has no results, with what its service has said.
 fn failed(error: Error, failure: Option<Box<Failure>>) -> CallError {
     CallError::new(error, failure.map(|failure| Detail::Service(*failure)))
+}
+
+/// Where the peer's version of a function differs.
+#[cold]
+fn mismatch(state: &LinkState, callee: Callee<'_>, error: Error) -> CallError {
+    let published = state.session.their_function_list().named(callee.name());
+    let found = published.and_then(|published| callee.check(published.signature).err());
+    CallError::new(error, found.map(Detail::Version))
 }
 
 /// For the audit log.

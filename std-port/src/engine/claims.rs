@@ -277,7 +277,7 @@ impl<T: Send + 'static> Engine<T> {
         let (identity, _) = self.hub.lock().identity();
         let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
         self.hub.lock().hub.node.set_claim(tagged);
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.announce_claim(cx));
             self.settle(&link, state);

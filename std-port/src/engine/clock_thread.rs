@@ -30,7 +30,7 @@ impl<T: Send + 'static> Engine<T> {
                 Ok(due) => due,
                 Err(next) => return next,
             };
-            let Some(link) = self.link(due) else { continue };
+            let Some(link) = self.links.get(due) else { continue };
             let mut state = link.lock();
             state.timer = Instant::FAR_FUTURE;
             if state.is_paused() {
@@ -66,7 +66,7 @@ impl<T: Send + 'static> Engine<T> {
 
     pub(super) fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
         if let Some((link, nonce, body)) = datagram::for_session(bytes, self.keys().mode(), self.fleet)
-            && let Some(link) = self.link(link)
+            && let Some(link) = self.links.get(link)
         {
             return self.session_datagram(&link, from, nonce, body);
         }
@@ -141,7 +141,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// A peer that was revoked loses its link.
     fn end_links_without_keys(&self, ring: &KeyRing) {
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
                 self.with(&link, &mut state, |session, cx| session.revoke(cx));
@@ -168,7 +168,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
     }
 
     fn look_around(&self) -> Instant {
-        let (interfaces, up) = self.sockets.interfaces.look(&self.sockets.datagrams, &self.hub, &self.driver);
+        let (interfaces, up) = self.interfaces.look(&self.sockets.datagrams, &self.hub, &self.driver);
         if let Some(up) = up {
             self.notify(UnitEvent::NetworkChanged { up });
         }

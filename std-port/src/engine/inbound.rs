@@ -100,7 +100,7 @@ impl<T: Send + 'static> Engine<T> {
         mut arguments: Option<&mut ParametersView>,
         own: Option<&mut OwnCall<'_>>,
     ) -> Step {
-        self.make_call_room(state);
+        self.links.make_call_room(state);
         let functions = self.functions();
         let LinkState { session, waiters, notices, woken, .. } = state;
         let receipt = self.with_functions(now, &functions, link, session, |session, cx| {
@@ -148,7 +148,9 @@ impl<T: Send + 'static> Engine<T> {
             }
             Some(Event::Sample(sample)) => {
                 let block = session.results(&sample.values, bytes);
-                if block.is_ok_and(|block| self.sample_arrived(now, link, sample.age, &block, woken)) {
+                if let Some(peer) = link.peer.get()
+                    && block.is_ok_and(|block| peer.streams.receive(now, sample.age, &block, woken))
+                {
                     notices.push(Event::Sample(sample));
                 }
             }
@@ -160,7 +162,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
                 if matches!(event, Event::ListChanged) && !link.is_introduced() {
                     // A node that counts has its place.
-                    link.peer.get().into_iter().for_each(|peer| self.peers_mut().introduce(peer));
+                    link.peer.get().into_iter().for_each(|peer| self.nodes.write().introduce(peer));
                     link.introduce();
                 }
                 if let Event::LeaseExpired(slot) = event {

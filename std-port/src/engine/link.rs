@@ -23,7 +23,7 @@ use core::net::SocketAddr;
 
 use super::details::Details;
 use super::notices::Notices;
-use super::peers::PeerCell;
+use super::peer_cell::PeerCell;
 use super::reader::{ReadPolicy, Registration};
 use crate::locks::{Locked, Rank};
 use crate::storage::Boxed;
@@ -214,6 +214,12 @@ impl LinkCell {
         drop(state);
         self.room.notify_all();
         woken.into_iter().for_each(Waker::wake);
+    }
+
+    /// The name of a function of the peer.
+    pub(super) fn their_function(&self, slot: Slot) -> Option<String> {
+        let state = self.lock();
+        state.session.their_function_list().function(slot).map(|function| function.name().to_owned())
     }
 
     /// The state, unless a thread has it now.

@@ -14,7 +14,7 @@ use crate::timers::Timers;
 /// One place for each link that there may be.
 type Table = Vec<Option<Arc<LinkCell>>>;
 
-pub(super) struct Links {
+pub(crate) struct Links {
     table: RwLock<Table>,
     /// When the session of each is to be polled.
     timers: Mutex<Timers>,
@@ -49,7 +49,7 @@ impl Links {
         self.get(id).filter(|link| link.token() == token)
     }
 
-    pub(super) fn all(&self) -> Vec<Arc<LinkCell>> {
+    pub(crate) fn all(&self) -> Vec<Arc<LinkCell>> {
         self.table().iter().flatten().cloned().collect()
     }
 

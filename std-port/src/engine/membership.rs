@@ -16,7 +16,10 @@ use core::net::{IpAddr, SocketAddr};
 
 use super::Engine;
 use super::link::{LinkCell, LinkState, StdMailman};
+use super::peer_cell::PeerCell;
 use super::reader::Cause;
+use super::streams::Watched;
+use super::tables;
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
@@ -40,7 +43,7 @@ impl<T: Send + 'static> Engine<T> {
         let index = links.iter().position(Option::is_none)?;
         let id = LinkId(u16::try_from(index).ok()?);
         let now = self.now();
-        let storage = self.session_storage();
+        let storage = self.links.session_storage(self.services.own_functions());
         let (serial, nonce, constraints) = {
             let mut cell = self.hub.lock();
             let serial = cell.open(id);
@@ -117,7 +120,7 @@ impl<T: Send + 'static> Engine<T> {
             let is_unproven = !state.session.dialed() && !state.session.is_proven();
             is_unproven.then(|| state.session.address().ip())
         };
-        let mut links = self.each_link();
+        let mut links = self.links.all();
         links.retain(|link| link.peer.get().is_none());
         links.into_iter().filter_map(|link| Some((host(&link)?, link))).collect()
     }
@@ -159,14 +162,14 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn joined(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
         let limit = usize::from(self.hub.lock().hub.node.constraints().maximum_nodes);
-        let peer = self.peers_mut().join(&identity, limit, link);
+        let peer = self.nodes.write().join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
         }
         let _ = link.peer.set(peer);
         // Who publishes from here on finds the peer, and waits for this link's lock to tell it. What was published before,
         // and after the session looked, or found no room in it, is told now.
-        let grew = self.make_publication_room(state);
+        let grew = tables::make_publication_room(state, self.services.own_functions());
         self.with(link, state, |session, cx| {
             if grew || session.is_behind(cx) {
                 session.publish(cx);
@@ -184,9 +187,24 @@ impl<T: Send + 'static> Engine<T> {
             return self.actuator_reported(link, slot, state);
         }
         match event {
-            Event::Sample(_) => return self.pass_on_samples(link),
-            Event::Subscribed(slot, answer) => return self.subscription_answered(link, slot, answer),
-            Event::ListChanged => self.subscribe_again(link),
+            Event::Sample(_) => {
+                if link.peer.get().is_some_and(|peer| peer.streams.pass_on(self.now())) {
+                    self.stream_published();
+                }
+                return;
+            }
+            Event::Subscribed(slot, answer) => {
+                if let Some((peer, name)) = link.peer.get().zip(link.their_function(slot)) {
+                    peer.streams.answered(&name, answer);
+                }
+                return;
+            }
+            Event::ListChanged => {
+                // What is read of it is subscribed to.
+                if let Some(peer) = link.peer.get() {
+                    peer.streams.all().iter().for_each(|watched| self.tell_interval_on(link, peer, watched));
+                }
+            }
             _ => {}
         }
         self.notify_of(link, event);
@@ -260,7 +278,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The link that a command means, unless that one has ended: another may have got its place.
     fn link_of(&self, id: LinkId, serial: Option<u32>) -> Option<Arc<LinkCell>> {
-        self.link(id).filter(|link| Some(link.serial) == serial)
+        self.links.get(id).filter(|link| Some(link.serial) == serial)
     }
 
     /// Searches for nodes now (paper, listing line 6).
@@ -282,7 +300,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
             }
         }
-        let peers: Vec<_> = self.peers().connected().cloned().collect();
+        let peers: Vec<_> = self.nodes.read().connected().cloned().collect();
         let chosen = peers.into_iter().filter(|peer| to.is_none_or(|identity| peer.identity == *identity));
         Ok(chosen.filter_map(|peer| self.publish_on(&peer.link()?)).collect())
     }
@@ -292,7 +310,7 @@ impl<T: Send + 'static> Engine<T> {
         if !state.session.is_live() {
             return None;
         }
-        self.make_publication_room(&mut state);
+        tables::make_publication_room(&mut state, self.services.own_functions());
         let serial = self.with(link, &mut state, |session, cx| session.publish(cx));
         self.settle(link, state);
         Some((link.clone(), serial))
@@ -302,12 +320,49 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
         let (slot, _) = self.functions_mut().remove(name)?;
         self.hub.lock().hub.publications.withdraw(slot);
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.withdraw(cx, slot));
             self.settle(&link, state);
         }
         Ok(())
+    }
+
+    /// A stream of this unit has a new value: it goes to each node whose turn it is.
+    pub(crate) fn stream_published(&self) {
+        for link in self.links.all() {
+            if !link.has_subscriptions() {
+                continue;
+            }
+            let mut state = link.lock();
+            if state.session.stream_changed(self.now()) {
+                self.settle(&link, state);
+            }
+        }
+    }
+
+    /// A node is told at which interval its stream is read here, if it still is.
+    pub(crate) fn tell_interval(&self, peer: &PeerCell, watched: &Watched) {
+        if let Some(link) = peer.link() {
+            self.tell_interval_on(&link, peer, watched);
+        }
+    }
+
+    fn tell_interval_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
+        let mut state = link.lock();
+        // Read under the lock of the link: of two threads the last one tells what holds.
+        let interval = peer.streams.interval(&watched.name);
+        let reported = self.with(link, &mut state, |session, cx| match interval {
+            Some(interval) => session.subscribe(cx, &watched.name, interval).map(drop),
+            None => {
+                session.unsubscribe(cx, &watched.name);
+                Ok(())
+            }
+        });
+        self.settle(link, state);
+        if let Err(error @ Error::UnknownFunction) = reported {
+            watched.was_answered(Err(error));
+        }
     }
 
     /// Waits until each peer has read what it was told, at most until `timeout`; returns those that have not.
@@ -375,16 +430,16 @@ mod tests {
         let first = vehicle(fleet, 1, Constraints::S_UNIT);
         first.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
-        let ended = engine.each_link().remove(0);
+        let ended = engine.links.all().remove(0);
         let serial = engine.hub.lock().serials.get(&ended.id).copied();
         assert!(engine.link_of(ended.id, serial).is_some_and(|link| Arc::ptr_eq(&link, &ended)));
         first.stop();
         until(|| manager.number_of_s_units() == 0);
-        until(|| engine.link(ended.id).is_none());
+        until(|| engine.links.get(ended.id).is_none());
         let second = vehicle(fleet, 2, Constraints::S_UNIT);
         second.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
-        let newcomer = engine.each_link().remove(0);
+        let newcomer = engine.links.all().remove(0);
         assert_eq!((newcomer.id, newcomer.serial != ended.serial), (ended.id, true), "it has the same index");
         assert!(engine.link_of(ended.id, serial).is_none());
         let its_own = engine.hub.lock().serials.get(&newcomer.id).copied();

@@ -41,7 +41,8 @@ mod looking;
 mod membership;
 pub(crate) mod notices;
 mod noting;
-pub(crate) mod peers;
+pub(crate) mod peer_cell;
+mod peers;
 mod pinging;
 mod presence;
 pub(crate) mod reader;
@@ -81,7 +82,7 @@ pub(crate) use worker::{arena, arena_bytes, room};
 use std::path::PathBuf;
 use std::sync::atomic::{self, AtomicU64};
 use std::sync::mpsc::SyncSender;
-use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
+use std::sync::{Arc, Mutex, RwLockReadGuard, RwLockWriteGuard, Weak};
 
 use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::claim::Claim;
@@ -89,7 +90,6 @@ use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::Fleet;
 use cara_core::error::{CloseReason, Error};
-use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::services::Context;
 use cara_core::services::access::Access;
@@ -105,7 +105,7 @@ use crate::error::{StartError, system_refused};
 use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::latch::Keeper;
-use crate::locks::{Held, Rank};
+use crate::locks::Held;
 use crate::news::News;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
@@ -119,7 +119,8 @@ use hub::{HubDoor, SharedHub};
 use keys::{KeyDoor, KeyWatch};
 use link::{LinkCell, LinkState, Linux, StdMailman};
 use links::Links;
-use peers::{PeerCell, Peers};
+use peer_cell::PeerCell;
+use peers::Nodes;
 use presence::SelfSearch;
 use services::Services;
 use sockets::Sockets;
@@ -132,9 +133,10 @@ pub(crate) struct Engine<T: 'static> {
     /// Beside the hub, whose lock a session's datagram does not take.
     pub(crate) fleet: Fleet,
     pub(crate) sockets: Sockets,
-    links: Links,
+    interfaces: interfaces::InterfaceWatch,
+    pub(crate) links: Links,
     pub(crate) hub: SharedHub,
-    peers: RwLock<Peers>,
+    pub(crate) nodes: Nodes,
     services: Services<T>,
     pub(crate) pool: MessagePool,
     pub(crate) key_watch: KeyWatch,
@@ -184,10 +186,11 @@ impl<T: Send + 'static> Engine<T> {
             me: me.clone(),
             fleet: parts.hub.hub.node.fleet(),
             sockets: Sockets::new(parts.datagrams, parts.listener),
+            interfaces: interfaces::InterfaceWatch::default(),
             links: Links::new(parts.maximum_links, parts.capacities),
             services: Services::new(parts.functions, parts.state, parts.hub.longest_message()),
             hub: SharedHub::new(parts.hub),
-            peers: RwLock::new(Peers::default()),
+            nodes: Nodes::new(),
             pool: parts.pool,
             key_watch: KeyWatch::new(parts.keys, driver.born()),
             driver,
@@ -211,17 +214,6 @@ impl<T: Send + 'static> Engine<T> {
     #[track_caller]
     pub(crate) fn functions_mut(&self) -> Held<RwLockWriteGuard<'_, FunctionList<Boxed, Handler<T>>>> {
         self.services.functions_mut()
-    }
-
-    /// The nodes that this unit knows.
-    #[track_caller]
-    pub(crate) fn peers(&self) -> Held<RwLockReadGuard<'_, Peers>> {
-        Rank::Leaf.read(&self.peers)
-    }
-
-    #[track_caller]
-    pub(super) fn peers_mut(&self) -> Held<RwLockWriteGuard<'_, Peers>> {
-        Rank::Leaf.write(&self.peers)
     }
 
     pub(crate) fn is_stopping(&self) -> bool {
@@ -276,15 +268,6 @@ impl<T: Send + 'static> Engine<T> {
         act(session, &mut cx)
     }
 
-    /// The link of an id.
-    pub(crate) fn link(&self, id: LinkId) -> Option<Arc<LinkCell>> {
-        self.links.get(id)
-    }
-
-    pub(crate) fn each_link(&self) -> Vec<Arc<LinkCell>> {
-        self.links.all()
-    }
-
     /// Tells subscribers.
     pub(crate) fn notify(&self, event: UnitEvent) {
         self.events.notify(&event);
@@ -308,7 +291,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the process may
     /// have files open for.
     pub(crate) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
-        self.make_node_room(constraints.maximum_nodes)?;
+        self.links.make_node_room(&self.hub, constraints.maximum_nodes)?;
         let longest = {
             let mut cell = self.hub.lock();
             cell.hub.node.set_constraints(constraints);
@@ -317,7 +300,7 @@ impl<T: Send + 'static> Engine<T> {
         // Buffers first: peers send longer messages as soon as they are told.
         self.pool.resize(message_buffer_bytes(&constraints, self.keys().mode()));
         self.services.set_longest_message(longest);
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             let own = link.peer.get().map_or(constraints, |peer| peer.constraints(constraints));
             self.with(&link, &mut state, |session, cx| session.set_constraints(cx, own));
@@ -398,7 +381,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         // Those that wait for a node wait in vain.
         self.news.add();
-        for link in self.each_link() {
+        for link in self.links.all() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::StoppedHere));
             self.settle(&link, state);
@@ -419,7 +402,8 @@ impl<T: Send + 'static> Engine<T> {
         #[cfg(feature = "async")]
         {
             self.events.end_queues();
-            self.end_streams();
+            let peers: Vec<_> = self.nodes.read().all().cloned().collect();
+            peers.iter().for_each(|peer| peer.streams.wake_tasks());
         }
     }
 

@@ -1,182 +1,26 @@
 //! The nodes that this unit knows, in the order in which they first told what they offer: a node keeps its place when
 //! another one leaves, and finds it again when it comes back.
 
-use std::collections::{BTreeMap, HashMap};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::HashMap;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
-use cara_core::config::Constraints;
-use cara_core::counters::Counters;
 use cara_core::distribution::identity::{Identity, Role};
-use cara_core::error::{CloseReason, Error};
-use cara_core::host::connections::LinkCounter;
-use cara_core::services::requests::CallId;
-use cara_core::time::Duration;
+use cara_core::error::Error;
 
+use super::keys::Keys;
 use super::link::LinkCell;
+use super::peer_cell::PeerCell;
 use super::roster::Roster;
-use crate::locks::lock;
-
-/// The counters of a link, or of many.
-pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
-
-/// A node, connected or not.
-pub(crate) struct PeerCell {
-    pub(crate) identity: Identity,
-    link: Mutex<Option<Arc<LinkCell>>>,
-    /// When it joined last.
-    joined: Mutex<Option<std::time::Instant>>,
-    /// When and why its last link ended.
-    left: Mutex<Option<(std::time::Instant, CloseReason)>>,
-    /// What differs for this node from the unit's constraints, whether it is connected or not.
-    own: Mutex<Option<OwnConstraints>>,
-    /// The newest call of each function that was to move something, and the link that it was made by.
-    orders: Mutex<BTreeMap<String, (u32, CallId)>>,
-    /// Its streams that are read here.
-    pub(super) streams: Mutex<HashMap<String, Arc<super::streams::Watched>>>,
-    /// What its earlier links have counted.
-    earlier: Mutex<Option<Box<LinkCounters>>>,
-    /// It has told what it offers since it has its place, on this link or an earlier one.
-    introduced: AtomicBool,
-    /// The operator has taken it off the roster.
-    retired: AtomicBool,
-}
-
-/// The constraints that a node may have of its own.
-#[derive(Clone, Copy)]
-struct OwnConstraints {
-    request_timeout: Duration,
-    minimum_interval: Duration,
-    calls_per_peer: u16,
-}
-
-impl PeerCell {
-    /// The link to the node while it is connected.
-    pub(crate) fn link(&self) -> Option<Arc<LinkCell>> {
-        self.link.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-
-    pub(crate) fn is_connected(&self) -> bool {
-        self.link.lock().unwrap_or_else(PoisonError::into_inner).is_some()
-    }
-
-    /// How long it has been connected.
-    pub(crate) fn connected_for(&self) -> Option<std::time::Duration> {
-        self.link()?;
-        lock(&self.joined).map(|joined| joined.elapsed())
-    }
-
-    /// How long ago it left, and why, while it is not connected.
-    pub(crate) fn left(&self) -> Option<(std::time::Duration, CloseReason)> {
-        let left = *lock(&self.left);
-        left.filter(|_| !self.is_connected()).map(|(at, reason)| (at.elapsed(), reason))
-    }
-
-    /// Whether it is connected and what it offers is known.
-    pub(crate) fn is_introduced(&self) -> bool {
-        self.link().is_some_and(|link| link.is_introduced())
-    }
-
-    /// The unit's constraints with what this node has of its own.
-    pub(crate) fn constraints(&self, unit: Constraints) -> Constraints {
-        self.own_constraints(unit).unwrap_or(unit)
-    }
-
-    pub(super) fn own_constraints(&self, unit: Constraints) -> Option<Constraints> {
-        let own = (*lock(&self.own))?;
-        let OwnConstraints { request_timeout, minimum_interval, calls_per_peer } = own;
-        Some(Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit })
-    }
-
-    /// [`Error::BadConstraint`] for what cannot differ from node to node.
-    pub(super) fn set_constraints(&self, unit: Constraints, wanted: Constraints) -> Result<(), Error> {
-        let Constraints { request_timeout, minimum_interval, calls_per_peer, .. } = wanted;
-        if wanted != (Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit }) {
-            return Err(Error::BadConstraint);
-        }
-        *lock(&self.own) = Some(OwnConstraints { request_timeout, minimum_interval, calls_per_peer });
-        Ok(())
-    }
-
-    pub(super) fn new(identity: &Identity) -> Arc<Self> {
-        Arc::new(Self {
-            identity: identity.clone(),
-            link: Mutex::new(None),
-            joined: Mutex::new(None),
-            left: Mutex::new(None),
-            own: Mutex::new(None),
-            orders: Mutex::default(),
-            streams: Mutex::default(),
-            earlier: Mutex::new(None),
-            introduced: AtomicBool::new(false),
-            retired: AtomicBool::new(false),
-        })
-    }
-
-    /// Whether it has ever joined.
-    pub(super) fn has_joined(&self) -> bool {
-        lock(&self.joined).is_some()
-    }
-
-    /// Whether it has been taken off the roster, and has not joined since.
-    pub(crate) fn is_retired(&self) -> bool {
-        self.retired.load(Ordering::Relaxed)
-    }
-
-    /// Takes it off the roster until it joins again; `false` while it is connected.
-    pub(crate) fn retire(&self) -> bool {
-        let link = self.link.lock().unwrap_or_else(PoisonError::into_inner);
-        if link.is_none() {
-            self.retired.store(true, Ordering::Relaxed);
-        }
-        link.is_none()
-    }
-
-    /// A call that is to move something goes out.
-    pub(super) fn ordered(&self, function: &str, link: u32, call: CallId) {
-        let mut orders = lock(&self.orders);
-        match orders.get_mut(function) {
-            Some(known) => *known = (link, call),
-            None => drop(orders.insert(function.to_owned(), (link, call))),
-        }
-    }
-
-    /// The newest call of a function that was to move something, and the link that it was made by.
-    pub(crate) fn last_order(&self, function: &str) -> Option<(u32, CallId)> {
-        lock(&self.orders).get(function).copied()
-    }
-
-    pub(super) fn earlier(&self) -> LinkCounters {
-        lock(&self.earlier).as_deref().cloned().unwrap_or_default()
-    }
-
-    pub(super) fn keep(&self, counters: &LinkCounters) {
-        lock(&self.earlier).get_or_insert_default().merge(counters);
-    }
-
-    fn join(&self, link: Arc<LinkCell>) {
-        *lock(&self.joined) = Some(std::time::Instant::now());
-        let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
-        self.retired.store(false, Ordering::Relaxed);
-        *current = Some(link);
-    }
-
-    /// The link has ended; a newer one stays.
-    pub(crate) fn leave(&self, link: &LinkCell, reason: CloseReason) {
-        let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
-        if current.as_ref().is_some_and(|current| current.serial == link.serial) {
-            *lock(&self.left) = Some((std::time::Instant::now(), reason));
-            *current = None;
-        }
-    }
-}
+use crate::keys::KeyRing;
+use crate::locks::{Held, Rank};
 
 /// All nodes that have joined.
 #[derive(Default)]
 pub(crate) struct Peers {
     list: Vec<Arc<PeerCell>>,
     by_identity: HashMap<Identity, usize>,
-    pub(super) roster: Roster,
+    roster: Roster,
 }
 
 impl Peers {
@@ -244,26 +88,102 @@ impl Peers {
     pub(crate) fn connected(&self) -> impl Iterator<Item = &Arc<PeerCell>> {
         self.list.iter().filter(|peer| peer.is_connected())
     }
+
+    /// The s_units of this ring are expected, and no others.
+    fn expect(&mut self, ring: &Arc<KeyRing>) {
+        self.roster.expect(ring, |identity| self.by_identity.contains_key(identity));
+    }
+
+    /// Those that have joined in the order of their places, then the others by name and id.
+    fn expected(&self) -> Vec<Arc<PeerCell>> {
+        let mut absent: Vec<_> = self.roster.absent().cloned().collect();
+        absent.sort_unstable_by(|a, b| a.identity.cmp(&b.identity));
+        let placed = self.of_role(Role::SUnit).filter(|peer| self.roster.belongs(&peer.identity)).cloned();
+        placed.chain(absent).filter(|peer| !peer.is_retired()).collect()
+    }
+
+    /// The only node that is meant, among those that have joined and those that are expected. One that was retired counts
+    /// where there is no other.
+    fn only(&self, wanted: impl Fn(&Identity) -> bool) -> Result<Arc<PeerCell>, Error> {
+        let all = self.all().chain(self.roster.absent());
+        let mut meant: Vec<_> = all.filter(|peer| wanted(&peer.identity)).collect();
+        if meant.len() > 1 {
+            meant.retain(|peer| !peer.is_retired());
+        }
+        meant.sort_unstable_by(|a, b| a.identity.cmp(&b.identity));
+        match meant.as_slice() {
+            [only] if only.has_joined() => Ok(Arc::clone(only)),
+            [] | [_] => Err(Error::NotConnected),
+            [first, second, ..] => Err(Error::Ambiguous { ids: [first.identity.id(), second.identity.id()] }),
+        }
+    }
+}
+
+/// The nodes as the threads share them.
+pub(crate) struct Nodes(RwLock<Peers>);
+
+impl Nodes {
+    pub(super) fn new() -> Self {
+        Self(RwLock::new(Peers::default()))
+    }
+
+    #[track_caller]
+    pub(crate) fn read(&self) -> Held<RwLockReadGuard<'_, Peers>> {
+        Rank::Leaf.read(&self.0)
+    }
+
+    #[track_caller]
+    pub(super) fn write(&self) -> Held<RwLockWriteGuard<'_, Peers>> {
+        Rank::Leaf.write(&self.0)
+    }
+
+    /// The nodes with the roster as the keys are now.
+    fn with_roster<R>(&self, keys: &Keys, act: impl FnOnce(&Peers) -> R) -> R {
+        let ring = keys.ring().map(|live| live.ring());
+        let mut peers = self.write();
+        if let Some(ring) = ring {
+            peers.expect(&ring);
+        }
+        act(&peers)
+    }
+
+    /// The s_units that this manager is to have.
+    pub(crate) fn roster(&self, keys: &Keys) -> Vec<Arc<PeerCell>> {
+        self.with_roster(keys, Peers::expected)
+    }
+
+    /// The only node that is meant; [`Error::Ambiguous`] where several are.
+    pub(crate) fn only(&self, keys: &Keys, wanted: impl Fn(&Identity) -> bool) -> Result<Arc<PeerCell>, Error> {
+        self.with_roster(keys, |peers| peers.only(wanted))
+    }
+
+    /// The node of an identity, if it has joined or is expected.
+    pub(crate) fn of(&self, keys: &Keys, identity: &Identity) -> Option<Arc<PeerCell>> {
+        self.with_roster(keys, |peers| peers.placed(identity).or_else(|| peers.roster.get(identity)).cloned())
+    }
 }
 
 #[cfg(test)]
-pub(super) mod tests {
-
+mod tests {
+    use cara_core::config::Constraints;
+    use cara_core::distribution::identity::Fleet;
+    use cara_core::error::CloseReason;
     use cara_core::host::mailman::LinkId;
     use cara_core::services::session::{Session, SessionConfig, SessionStorage};
     use cara_core::time::Instant;
     use cara_secure::link::Cipher;
 
     use super::*;
+    use crate::keys::{FleetKeys, RootKey};
     use crate::storage::{filled, filled_with};
     use crate::sys::stream::Stream;
 
-    pub(crate) fn agv(id: u32) -> Identity {
+    fn agv(id: u32) -> Identity {
         Identity::s_unit("agv", id).unwrap()
     }
 
     /// A link that leads nowhere.
-    pub(crate) fn link(serial: u32) -> Arc<LinkCell> {
+    fn link(serial: u32) -> Arc<LinkCell> {
         let listener = crate::sys::stream::Listener::open(std::net::Ipv4Addr::LOCALHOST, 0).unwrap();
         let address = std::net::SocketAddr::from((std::net::Ipv4Addr::LOCALHOST, listener.port()));
         let storage = SessionStorage {
@@ -349,5 +269,76 @@ pub(super) mod tests {
         let mut peers = Peers::default();
         (1..4).for_each(|id| drop(peers.join(&agv(id), 2, &link(id))));
         assert_eq!(ids(&peers), [1, 2, 3]);
+    }
+
+    fn expected(peers: &Peers) -> Vec<u32> {
+        peers.expected().iter().map(|peer| peer.identity.id()).collect()
+    }
+
+    fn ring(s_units: &[Identity]) -> Arc<KeyRing> {
+        let mut keys = FleetKeys::of_root(Fleet(7), RootKey::new([1; 32]));
+        let depot = Identity::m_unit("depot", 1).unwrap();
+        keys.add(&depot, &[]).unwrap();
+        s_units.iter().for_each(|agv| keys.add(agv, &[]).unwrap());
+        Arc::new(keys.ring(&depot).unwrap())
+    }
+
+    #[test]
+    fn in_plain_mode_who_has_joined_stays_expected_also_without_a_place() {
+        let mut peers = Peers::default();
+        assert!(expected(&peers).is_empty());
+        let old = link(1);
+        let first = peers.join(&agv(1), 1, &old);
+        first.leave(&old, CloseReason::Silent);
+        peers.join(&agv(2), 1, &link(2));
+        assert!(peers.placed(&agv(1)).is_none(), "its place is taken");
+        assert_eq!(expected(&peers), [2, 1]);
+        let again = peers.join(&agv(1), 2, &link(3));
+        assert!(Arc::ptr_eq(&first, &again), "its handle works again");
+        assert_eq!(expected(&peers), [2, 1]);
+    }
+
+    #[test]
+    fn with_keys_those_are_expected_that_they_name() {
+        let mut peers = Peers::default();
+        peers.expect(&ring(&[agv(1), agv(2)]));
+        assert_eq!(expected(&peers), [1, 2]);
+        let handle = peers.expected().remove(1);
+        peers.join(&agv(2), 8, &link(1));
+        assert_eq!(expected(&peers), [2, 1]);
+        assert!(handle.is_connected(), "a handle from before works once the node has joined");
+        // One is revoked, and one is added.
+        peers.expect(&ring(&[agv(1), agv(3)]));
+        assert_eq!(expected(&peers), [1, 3]);
+    }
+
+    #[test]
+    fn what_is_retired_is_not_expected_until_it_joins_again() {
+        let mut peers = Peers::default();
+        peers.expect(&ring(&[agv(1), agv(2)]));
+        let first = peers.join(&agv(1), 8, &link(1));
+        assert!(!first.retire(), "it is connected");
+        assert!(peers.expected().last().unwrap().retire());
+        assert_eq!(expected(&peers), [1]);
+        peers.expect(&ring(&[agv(1), agv(2), agv(3)]));
+        assert_eq!(expected(&peers), [1, 3], "other keys do not bring it back");
+        peers.join(&agv(2), 8, &link(2));
+        assert_eq!(expected(&peers), [1, 2, 3]);
+    }
+
+    /// Which one is meant is never guessed, also not where one alone is connected.
+    #[test]
+    fn a_name_that_several_have_is_refused() {
+        let mut peers = Peers::default();
+        peers.expect(&ring(&[agv(7), agv(8)]));
+        let named = |peers: &Peers| peers.only(|identity| identity.name() == "agv").map(|peer| peer.identity.id());
+        assert_eq!(named(&peers), Err(Error::Ambiguous { ids: [7, 8] }));
+        peers.join(&agv(7), 8, &link(1));
+        assert_eq!(named(&peers), Err(Error::Ambiguous { ids: [7, 8] }), "the other one may be meant");
+        assert!(peers.expected().last().unwrap().retire());
+        assert_eq!(named(&peers), Ok(7));
+        peers.expect(&ring(&[agv(7)]));
+        assert_eq!(named(&peers), Ok(7));
+        assert_eq!(peers.only(|identity| identity.id() == 9).err(), Some(Error::NotConnected));
     }
 }

@@ -49,6 +49,11 @@ impl<T> Services<T> {
         Rank::Functions.write(&self.functions)
     }
 
+    /// Slots of the unit's own list that are in use: those up to its last function.
+    pub(super) fn own_functions(&self) -> usize {
+        self.functions().iter().map(|function| usize::from(function.slot.0) + 1).max().unwrap_or(0)
+    }
+
     pub(super) fn set_longest_message(&self, bytes: usize) {
         self.longest_message.store(bytes, Ordering::Release);
     }

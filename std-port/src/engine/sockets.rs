@@ -6,7 +6,6 @@ use std::sync::Mutex;
 
 use cara_core::error::CloseReason;
 
-use super::interfaces::InterfaceWatch;
 use crate::locks::lock;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Listener;
@@ -19,12 +18,11 @@ pub(crate) struct Sockets {
     pub(super) listener: Option<Listener>,
     /// Hosts to which long packets do not come.
     short_segments: Mutex<HashSet<IpAddr>>,
-    pub(super) interfaces: InterfaceWatch,
 }
 
 impl Sockets {
     pub(super) fn new(datagrams: Datagrams, listener: Option<Listener>) -> Self {
-        Self { datagrams, listener, short_segments: Mutex::default(), interfaces: InterfaceWatch::default() }
+        Self { datagrams, listener, short_segments: Mutex::default() }
     }
 
     /// Where the unit takes connections; 0 for nowhere.

@@ -3,19 +3,16 @@
 //! However many handles of this process read a stream of a node, there is one subscription on the link: at the shortest
 //! interval that any of them wants. It is made again whenever the node tells its list, so also after a reconnection.
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::task::Waker;
 
-use cara_core::distribution::function_list::Slot;
 use cara_core::error::Error;
 use cara_core::services::session::{GrantedStream, ReplyBlock};
 use cara_core::services::stream::{Newest, Source, Value};
 use cara_core::time::{Duration, Instant};
 
-use super::Engine;
-use super::link::LinkCell;
-use super::peers::PeerCell;
 use crate::locks::lock;
 
 /// A stream of this unit.
@@ -165,7 +162,7 @@ impl Watched {
     }
 
     /// Called without a lock.
-    fn was_answered(&self, answer: Result<GrantedStream, Error>) {
+    pub(super) fn was_answered(&self, answer: Result<GrantedStream, Error>) {
         lock(&self.state).refused = answer.err();
         self.changed.notify_all();
         self.wake_tasks();
@@ -213,120 +210,61 @@ impl Watched {
     }
 }
 
-impl PeerCell {
+/// The streams of one node that are read here.
+#[derive(Default)]
+pub(crate) struct Streams(Mutex<HashMap<String, Arc<Watched>>>);
+
+impl Streams {
     /// The stream of this name, if it is read here.
-    fn watched(&self, name: &str) -> Option<Arc<Watched>> {
-        lock(&self.streams).get(name).cloned()
-    }
-}
-
-impl<T: Send + 'static> Engine<T> {
-    /// A stream of this unit has a new value: it goes to each node whose turn it is.
-    pub(crate) fn stream_published(&self) {
-        for link in self.each_link() {
-            if !link.has_subscriptions() {
-                continue;
-            }
-            let mut state = link.lock();
-            if state.session.stream_changed(self.now()) {
-                self.settle(&link, state);
-            }
-        }
+    fn get(&self, name: &str) -> Option<Arc<Watched>> {
+        lock(&self.0).get(name).cloned()
     }
 
-    /// One more handle reads a stream of a node.
-    pub(crate) fn subscribe_to(&self, peer: &PeerCell, name: &str, interval: Duration) -> (Arc<Watched>, u64) {
-        let (watched, id) = {
-            let mut streams = lock(&peer.streams);
-            let watched = streams.entry(name.to_owned()).or_insert_with(|| Arc::new(Watched::new(name))).clone();
-            let id = watched.want(interval);
-            (watched, id)
-        };
-        self.notify_subscription(peer, &watched);
+    pub(super) fn all(&self) -> Vec<Arc<Watched>> {
+        lock(&self.0).values().cloned().collect()
+    }
+
+    /// The shortest interval that a handle wants a stream at, if any reads it.
+    pub(super) fn interval(&self, name: &str) -> Option<Duration> {
+        self.get(name)?.interval()
+    }
+
+    /// One more handle reads a stream; its number there. The node is to be told.
+    pub(crate) fn subscribe(&self, name: &str, interval: Duration) -> (Arc<Watched>, u64) {
+        let mut streams = lock(&self.0);
+        let watched = streams.entry(name.to_owned()).or_insert_with(|| Arc::new(Watched::new(name))).clone();
+        let id = watched.want(interval);
         (watched, id)
     }
 
-    /// A handle is dropped.
-    pub(crate) fn unsubscribe(&self, peer: &PeerCell, watched: &Watched, id: u64) {
-        {
-            let mut streams = lock(&peer.streams);
-            if watched.want_no_more(id) {
-                streams.remove(&watched.name);
-            }
-        }
-        self.notify_subscription(peer, watched);
-    }
-
-    fn notify_subscription(&self, peer: &PeerCell, watched: &Watched) {
-        let Some(link) = peer.link() else { return };
-        self.notify_on(&link, peer, watched);
-    }
-
-    fn notify_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
-        let mut state = link.lock();
-        // Read under the lock of the link: of two threads the last one tells what holds.
-        let interval = peer.watched(&watched.name).and_then(|watched| watched.interval());
-        let reported = self.with(link, &mut state, |session, cx| match interval {
-            Some(interval) => session.subscribe(cx, &watched.name, interval).map(drop),
-            None => {
-                session.unsubscribe(cx, &watched.name);
-                Ok(())
-            }
-        });
-        self.settle(link, state);
-        if let Err(error @ Error::UnknownFunction) = reported {
-            watched.was_answered(Err(error));
+    /// A handle is dropped. The node is to be told.
+    pub(crate) fn unsubscribe(&self, watched: &Watched, id: u64) {
+        let mut streams = lock(&self.0);
+        if watched.want_no_more(id) {
+            streams.remove(&watched.name);
         }
     }
 
-    /// A node has told its list: what is read of it is subscribed to.
-    pub(super) fn subscribe_again(&self, link: &Arc<LinkCell>) {
-        let Some(peer) = link.peer.get() else { return };
-        let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
-        all.iter().for_each(|watched| self.notify_on(link, peer, watched));
+    /// A value has come; whether it is to go on to a stream of this unit. The tasks that wait for it are put into `woken`.
+    pub(super) fn receive(&self, now: Instant, age: Duration, block: &ReplyBlock<'_>, woken: &mut Vec<Waker>) -> bool {
+        self.get(block.signature().name()).is_some_and(|watched| watched.receive(now, age, block, woken))
     }
 
-    /// Whether a value is to go on to a stream of this unit. The tasks that wait for it are put into `woken`.
-    pub(super) fn sample_arrived(
-        &self,
-        now: Instant,
-        link: &LinkCell,
-        age: Duration,
-        block: &ReplyBlock<'_>,
-        woken: &mut Vec<Waker>,
-    ) -> bool {
-        let watched = link.peer.get().and_then(|peer| peer.watched(block.signature().name()));
-        watched.is_some_and(|watched| watched.receive(now, age, block, woken))
-    }
-
-    /// The unit has been stopped: tasks that wait for values look again.
-    #[cfg(feature = "async")]
-    pub(super) fn end_streams(&self) {
-        let peers: Vec<_> = self.peers().all().cloned().collect();
-        for peer in peers {
-            let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
-            all.iter().for_each(|watched| watched.wake_tasks());
-        }
-    }
-
-    pub(super) fn subscription_answered(&self, link: &LinkCell, slot: Slot, answer: Result<GrantedStream, Error>) {
-        let watched = {
-            let state = link.lock();
-            let stream = state.session.their_function_list().function(slot);
-            link.peer.get().zip(stream).and_then(|(peer, stream)| peer.watched(stream.name()))
-        };
-        if let Some(watched) = watched {
+    /// The node has answered a subscription.
+    pub(super) fn answered(&self, name: &str, answer: Result<GrantedStream, Error>) {
+        if let Some(watched) = self.get(name) {
             watched.was_answered(answer);
         }
     }
 
-    /// Values have come that go on to streams of this unit.
-    pub(super) fn pass_on_samples(&self, link: &LinkCell) {
-        let Some(peer) = link.peer.get() else { return };
-        let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
-        let now = self.now();
-        if all.iter().filter(|watched| watched.pass_on(now)).count() > 0 {
-            self.stream_published();
-        }
+    /// Values have come that go on to streams of this unit; whether any has.
+    pub(super) fn pass_on(&self, now: Instant) -> bool {
+        self.all().iter().filter(|watched| watched.pass_on(now)).count() > 0
+    }
+
+    /// The unit has been stopped: tasks that wait for values look again.
+    #[cfg(feature = "async")]
+    pub(super) fn wake_tasks(&self) {
+        self.all().iter().for_each(|watched| watched.wake_tasks());
     }
 }

@@ -4,18 +4,14 @@
 use cara_core::config::LINK_BUFFER_BYTES;
 use cara_core::distribution::connection_handler::NodeStorage;
 use cara_core::distribution::function_list::Entry;
-use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{Error, Limit};
-use cara_core::services::call::{Callee, Detail};
-use cara_core::services::requests::CallId;
-use cara_core::services::session::{RequestOptions, SessionStorage};
+use cara_core::error::Error;
+use cara_core::services::session::SessionStorage;
 use cara_core::services::slots_for;
-use cara_core::time::Instant;
 
-use super::Engine;
-use super::link::{LinkCell, LinkState, Linux};
+use super::hub::SharedHub;
+use super::link::{LinkState, Linux};
+use super::links::Links;
 use crate::config::Capacities;
-use crate::error::CallError;
 use crate::storage::{Boxed, filled, filled_with};
 use crate::sys::limits;
 
@@ -46,13 +42,13 @@ pub(crate) fn node_storage(nodes: usize, links: usize) -> NodeStorage<Linux> {
     }
 }
 
-impl<T: Send + 'static> Engine<T> {
+impl Links {
     /// Longer tables where those of the node are too short for so many. [`Error::BadConstraint`] where the process may not have
     /// as many files open.
-    pub(super) fn make_node_room(&self, nodes: u16) -> Result<(), Error> {
+    pub(super) fn make_node_room(&self, hub: &SharedHub, nodes: u16) -> Result<(), Error> {
         let nodes = usize::from(nodes);
-        let links = nodes + self.links.capacities.pending_links;
-        if self.links.table().len() >= links {
+        let links = nodes + self.capacities.pending_links;
+        if self.table().len() >= links {
             return Ok(());
         }
         if !limits::make_room_for(links) {
@@ -60,93 +56,43 @@ impl<T: Send + 'static> Engine<T> {
         }
         // The node first: it is to know every link that there can be.
         let longer = node_storage(nodes, links);
-        self.hub.lock().hub.node.grow(longer.nodes, longer.order, longer.links);
-        let mut cells = self.links.table_mut();
+        hub.lock().hub.node.grow(longer.nodes, longer.order, longer.links);
+        let mut cells = self.table_mut();
         let length = cells.len().max(links);
         cells.resize_with(length, || None);
         Ok(())
     }
 
-    /// The slices that a session begins with.
-    pub(super) fn session_storage(&self) -> SessionStorage<Boxed> {
-        let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } =
-            self.links.capacities;
+    /// The slices that a session begins with, where the unit's own list has so many functions.
+    pub(super) fn session_storage(&self, functions: usize) -> SessionStorage<Boxed> {
+        let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } = self.capacities;
         SessionStorage {
             small: filled(LINK_BUFFER_BYTES, 0),
             pending: filled(first_calls(calls_in_flight), None),
             running: filled(slots_for(calls_running.min(FIRST_CALLS)), None),
-            publications: filled_with(self.own_functions(), Default::default),
+            publications: filled_with(functions, Default::default),
             their_functions: filled_with(their_functions.min(FIRST_FUNCTIONS), Entry::empty),
             their_signatures: filled(their_signature_bytes.min(FIRST_SIGNATURES), 0),
         }
     }
 
-    /// Slots of the unit's own list that are in use: those up to its last function.
-    fn own_functions(&self) -> usize {
-        let functions = self.functions();
-        functions.iter().map(|function| usize::from(function.slot.0) + 1).max().unwrap_or(0)
-    }
-
-    #[expect(clippy::too_many_arguments, reason = "those of a request, and where and when it is made")]
-    /// A request on a link, with more slots for calls if all of those are taken that it has.
-    pub(super) fn request_on(
-        &self,
-        now: Instant,
-        link: &LinkCell,
-        state: &mut LinkState,
-        callee: Callee<'_>,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-        wait: bool,
-    ) -> Result<CallId, CallError> {
-        let mut attempt =
-            || self.with_at(now, link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
-        let mut outcome = attempt();
-        let most = self.links.capacities.calls_in_flight;
-        if outcome == Err(Error::Full(Limit::Calls)) && state.session.call_slots() < most {
-            drop(state.session.lend_calls(filled(most, None)));
-            outcome = self.with(link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
-        }
-        // An operator's is not the program's to ask after.
-        if let Ok(id) = outcome
-            && !options.operator
-            && state.session.last_order().is_some_and(|(_, order)| order == id)
-            && let Some(peer) = link.peer.get()
-        {
-            peer.ordered(callee.name(), state.session.nonce() as u32, id);
-        }
-        outcome.map_err(|error| match error {
-            Error::Mismatch(_) => mismatch(state, callee, error),
-            error => error.into(),
-        })
-    }
-
     /// Makes room for as many calls of the peer as it may have here once more than one runs or waits, before the next one comes.
     pub(super) fn make_call_room(&self, state: &mut LinkState) {
-        let most = slots_for(self.links.capacities.calls_running);
+        let most = slots_for(self.capacities.calls_running);
         let (slots, calls) = state.session.running_slots();
         if slots < most && calls > 1 {
             drop(state.session.lend_running(filled(most, None)));
         }
     }
-
-    /// Makes room for all functions of the unit's own list, which may be published next; whether there was too little.
-    pub(super) fn make_publication_room(&self, state: &mut LinkState) -> bool {
-        let functions = self.own_functions();
-        let grows = functions > state.session.publication_slots();
-        if grows {
-            drop(state.session.lend_publications(filled_with(functions, Default::default)));
-        }
-        grows
-    }
 }
 
-/// Where the peer's version of a function differs.
-#[cold]
-fn mismatch(state: &LinkState, callee: Callee<'_>, error: Error) -> CallError {
-    let published = state.session.their_function_list().named(callee.name());
-    let found = published.and_then(|published| callee.check(published.signature).err());
-    CallError::new(error, found.map(Detail::Version))
+/// Makes room for all functions of the unit's own list, which may be published next; whether there was too little.
+pub(super) fn make_publication_room(state: &mut LinkState, functions: usize) -> bool {
+    let grows = functions > state.session.publication_slots();
+    if grows {
+        drop(state.session.lend_publications(filled_with(functions, Default::default)));
+    }
+    grows
 }
 
 #[cfg(test)]

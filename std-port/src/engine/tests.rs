@@ -112,7 +112,7 @@ fn what_a_link_has_counted_counts_once_when_it_ends() {
         assert_eq!((sent(), value(&engine.readings(), Group::Unit, "LinksOpen")), ((3, 3), 0));
     }
     pair.agv.stop();
-    until(|| engine.link(near.id).is_none());
+    until(|| engine.links.get(near.id).is_none());
     assert_eq!(sent(), (3, 3));
 }
 
@@ -132,7 +132,7 @@ fn a_proven_link_gives_way_to_none() {
     let length = frame::encode(&Frame::Hello(&bytes[..length]), 0, &mut framed);
     let mut proven = dial();
     proven.write_all(&framed[..length]).unwrap();
-    let newest = || engine.each_link().into_iter().max_by_key(|link| link.serial).unwrap();
+    let newest = || engine.links.all().into_iter().max_by_key(|link| link.serial).unwrap();
     until(|| newest().serial != near.serial && newest().lock().session.is_proven());
     let newcomer = newest();
     assert!(!engine.make_room(), "all have proven themselves");
@@ -140,8 +140,8 @@ fn a_proven_link_gives_way_to_none() {
     until(|| newest().serial != newcomer.serial);
     let unproven = newest();
     assert!(engine.make_room() && !engine.make_room());
-    until(|| engine.link(unproven.id).is_none());
-    assert!(engine.link(newcomer.id).is_some_and(|link| Arc::ptr_eq(&link, &newcomer)));
+    until(|| engine.links.get(unproven.id).is_none());
+    assert!(engine.links.get(newcomer.id).is_some_and(|link| Arc::ptr_eq(&link, &newcomer)));
     drop(frozen);
 }
 

@@ -1,0 +1,171 @@
+//! A node, whether it is connected or not, and what is known of it beyond its links.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use cara_core::config::Constraints;
+use cara_core::counters::Counters;
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error};
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::requests::CallId;
+use cara_core::time::Duration;
+
+use super::link::LinkCell;
+use super::streams::Streams;
+use crate::locks::lock;
+
+/// The counters of a link, or of many.
+pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
+
+/// A node, connected or not.
+pub(crate) struct PeerCell {
+    pub(crate) identity: Identity,
+    link: Mutex<Option<Arc<LinkCell>>>,
+    /// When it joined last.
+    joined: Mutex<Option<std::time::Instant>>,
+    /// When and why its last link ended.
+    left: Mutex<Option<(std::time::Instant, CloseReason)>>,
+    /// What differs for this node from the unit's constraints, whether it is connected or not.
+    own: Mutex<Option<OwnConstraints>>,
+    /// The newest call of each function that was to move something, and the link that it was made by.
+    orders: Mutex<BTreeMap<String, (u32, CallId)>>,
+    /// Its streams that are read here.
+    pub(crate) streams: Streams,
+    /// What its earlier links have counted.
+    earlier: Mutex<Option<Box<LinkCounters>>>,
+    /// It has told what it offers since it has its place, on this link or an earlier one.
+    pub(super) introduced: AtomicBool,
+    /// The operator has taken it off the roster.
+    retired: AtomicBool,
+}
+
+/// The constraints that a node may have of its own.
+#[derive(Clone, Copy)]
+struct OwnConstraints {
+    request_timeout: Duration,
+    minimum_interval: Duration,
+    calls_per_peer: u16,
+}
+
+impl PeerCell {
+    /// The link to the node while it is connected.
+    pub(crate) fn link(&self) -> Option<Arc<LinkCell>> {
+        self.link.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    pub(crate) fn is_connected(&self) -> bool {
+        self.link.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// How long it has been connected.
+    pub(crate) fn connected_for(&self) -> Option<std::time::Duration> {
+        self.link()?;
+        lock(&self.joined).map(|joined| joined.elapsed())
+    }
+
+    /// How long ago it left, and why, while it is not connected.
+    pub(crate) fn left(&self) -> Option<(std::time::Duration, CloseReason)> {
+        let left = *lock(&self.left);
+        left.filter(|_| !self.is_connected()).map(|(at, reason)| (at.elapsed(), reason))
+    }
+
+    /// Whether it is connected and what it offers is known.
+    pub(crate) fn is_introduced(&self) -> bool {
+        self.link().is_some_and(|link| link.is_introduced())
+    }
+
+    /// The unit's constraints with what this node has of its own.
+    pub(crate) fn constraints(&self, unit: Constraints) -> Constraints {
+        self.own_constraints(unit).unwrap_or(unit)
+    }
+
+    pub(super) fn own_constraints(&self, unit: Constraints) -> Option<Constraints> {
+        let own = (*lock(&self.own))?;
+        let OwnConstraints { request_timeout, minimum_interval, calls_per_peer } = own;
+        Some(Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit })
+    }
+
+    /// [`Error::BadConstraint`] for what cannot differ from node to node.
+    pub(super) fn set_constraints(&self, unit: Constraints, wanted: Constraints) -> Result<(), Error> {
+        let Constraints { request_timeout, minimum_interval, calls_per_peer, .. } = wanted;
+        if wanted != (Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit }) {
+            return Err(Error::BadConstraint);
+        }
+        *lock(&self.own) = Some(OwnConstraints { request_timeout, minimum_interval, calls_per_peer });
+        Ok(())
+    }
+
+    pub(super) fn new(identity: &Identity) -> Arc<Self> {
+        Arc::new(Self {
+            identity: identity.clone(),
+            link: Mutex::new(None),
+            joined: Mutex::new(None),
+            left: Mutex::new(None),
+            own: Mutex::new(None),
+            orders: Mutex::default(),
+            streams: Streams::default(),
+            earlier: Mutex::new(None),
+            introduced: AtomicBool::new(false),
+            retired: AtomicBool::new(false),
+        })
+    }
+
+    /// Whether it has ever joined.
+    pub(super) fn has_joined(&self) -> bool {
+        lock(&self.joined).is_some()
+    }
+
+    /// Whether it has been taken off the roster, and has not joined since.
+    pub(crate) fn is_retired(&self) -> bool {
+        self.retired.load(Ordering::Relaxed)
+    }
+
+    /// Takes it off the roster until it joins again; `false` while it is connected.
+    pub(crate) fn retire(&self) -> bool {
+        let link = self.link.lock().unwrap_or_else(PoisonError::into_inner);
+        if link.is_none() {
+            self.retired.store(true, Ordering::Relaxed);
+        }
+        link.is_none()
+    }
+
+    /// A call that is to move something goes out.
+    pub(super) fn ordered(&self, function: &str, link: u32, call: CallId) {
+        let mut orders = lock(&self.orders);
+        match orders.get_mut(function) {
+            Some(known) => *known = (link, call),
+            None => drop(orders.insert(function.to_owned(), (link, call))),
+        }
+    }
+
+    /// The newest call of a function that was to move something, and the link that it was made by.
+    pub(crate) fn last_order(&self, function: &str) -> Option<(u32, CallId)> {
+        lock(&self.orders).get(function).copied()
+    }
+
+    pub(super) fn earlier(&self) -> LinkCounters {
+        lock(&self.earlier).as_deref().cloned().unwrap_or_default()
+    }
+
+    pub(super) fn keep(&self, counters: &LinkCounters) {
+        lock(&self.earlier).get_or_insert_default().merge(counters);
+    }
+
+    pub(super) fn join(&self, link: Arc<LinkCell>) {
+        *lock(&self.joined) = Some(std::time::Instant::now());
+        let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
+        self.retired.store(false, Ordering::Relaxed);
+        *current = Some(link);
+    }
+
+    /// The link has ended; a newer one stays.
+    pub(crate) fn leave(&self, link: &LinkCell, reason: CloseReason) {
+        let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
+        if current.as_ref().is_some_and(|current| current.serial == link.serial) {
+            *lock(&self.left) = Some((std::time::Instant::now(), reason));
+            *current = None;
+        }
+    }
+}
