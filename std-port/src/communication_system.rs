@@ -68,18 +68,19 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     #[cfg(feature = "control")]
     pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
-        self.engine().operator_may(function, verb)
+        let engine = self.engine();
+        engine.guard.operator_may(&engine.links, engine.now(), function, verb)
     }
 
     /// Whether what the operator has begun may go on.
     #[cfg(feature = "control")]
     pub(crate) fn operator_may_go_on(&self, function: &str) -> bool {
-        self.engine().operator_may_go_on(function)
+        self.engine().guard.operator_may_go_on(function)
     }
 
     #[cfg(feature = "control")]
     pub(crate) fn operator_sees(&self, function: &str) -> bool {
-        self.engine().operator_sees(function)
+        self.engine().guard.operator_sees(function)
     }
 
     #[cfg(feature = "control")]

@@ -335,7 +335,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// The access table in force; without one, a joined node may do everything.
     pub fn access(&self) -> Option<Arc<AccessTable>> {
-        self.engine().access()
+        self.engine().guard.table()
     }
 
     /// Subscribes to events: joined, left, failed. A subscriber that does not keep up loses events.
@@ -355,7 +355,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// ```
     pub fn events(&self) -> Receiver<UnitEvent> {
         let (sender, receiver) = sync_channel(self.events_waiting());
-        self.engine().subscribe(sender);
+        self.engine().events.subscribe(sender);
         receiver
     }
 
@@ -371,7 +371,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
     #[cfg(feature = "control")]
     pub(crate) fn events_with_losses(&self, room: usize) -> (Receiver<UnitEvent>, Arc<AtomicU64>) {
         let (sender, receiver) = sync_channel(room);
-        (receiver, self.engine().subscribe(sender))
+        (receiver, self.engine().events.subscribe(sender))
     }
 
     /// A heart for one loop of the program, which is to beat it at least once in `period`: half of the shortest lease that
@@ -388,7 +388,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// # Ok::<(), cara_std::BuildError>(())
     /// ```
     pub fn with_state<A>(&self, act: impl FnOnce(&mut T) -> A) -> Result<A, Error> {
-        self.engine().with_state(act)
+        self.engine().services.with_state(act)
     }
 
     /// Frees unused message buffers, of which a few are otherwise kept for the next long messages.
@@ -406,7 +406,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// What happened on all links, also on those that have ended.
     pub fn counted(&self, counter: LinkCounter) -> u64 {
-        self.engine().counted(counter)
+        self.engine().accounts.counted(&self.engine().links, counter)
     }
 
     /// What happened in discovery and membership.

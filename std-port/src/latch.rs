@@ -11,48 +11,11 @@ use std::time::Duration;
 
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
-use cara_core::services::lease::{Latch, Lease, Service as _};
+use cara_core::services::lease::Latch;
 
-use crate::actuator::Change;
-use crate::engine::Engine;
 use crate::error::system_refused;
 use crate::file_name::escape;
 use crate::locks::lock;
-
-impl<T: Send + 'static> Engine<T> {
-    /// Keeps from here on whether anything is stopped. [`Error::Network`] when the system refuses the thread.
-    pub(crate) fn keep_latch(self: &Arc<Self>) -> Result<(), Error> {
-        let engine = Arc::downgrade(self);
-        self.latch.start(move || engine.upgrade().map(|engine| engine.latched()))
-    }
-
-    /// What is latched, if anything is.
-    fn latched(&self) -> Option<Latch> {
-        let functions = self.functions();
-        let moved = functions.iter().filter(|function| function.attributes.lease.is_some());
-        let latched = moved.filter_map(|function| function.handler.lease()).find_map(Lease::latch);
-        latched.or_else(|| functions.stopped().latch())
-    }
-
-    pub(crate) fn latch_changed(&self, change: Change) {
-        match change {
-            Change::Stopped => self.look_at_orders(),
-            Change::ResetHere => self.end_stop_of_all(),
-            Change::Reset => {}
-        }
-        self.latch.notify();
-    }
-
-    /// A stop of all has ended once its program has reset the last thing that it stopped.
-    fn end_stop_of_all(&self) {
-        let functions = self.functions();
-        let moved = functions.iter().filter(|function| function.attributes.lease.is_some());
-        let mut leases = moved.filter_map(|function| function.handler.lease()).peekable();
-        if leases.peek().is_some() && leases.all(|lease| !lease.is_inhibited()) {
-            functions.stopped().reset(self.now(), self.now());
-        }
-    }
-}
 
 /// The thread looks this often at least, and tries again what failed.
 const LOOK: Duration = Duration::from_secs(1);

@@ -66,7 +66,7 @@ impl Snapshot {
             peer: cell.identity.to_string(),
             role: cell.identity.role().as_str(),
             connected: cell.is_connected(),
-            readings: engine.peer_readings(cell),
+            readings: engine.accounts.of_peer(cell),
         });
         Self { unit: unit.to_string(), uptime: engine.uptime(), peers: peers.collect(), readings: engine.readings() }
     }

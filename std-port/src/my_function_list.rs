@@ -100,7 +100,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         if bytes > limit {
             return Err(Error::TooLarge { limit: limit as u32 });
         }
-        self.engine.make_room_for(bytes);
+        self.engine.services.make_room_for(bytes);
         Ok(())
     }
 
@@ -120,7 +120,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         }
         #[cfg(feature = "async")]
         if matches!(run, crate::handler::Run::Task(_)) {
-            self.engine.make_runner()?;
+            self.engine.services.runner.make()?;
         }
         let executor = if is_emergency { Some(Arc::new(Executor::start("cara-emergency")?)) } else { None };
         let actuator = match (options.actuator, options.safe) {
@@ -138,7 +138,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             to_its_end: options.to_its_end,
             stream: None,
         };
-        put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
+        put(&mut self.engine.services.functions_mut(), definition, attributes, handler)?;
         Ok(watch)
     }
 
@@ -155,11 +155,12 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     fn make_actuator(&self, hook: Arc<Safe>, then: Option<Arc<Hook<T>>>) -> Result<Actuator, Error> {
         let (lease, clock) = (Arc::<ServiceLease>::default(), self.engine.driver.clock());
-        let then = then.map(|then| self.engine.afterwards(then)).transpose()?;
-        let late = self.engine.hooks_late();
+        let then = then.map(|then| self.engine.services.afterwards(then)).transpose()?;
+        let late = self.engine.accounts.hooks_late();
         let safe = Arc::new(SafeHook::start(Parts { lease: lease.clone(), clock, hook, then, late })?);
         let engine = Arc::downgrade(self.engine);
-        self.engine.keep_latch()?;
+        let services = Arc::downgrade(&self.engine.services);
+        self.engine.latch.start(move || services.upgrade().map(|services| services.latched()))?;
         let look = Arc::new(move |change| engine.upgrade().into_iter().for_each(|engine| engine.latch_changed(change)));
         Ok(Actuator { lease, safe, clock, look })
     }
@@ -171,7 +172,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     /// How many functions there are.
     pub fn len(&self) -> usize {
-        self.engine.functions().len()
+        self.engine.services.functions().len()
     }
 
     /// Whether there are none.
@@ -181,11 +182,11 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     #[cfg(feature = "control")]
     pub(crate) fn names(&self) -> Vec<String> {
-        self.engine.functions().iter().map(|function| function.name().to_owned()).collect()
+        self.engine.services.functions().iter().map(|function| function.name().to_owned()).collect()
     }
 
     /// One line per function.
     pub fn show_functions(&self) -> String {
-        self.engine.functions().show_functions().to_string()
+        self.engine.services.functions().show_functions().to_string()
     }
 }

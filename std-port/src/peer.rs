@@ -450,6 +450,6 @@ impl<T: Send + 'static> Peer<T> {
 
     /// What happened on its links, the earlier ones included: (name, count), zeros included.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
-        pairs(self.engine.peer_readings(&self.cell))
+        pairs(self.engine.accounts.of_peer(&self.cell))
     }
 }

@@ -127,7 +127,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             #[cfg(feature = "async")]
             to_its_end: false,
         };
-        self.engine.functions_mut().add_function(definition, attributes, handler)?;
+        self.engine.services.functions_mut().add_function(definition, attributes, handler)?;
         Ok(Stream { engine: self.engine.clone(), definition: definition.clone(), own })
     }
 
@@ -159,7 +159,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     }
 
     pub(crate) fn stream(&self, name: &str) -> Option<Stream<T>> {
-        let functions = self.engine.functions();
+        let functions = self.engine.services.functions();
         let function = functions.function(functions.find(name)?)?;
         let own = function.handler.stream.clone()?;
         Some(Stream { engine: self.engine.clone(), definition: function.signature.to_definition(), own })

@@ -34,13 +34,13 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// # }
     /// ```
     pub fn run_services_on(&self, spawn: impl Fn(Spawned) + Send + Sync + 'static) {
-        self.engine().run_tasks_on(Arc::new(spawn));
+        self.engine().services.runner.run_on(Arc::new(spawn));
     }
 
     /// As [`with_state`](Self::with_state): runs `act` with the application's state when its turn comes. `act` itself must not
     /// wait. [`Error::WouldDeadlock`] when this thread has the state already. Dropped before its turn, it gives the turn up.
     pub async fn with_state_async<A>(&self, act: impl FnOnce(&mut T) -> A) -> Result<A, Error> {
-        self.engine().with_state_awaited(act).await
+        self.engine().services.with_state_awaited(act).await
     }
 }
 
@@ -90,7 +90,7 @@ impl<T: Send + 'static> fmt::Debug for StateOfTasks<T> {
 impl<T: Send + 'static> AsyncState<T> for StateOfTasks<T> {
     async fn with<R: Send>(&self, act: impl FnOnce(&mut T) -> R + Send) -> Result<R, ServiceError> {
         let engine = self.engine.upgrade().ok_or(ServiceError::NotReady)?;
-        Ok(engine.with_state_awaited(act).await?)
+        Ok(engine.services.with_state_awaited(act).await?)
     }
 
     async fn commit<R: Send>(&self, change: impl FnOnce(&mut T) -> R + Send) -> Result<R, ServiceError> {

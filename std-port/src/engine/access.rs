@@ -5,10 +5,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, RwLock};
 
 use cara_core::services::access::{Access, Bucket, Decision, Principal, Verb};
-use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 
-use super::Engine;
+#[cfg(feature = "control")]
+use super::links::Links;
 use crate::access::AccessTable;
 use crate::locks::{lock, read, write};
 
@@ -56,7 +56,8 @@ impl Guard {
         Some(Asked { table, guard: self })
     }
 
-    pub(super) fn table(&self) -> Option<Arc<AccessTable>> {
+    /// The table in force.
+    pub(crate) fn table(&self) -> Option<Arc<AccessTable>> {
         if !self.is_set.load(Ordering::Acquire) {
             return None;
         }
@@ -86,27 +87,6 @@ impl Guard {
     }
 }
 
-impl<T: Send + 'static> Engine<T> {
-    /// Another table, or none: in force when this returns, and every peer is told what it may see.
-    pub(crate) fn set_access(&self, table: Option<AccessTable>) {
-        self.guard.set(table);
-        for link in self.links.all() {
-            let mut state = link.lock();
-            // One that is not live yet may have told its list.
-            self.with(&link, &mut state, |session, cx| session.access_changed(cx));
-            if state.session.is_live() {
-                state.notices.push(Event::ListChanged);
-            }
-            self.settle(&link, state);
-        }
-    }
-
-    /// The table in force.
-    pub(crate) fn access(&self) -> Option<Arc<AccessTable>> {
-        self.guard.table()
-    }
-}
-
 #[cfg(feature = "control")]
 mod operator {
     use cara_core::error::Error;
@@ -125,35 +105,30 @@ mod operator {
             }
             buckets.entry(function.to_owned()).or_default().take(now, rate)
         }
-    }
 
-    impl<T: Send + 'static> Engine<T> {
         /// Whether the operator may do something; a refusal is counted, and told in the log once a second at most.
-        pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
-            let Some(table) = self.guard.table() else { return Ok(()) };
+        pub(crate) fn operator_may(
+            &self,
+            links: &Links,
+            now: Instant,
+            function: &str,
+            verb: Verb,
+        ) -> Result<(), Error> {
+            let Some(table) = self.table() else { return Ok(()) };
             let decision = match table.decide(Principal::Operator, function, verb) {
                 Decision::Allowed { rate: Some(rate), .. } if verb == Verb::Call => {
-                    let taken = self.guard.take(self.now(), function, rate);
+                    let taken = self.take(now, function, rate);
                     // A stop never comes too often, nor does another emergency.
-                    taken.or_else(|error| if self.is_urgent(function) { Ok(()) } else { Err(error) })
+                    taken.or_else(|error| if is_urgent(links, function) { Ok(()) } else { Err(error) })
                 }
                 Decision::Allowed { .. } => Ok(()),
                 Decision::Denied => Err(Error::NotAllowed),
             };
             decision.inspect_err(|error| {
-                self.guard.operator_refused.fetch_add(1, Ordering::Relaxed);
-                if self.guard.may_log(self.now()) {
+                self.operator_refused.fetch_add(1, Ordering::Relaxed);
+                if self.may_log(now) {
                     tracing::warn!(function, ?verb, %error, "the access table does not let the operator do this");
                 }
-            })
-        }
-
-        /// Whether a function of this name stops something, or is an emergency service, at any node.
-        fn is_urgent(&self, function: &str) -> bool {
-            self.links.all().iter().any(|link| {
-                let state = link.lock();
-                let known = state.session.their_function_list().named(function);
-                known.is_some_and(|known| known.attributes.is_urgent(known.attributes.priority))
             })
         }
 
@@ -168,52 +143,55 @@ mod operator {
         }
 
         fn operator_has(&self, function: &str, verb: Verb) -> bool {
-            let table = self.guard.table();
+            let table = self.table();
             table.is_none_or(|table| table.decide(Principal::Operator, function, verb).is_allowed())
         }
+    }
+
+    /// Whether a function of this name stops something, or is an emergency service, at any node.
+    fn is_urgent(links: &Links, function: &str) -> bool {
+        links.all().iter().any(|link| {
+            let state = link.lock();
+            let known = state.session.their_function_list().named(function);
+            known.is_some_and(|known| known.attributes.is_urgent(known.attributes.priority))
+        })
     }
 }
 
 #[cfg(feature = "access")]
-mod following {
+pub(super) mod following {
     use cara_core::error::Error;
 
     use super::*;
-    use crate::access::watch::FileWatch;
+    use crate::access::AccessError;
 
     /// Between two looks at the file. A change counts when two looks have found it the same.
     const LOOK: std::time::Duration = std::time::Duration::from_millis(400);
 
-    impl<T: Send + 'static> Engine<T> {
-        /// Takes over what is written to a table's file, in a thread of its own: a disk may take its time.
-        pub(crate) fn follow(self: &Arc<Self>, mut watch: FileWatch) -> Result<(), Error> {
-            let engine = Arc::downgrade(self);
-            let thread = std::thread::Builder::new().name("cara-access".into());
-            let run = move || {
-                while let Some(engine) = engine.upgrade().filter(|engine| !engine.is_stopping()) {
-                    if let Some(read) = watch.look() {
-                        engine.take_over(read);
-                    }
-                    drop(engine);
-                    std::thread::park_timeout(LOOK);
-                }
-            };
-            thread.spawn(run).map(drop).map_err(crate::error::system_refused)
-        }
+    /// Looks at the table's file in a thread of its own, until `look` says that it is over: a disk may take its time.
+    pub(crate) fn follow(mut look: impl FnMut() -> bool + Send + 'static) -> Result<(), Error> {
+        let run = move || {
+            while look() {
+                std::thread::park_timeout(LOOK);
+            }
+        };
+        let thread = std::thread::Builder::new().name("cara-access".into());
+        thread.spawn(run).map(drop).map_err(crate::error::system_refused)
+    }
 
-        /// A mistake keeps the table that is in force.
-        fn take_over(&self, read: Result<AccessTable, crate::access::AccessError>) {
-            let counts = &self.guard.file;
-            counts.is_wrong.store(read.is_err(), Ordering::Relaxed);
+    impl Guard {
+        /// The table that was read, if it is to be set. A mistake keeps the one that is in force.
+        pub(crate) fn read(&self, read: Result<AccessTable, AccessError>) -> Option<AccessTable> {
+            self.file.is_wrong.store(read.is_err(), Ordering::Relaxed);
             match read {
                 Ok(table) => {
                     tracing::info!(file = table.source(), rules = table.rules().len(), "the access table has changed");
-                    self.set_access(Some(table));
-                    counts.reloads.fetch_add(1, Ordering::Relaxed);
+                    Some(table)
                 }
                 Err(error) => {
-                    counts.mistakes.fetch_add(1, Ordering::Relaxed);
+                    self.file.mistakes.fetch_add(1, Ordering::Relaxed);
                     tracing::error!("the access table stays as it was:\n{error}");
+                    None
                 }
             }
         }

@@ -9,10 +9,17 @@ use std::sync::{Arc, Mutex};
 use cara_core::counters::{Counter, Counters};
 use cara_core::host::connections::LinkCounter;
 
-use super::Engine;
+use super::access::Guard;
+use super::events::Events;
+use super::hub::SharedHub;
 use super::link::LinkCell;
+use super::links::Links;
+use super::noting::Notes;
 use super::peer_cell::{LinkCounters, PeerCell};
+use super::peers::Nodes;
+use crate::latch::Keeper;
 use crate::locks::Rank;
+use crate::pool::MessagePool;
 
 /// What outlives the links, and what is counted outside of the core.
 #[derive(Default)]
@@ -21,13 +28,6 @@ pub(crate) struct Accounts {
     ended: Mutex<LinkCounters>,
     connections_refused: AtomicU64,
     hooks_late: Arc<AtomicU64>,
-}
-
-impl Accounts {
-    /// A connection found no room. Returns how many did so before.
-    pub(super) fn connection_refused(&self) {
-        self.connections_refused.fetch_add(1, Ordering::Relaxed);
-    }
 }
 
 /// One number about a unit or a link.
@@ -55,6 +55,18 @@ pub(crate) enum Group {
     Link,
 }
 
+/// The parts that count for themselves, or are counted.
+pub(super) struct Parts<'e> {
+    pub(super) links: &'e Links,
+    pub(super) hub: &'e SharedHub,
+    pub(super) nodes: &'e Nodes,
+    pub(super) pool: &'e MessagePool,
+    pub(super) events: &'e Events,
+    pub(super) guard: &'e Guard,
+    pub(super) latch: &'e Keeper,
+    pub(super) notes: &'e Notes,
+}
+
 /// What the links hold now.
 #[derive(Default)]
 struct Held {
@@ -63,24 +75,29 @@ struct Held {
     in_flight: u64,
 }
 
-impl<T: Send + 'static> Engine<T> {
+impl Accounts {
+    /// A connection found no room.
+    pub(super) fn connection_refused(&self) {
+        self.connections_refused.fetch_add(1, Ordering::Relaxed);
+    }
+
     /// Everything that is counted for the unit as a whole.
-    pub(crate) fn readings(&self) -> Vec<Reading> {
-        let (links, held) = self.sum_links();
-        let node = self.hub.lock().hub.node.counters.clone();
+    pub(super) fn readings(&self, parts: &Parts<'_>) -> Vec<Reading> {
+        let (links, held) = self.sum(parts.links);
+        let node = parts.hub.lock().hub.node.counters.clone();
         let mut readings: Vec<_> = of(Group::Node, &node).chain(of(Group::Links, &links)).collect();
-        readings.extend(self.port_readings(&held));
+        readings.extend(self.of_port(parts, &held));
         readings
     }
 
     /// What all links have counted.
-    pub(crate) fn counted(&self, counter: LinkCounter) -> u64 {
-        self.sum_links().0.value(counter)
+    pub(crate) fn counted(&self, links: &Links, counter: LinkCounter) -> u64 {
+        self.sum(links).0.value(counter)
     }
 
     /// What the links to a node have counted.
-    pub(crate) fn peer_readings(&self, peer: &PeerCell) -> Vec<Reading> {
-        let _accounts = Rank::Accounts.lock(&self.accounts.ended);
+    pub(crate) fn of_peer(&self, peer: &PeerCell) -> Vec<Reading> {
+        let _accounts = Rank::Accounts.lock(&self.ended);
         let mut counters = peer.earlier();
         if let Some(link) = peer.link() {
             let state = link.lock();
@@ -93,7 +110,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// A link has ended: what it has counted is kept.
     pub(super) fn retire(&self, link: &LinkCell) {
-        let mut ended = Rank::Accounts.lock(&self.accounts.ended);
+        let mut ended = Rank::Accounts.lock(&self.ended);
         let mut state = link.lock();
         if !std::mem::replace(&mut state.retired, true) {
             ended.merge(state.session.counters());
@@ -103,10 +120,10 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn sum_links(&self) -> (LinkCounters, Held) {
-        let ended = Rank::Accounts.lock(&self.accounts.ended);
+    fn sum(&self, links: &Links) -> (LinkCounters, Held) {
+        let ended = Rank::Accounts.lock(&self.ended);
         let (mut sum, mut held) = (ended.clone(), Held::default());
-        for link in self.links.all() {
+        for link in links.all() {
             let state = link.lock();
             if !state.retired {
                 sum.merge(state.session.counters());
@@ -120,32 +137,28 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Where safe hooks count that they took long.
     pub(crate) fn hooks_late(&self) -> Arc<AtomicU64> {
-        self.accounts.hooks_late.clone()
+        self.hooks_late.clone()
     }
 
-    fn port_readings(&self, held: &Held) -> [Reading; 16] {
-        // One that is stuck has not counted itself.
-        let functions = self.functions();
-        let actuators = functions.iter().filter_map(|function| function.handler.actuator.as_ref());
-        actuators.for_each(|actuator| actuator.safe.look());
-        let pool = self.pool.counters();
-        let connected = self.nodes.read().connected().count() as u64;
-        let file = &self.guard.file;
+    fn of_port(&self, parts: &Parts<'_>, held: &Held) -> [Reading; 16] {
+        let pool = parts.pool.counters();
+        let connected = parts.nodes.read().connected().count() as u64;
+        let file = &parts.guard.file;
         let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         [
-            count("EventsLost", "Events that a subscriber lost because it did not keep up.", self.events.lost()),
+            count("EventsLost", "Events that a subscriber lost because it did not keep up.", parts.events.lost()),
             count(
                 "ConnectionsRefused",
                 "Connections dropped because as many links were open as may be.",
-                load(&self.accounts.connections_refused),
+                load(&self.connections_refused),
             ),
             count(
                 "AuditLinesLost",
                 "Lines of the audit log that its disk did not take, or not in time.",
-                self.audit_lines_lost(),
+                parts.notes.lines_lost(),
             ),
-            count("HooksLate", "Safe hooks that took longer than 100 ms.", load(&self.accounts.hooks_late)),
-            count("LatchesUnkept", "Times that a stop or its end could not be written.", self.latch.failed()),
+            count("HooksLate", "Safe hooks that took longer than 100 ms.", load(&self.hooks_late)),
+            count("LatchesUnkept", "Times that a stop or its end could not be written.", parts.latch.failed()),
             count(
                 "BuffersRefused",
                 "Times that all message buffers were in use when one was asked for.",
@@ -154,7 +167,7 @@ impl<T: Send + 'static> Engine<T> {
             count(
                 "OperatorForbidden",
                 "Questions of the operator that the access table does not allow.",
-                self.guard.operator_refused(),
+                parts.guard.operator_refused(),
             ),
             count("AccessReloads", "Times that the access table was taken over from its file.", load(&file.reloads)),
             count(

@@ -88,7 +88,7 @@ impl<T: Send + 'static> Pending<T> {
             made,
             alarm: Alarm::new(engine.driver.clone()),
             mark: None,
-            recorded: engine.recorded(&link, callee.name(), options),
+            recorded: engine.notes.recorded(&link, callee.name(), options),
             link,
         }
     }
@@ -201,7 +201,7 @@ impl<T: Send + 'static> Pending<T> {
         if self.mark.is_none() {
             self.mark = self.engine.services.state.mark(self.link.id);
             if self.mark.is_some() {
-                self.engine.go_on_with_parked();
+                self.engine.services.go_on_with_parked();
             }
         }
     }
@@ -236,7 +236,7 @@ impl<T: Send + 'static> Engine<T> {
     ) -> Result<CallId, CallError> {
         let mut state = link.lock();
         // A link that is kept is read by no thread until its caller is back.
-        self.read_by(now, link, &mut state, Cause::NeedsPool);
+        self.links.read_by(now, link, &mut state, Cause::NeedsPool);
         let sent = self.request_on(now, link, &mut state, callee, parameters, options, true);
         match &sent {
             Ok(id) => state.await_reply(*id, Wake::Task(Some(waker.clone()))),

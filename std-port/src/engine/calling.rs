@@ -50,7 +50,7 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, CallError> {
-        let recorded = self.recorded(link, callee.name(), options);
+        let recorded = self.notes.recorded(link, callee.name(), options);
         let now = self.now();
         let mut state = link.lock();
         let result = self.request_on(now, link, &mut state, callee, parameters, options, false);
@@ -67,9 +67,9 @@ impl<T: Send + 'static> Engine<T> {
         link: &Arc<LinkCell>,
         mut outgoing: Outgoing<'_, Canceller>,
     ) -> Result<CallId, CallError> {
-        let recorded = self.recorded(link, outgoing.callee.name(), outgoing.options);
+        let recorded = self.notes.recorded(link, outgoing.callee.name(), outgoing.options);
         let result = self.services.state.waiting_for(link.id, || {
-            self.go_on_with_parked();
+            self.services.go_on_with_parked();
             let started = self.begin_call(link, &outgoing)?;
             let id = started.id;
             self.await_reply(link, started, &mut outgoing).map(|()| id)
@@ -123,8 +123,8 @@ impl<T: Send + 'static> Engine<T> {
 
     fn take_token(&self, now: Instant, link: &LinkCell, state: &mut LinkState) -> Option<Token> {
         let is_live = state.session.is_live();
-        let token = is_live.then(|| self.read_by(now, link, state, Cause::Wants)).flatten();
-        self.set_interest(link, state);
+        let token = is_live.then(|| self.links.read_by(now, link, state, Cause::Wants)).flatten();
+        self.links.set_interest(link, state);
         token
     }
 
@@ -167,7 +167,7 @@ impl<T: Send + 'static> Engine<T> {
             }
             // A thread that reads is woken by what comes alone, so one that may be told to give up looks now and then.
             let until = if canceller.is_some() { deadline.min(now + PAUSE) } else { deadline };
-            token = token.or_else(|| self.read_by(now, link, &mut state, Cause::Wants));
+            token = token.or_else(|| self.links.read_by(now, link, &mut state, Cause::Wants));
             if let Some(token) = token {
                 let mut own = OwnCall { id, parameters, result: None };
                 (state, now) = self.read_for_reply(link, state, &mut own, now, until);
@@ -276,7 +276,7 @@ impl<T: Send + 'static> Engine<T> {
     /// A thread no longer waits for the link: the next caller gets its token, or the pool.
     pub(super) fn leave(&self, link: &Arc<LinkCell>, mut state: Locked<'_, LinkState>, token: Option<Token>) {
         let (now, waiter) = (self.now(), state.next_reader());
-        self.read_by(now, link, &mut state, Cause::Leaves { token, waiter });
+        self.links.read_by(now, link, &mut state, Cause::Leaves { token, waiter });
         self.settle_at(now, link, state);
     }
 
@@ -292,7 +292,7 @@ impl<T: Send + 'static> Engine<T> {
         // A task reads nothing itself: it would wait until the clock gives the link to the pool.
         let may_keep = state.session.is_live() && !state.is_paused() && !state.has_task() && !self.is_stopping();
         let waiter = state.next_reader();
-        self.read_by(now, link, &mut state, Cause::Replied { token, asked, may_keep, waiter });
+        self.links.read_by(now, link, &mut state, Cause::Replied { token, asked, may_keep, waiter });
         self.settle_at(now, link, state);
     }
 

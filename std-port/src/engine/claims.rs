@@ -253,7 +253,7 @@ impl<T: Send + 'static> Engine<T> {
                 tracing::info!(claim = %tagged.claim, manager = manager.name(), "a claim is obeyed, and stored");
                 lock(&self.claims.writer).kept = kept;
                 self.hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
-                self.look_at_orders();
+                self.links.look_at_orders();
             }
             Err(error) => {
                 tracing::error!(%error, "a claim cannot be stored");

@@ -49,12 +49,6 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// What a unit moves has been stopped: its links look at their orders now.
-    pub(crate) fn look_at_orders(&self) {
-        self.links.bring_timers_forward();
-        self.driver.wake();
-    }
-
     /// Whether none is left.
     pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) -> bool {
         for _ in 0..BATCH {
@@ -162,7 +156,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
 
     fn keep_time(&self) -> Instant {
         let others = self.poll_node().min(self.driver.go_on_listening(&self.sockets));
-        let look = self.watch_links(others);
+        let look = self.links.look(others, |link, state| self.settle(link, state));
         self.look_at_claims();
         self.poll_links().min(others).min(look).min(self.driver.alarms.sound(self.now()))
     }

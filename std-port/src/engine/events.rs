@@ -12,7 +12,7 @@ use crate::event::UnitEvent;
 use crate::locks::Rank;
 
 #[derive(Default)]
-pub(super) struct Events {
+pub(crate) struct Events {
     subscribers: Mutex<Vec<Subscriber>>,
     /// Events that any subscriber lost.
     lost: AtomicU64,
@@ -57,7 +57,8 @@ impl Events {
         }
     }
 
-    pub(super) fn subscribe(&self, sender: SyncSender<UnitEvent>) -> Arc<AtomicU64> {
+    /// Tells `sender` what happens from here on; what is returned counts the events that found no room.
+    pub(crate) fn subscribe(&self, sender: SyncSender<UnitEvent>) -> Arc<AtomicU64> {
         let lost = Arc::new(AtomicU64::new(0));
         Rank::Leaf.lock(&self.subscribers).push(Subscriber::Channel { sender, lost: lost.clone() });
         lost

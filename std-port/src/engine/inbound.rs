@@ -12,6 +12,7 @@ use cara_core::time::Instant;
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
+use super::services;
 use super::serving::{self, Started};
 use super::worker::arena;
 use crate::handler::Handler;
@@ -101,7 +102,7 @@ impl<T: Send + 'static> Engine<T> {
         own: Option<&mut OwnCall<'_>>,
     ) -> Step {
         self.links.make_call_room(state);
-        let functions = self.functions();
+        let functions = self.services.functions();
         let LinkState { session, waiters, notices, woken, .. } = state;
         let receipt = self.with_functions(now, &functions, link, session, |session, cx| {
             session.receive(cx, bytes, arguments.as_deref_mut())
@@ -166,7 +167,7 @@ impl<T: Send + 'static> Engine<T> {
                     link.introduce();
                 }
                 if let Event::LeaseExpired(slot) = event {
-                    self.wake_leased(&functions, slot);
+                    services::wake_leased(&functions, slot);
                 }
                 notices.push(event);
             }
@@ -182,7 +183,7 @@ impl<T: Send + 'static> Engine<T> {
         started: Started,
         arguments: &ParametersView,
     ) {
-        let mut copy = arena(self.call_bytes());
+        let mut copy = arena(self.services.call_bytes());
         if copy.copy_from(arguments).is_ok() {
             self.run_emergency(functions, link, started, copy);
         }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use cara_core::host::mailman::LinkId;
 use cara_core::time::Instant;
 
+use super::driving::Driver;
 use super::link::LinkCell;
 use super::watch::Watch;
 use crate::config::Capacities;
@@ -15,6 +16,7 @@ use crate::timers::Timers;
 type Table = Vec<Option<Arc<LinkCell>>>;
 
 pub(crate) struct Links {
+    pub(super) driver: Arc<Driver>,
     table: RwLock<Table>,
     /// When the session of each is to be polled.
     timers: Mutex<Timers>,
@@ -24,9 +26,9 @@ pub(crate) struct Links {
 }
 
 impl Links {
-    pub(super) fn new(most: usize, capacities: Capacities) -> Self {
+    pub(super) fn new(driver: Arc<Driver>, most: usize, capacities: Capacities) -> Self {
         let table = RwLock::new((0..most).map(|_| None).collect());
-        Self { table, timers: Mutex::new(Timers::new()), watch: Watch::new(), capacities }
+        Self { driver, table, timers: Mutex::new(Timers::new()), watch: Watch::new(), capacities }
     }
 
     #[track_caller]
@@ -69,9 +71,10 @@ impl Links {
         Rank::Leaf.lock(&self.timers).set(u32::from(id.0), at)
     }
 
-    /// The sessions of all links are to be polled now.
-    pub(super) fn bring_timers_forward(&self) {
+    /// What a unit moves has been stopped: its links look at their orders now.
+    pub(super) fn look_at_orders(&self) {
         Rank::Leaf.lock(&self.timers).bring_all_forward(Instant::START);
+        self.driver.wake();
     }
 
     pub(super) fn cancel_timer(&self, id: LinkId) {

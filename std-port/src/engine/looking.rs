@@ -107,7 +107,7 @@ impl<T: Send + 'static> Engine<T> {
             }
             if !asked {
                 // A link that is kept is read by no thread until its caller is back.
-                self.read_by(self.now(), link, state, Cause::NeedsPool);
+                self.links.read_by(self.now(), link, state, Cause::NeedsPool);
                 match self.with(link, state, |session, cx| session.ping(cx)) {
                     Ok(()) => asked = true,
                     Err(Error::Full(_)) => {}

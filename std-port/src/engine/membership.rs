@@ -148,11 +148,11 @@ impl<T: Send + 'static> Engine<T> {
         match link.stream.finish_connect() {
             Ok(false) => {}
             Ok(true) => {
-                self.read_by(self.now(), link, state, Cause::Opened);
+                self.links.read_by(self.now(), link, state, Cause::Opened);
                 self.with(link, state, |session, cx| session.connected(cx));
             }
             Err(reason) => {
-                self.read_by(self.now(), link, state, Cause::Opened);
+                self.links.read_by(self.now(), link, state, Cause::Opened);
                 state.session.disconnected(reason);
             }
         }
@@ -228,7 +228,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Tells subscribers of an event on a link.
     fn notify_of(&self, link: &LinkCell, event: Event) {
-        let reported = UnitEvent::of(event, &link.lock().session, &*self.functions(), str::to_owned);
+        let reported = UnitEvent::of(event, &link.lock().session, &*self.services.functions(), str::to_owned);
         reported.into_iter().for_each(|event| self.notify(event));
     }
 
@@ -245,10 +245,10 @@ impl<T: Send + 'static> Engine<T> {
             (state.session.address().ip(), state.session.dialed())
         };
         self.sockets.note_segments(host, dialed, reason);
-        self.retire(link);
+        self.accounts.retire(link);
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);
-            self.run_lost_hook();
+            self.services.run_lost_hook();
         }
         self.notify_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
@@ -290,7 +290,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Makes all functions of the unit's list visible: to one node, or to all and those that come later. Returns the
     /// links that are to acknowledge, each with its serial.
     pub(crate) fn publish(&self, to: Option<&Identity>) -> Result<Vec<(Arc<LinkCell>, u32)>, Error> {
-        let slots: Vec<Slot> = self.functions().iter().map(|function| function.slot).collect();
+        let slots: Vec<Slot> = self.services.functions().iter().map(|function| function.slot).collect();
         {
             let publications = &mut self.hub.lock().hub.publications;
             for &slot in &slots {
@@ -318,7 +318,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Removes a function: its slot's callers learn that it is gone.
     pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
-        let (slot, _) = self.functions_mut().remove(name)?;
+        let (slot, _) = self.services.functions_mut().remove(name)?;
         self.hub.lock().hub.publications.withdraw(slot);
         for link in self.links.all() {
             let mut state = link.lock();

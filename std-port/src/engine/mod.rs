@@ -64,9 +64,10 @@ mod watch;
 pub(crate) mod worker;
 mod workers;
 
-pub(crate) use accounts::pairs;
 #[cfg(feature = "metrics")]
-pub(crate) use accounts::{Group, Reading};
+pub(crate) use accounts::Group;
+pub(crate) use accounts::Reading;
+pub(crate) use accounts::pairs;
 pub(crate) use awaiting::{Answered, CallsToAll, Pending};
 #[cfg(feature = "async")]
 pub(crate) use driving::Alarm;
@@ -80,9 +81,8 @@ pub(crate) use tasks::{GivenUp, Spawned};
 pub(crate) use worker::{arena, arena_bytes, room};
 
 use std::path::PathBuf;
-use std::sync::atomic::{self, AtomicU64};
-use std::sync::mpsc::SyncSender;
-use std::sync::{Arc, Mutex, RwLockReadGuard, RwLockWriteGuard, Weak};
+use std::sync::atomic;
+use std::sync::{Arc, Mutex, Weak};
 
 use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::claim::Claim;
@@ -94,10 +94,14 @@ use cara_core::host::secure::Seal;
 use cara_core::services::Context;
 use cara_core::services::access::Access;
 use cara_core::services::lease::Latch;
-use cara_core::services::session::{Session, buffer_bytes};
+use cara_core::services::session::{Event, Session, buffer_bytes};
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 
+use crate::access::AccessTable;
+#[cfg(feature = "access")]
+use crate::access::watch::FileWatch;
+use crate::actuator::Change;
 use crate::config::Capacities;
 #[cfg(feature = "control")]
 use crate::control::Audit;
@@ -105,7 +109,6 @@ use crate::error::{StartError, system_refused};
 use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::latch::Keeper;
-use crate::locks::Held;
 use crate::news::News;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
@@ -119,6 +122,7 @@ use hub::{HubDoor, SharedHub};
 use keys::{KeyDoor, KeyWatch};
 use link::{LinkCell, LinkState, Linux, StdMailman};
 use links::Links;
+use noting::Notes;
 use peer_cell::PeerCell;
 use peers::Nodes;
 use presence::SelfSearch;
@@ -137,16 +141,15 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) links: Links,
     pub(crate) hub: SharedHub,
     pub(crate) nodes: Nodes,
-    services: Services<T>,
+    pub(crate) services: Arc<Services<T>>,
     pub(crate) pool: MessagePool,
     pub(crate) key_watch: KeyWatch,
-    guard: access::Guard,
+    pub(crate) guard: access::Guard,
     claims: claims::Claims,
     pub(crate) latch: Keeper,
-    accounts: accounts::Accounts,
-    #[cfg(feature = "control")]
-    audit: Option<Arc<Audit>>,
-    events: Events,
+    pub(crate) accounts: accounts::Accounts,
+    notes: Notes,
+    pub(crate) events: Events,
     /// For threads that look for themselves at what has happened.
     pub(crate) news: News,
 }
@@ -187,8 +190,13 @@ impl<T: Send + 'static> Engine<T> {
             fleet: parts.hub.hub.node.fleet(),
             sockets: Sockets::new(parts.datagrams, parts.listener),
             interfaces: interfaces::InterfaceWatch::default(),
-            links: Links::new(parts.maximum_links, parts.capacities),
-            services: Services::new(parts.functions, parts.state, parts.hub.longest_message()),
+            links: Links::new(driver.clone(), parts.maximum_links, parts.capacities),
+            services: Arc::new(Services::new(
+                driver.clone(),
+                parts.functions,
+                parts.state,
+                parts.hub.longest_message(),
+            )),
             hub: SharedHub::new(parts.hub),
             nodes: Nodes::new(),
             pool: parts.pool,
@@ -198,22 +206,13 @@ impl<T: Send + 'static> Engine<T> {
             claims: claims::Claims::new(parts.state_folder, parts.take_over),
             latch,
             accounts: accounts::Accounts::default(),
-            #[cfg(feature = "control")]
-            audit: parts.audit,
+            notes: Notes {
+                #[cfg(feature = "control")]
+                audit: parts.audit,
+            },
             events: Events::default(),
             news: News::default(),
         })
-    }
-
-    /// The unit's own functions.
-    #[track_caller]
-    pub(crate) fn functions(&self) -> Held<RwLockReadGuard<'_, FunctionList<Boxed, Handler<T>>>> {
-        self.services.functions()
-    }
-
-    #[track_caller]
-    pub(crate) fn functions_mut(&self) -> Held<RwLockWriteGuard<'_, FunctionList<Boxed, Handler<T>>>> {
-        self.services.functions_mut()
     }
 
     pub(crate) fn is_stopping(&self) -> bool {
@@ -238,7 +237,7 @@ impl<T: Send + 'static> Engine<T> {
         state: &mut LinkState,
         act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
     ) -> R {
-        self.with_functions(now, &self.functions(), link, &mut state.session, act)
+        self.with_functions(now, &self.services.functions(), link, &mut state.session, act)
     }
 
     /// The same with the functions that the caller reads, and goes on to read.
@@ -274,11 +273,6 @@ impl<T: Send + 'static> Engine<T> {
         self.news.add();
     }
 
-    /// Tells `sender` what happens from here on; what is returned counts the events that found no room.
-    pub(crate) fn subscribe(&self, sender: SyncSender<UnitEvent>) -> Arc<AtomicU64> {
-        self.events.subscribe(sender)
-    }
-
     /// Puts into `queue` what happens from here on, until the unit is stopped.
     #[cfg(feature = "async")]
     pub(crate) fn subscribe_queue(&self, queue: &Arc<crate::asynchronous::EventQueue>) {
@@ -309,6 +303,34 @@ impl<T: Send + 'static> Engine<T> {
         Ok(())
     }
 
+    /// Another access table, or none: in force when this returns, and every peer is told what it may see.
+    pub(crate) fn set_access(&self, table: Option<AccessTable>) {
+        self.guard.set(table);
+        for link in self.links.all() {
+            let mut state = link.lock();
+            // One that is not live yet may have told its list.
+            self.with(&link, &mut state, |session, cx| session.access_changed(cx));
+            if state.session.is_live() {
+                state.notices.push(Event::ListChanged);
+            }
+            self.settle(&link, state);
+        }
+    }
+
+    /// Takes over what is written to an access table's file.
+    #[cfg(feature = "access")]
+    pub(crate) fn follow(self: &Arc<Self>, mut watch: FileWatch) -> Result<(), Error> {
+        let engine = Arc::downgrade(self);
+        access::following::follow(move || {
+            let Some(engine) = engine.upgrade().filter(|engine| !engine.is_stopping()) else { return false };
+            if let Some(table) = watch.look().and_then(|read| engine.guard.read(read)) {
+                engine.set_access(Some(table));
+                engine.guard.file.reloads.fetch_add(1, atomic::Ordering::Relaxed);
+            }
+            true
+        })
+    }
+
     /// Changes what differs for one node from the unit's constraints.
     pub(crate) fn set_peer_constraints(&self, peer: &PeerCell, constraints: Constraints) -> Result<(), Error> {
         let unit = *self.hub.lock().hub.node.constraints();
@@ -319,6 +341,21 @@ impl<T: Send + 'static> Engine<T> {
             self.settle(&link, state);
         }
         Ok(())
+    }
+
+    /// Everything that is counted for the unit as a whole.
+    pub(crate) fn readings(&self) -> Vec<Reading> {
+        self.services.look_at_hooks();
+        self.accounts.readings(&accounts::Parts {
+            links: &self.links,
+            hub: &self.hub,
+            nodes: &self.nodes,
+            pool: &self.pool,
+            events: &self.events,
+            guard: &self.guard,
+            latch: &self.latch,
+            notes: &self.notes,
+        })
     }
 
     /// Time since the unit was made.
@@ -374,6 +411,16 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
+    /// What the unit moves has been stopped, or reset.
+    pub(crate) fn latch_changed(&self, change: Change) {
+        match change {
+            Change::Stopped => self.links.look_at_orders(),
+            Change::ResetHere => self.services.end_stop_of_all(self.now()),
+            Change::Reset => {}
+        }
+        self.latch.notify();
+    }
+
     /// Ends every link in an orderly way and all threads. Within a handler it returns before the threads have ended.
     pub(crate) fn stop(&self) {
         if self.driver.stop() {
@@ -387,15 +434,9 @@ impl<T: Send + 'static> Engine<T> {
             self.settle(&link, state);
         }
         self.services.state.stop();
-        self.go_on_with_parked();
-        // A handler may own a handle to a peer of this unit, and so the unit itself: without handlers nothing is left.
-        let handlers = self.take_handlers();
-        // What moved stops, and is heard of, before the unit is gone.
-        handlers.iter().filter_map(|handler| handler.actuator.as_ref()).for_each(|actuator| actuator.safe.end());
-        self.services.afterwards.end();
-        handlers.iter().filter_map(|handler| handler.executor.as_ref()).for_each(|executor| executor.end());
-        #[cfg(feature = "async")]
-        self.services.runner.end();
+        self.services.go_on_with_parked();
+        // Dropped at the end, when no thread of the unit is left.
+        let _handlers = self.services.end();
         self.driver.release_threads(&self.sockets, || self.links.watch.clear());
         // No clock sounds them any more, and the task of one may hold the unit.
         self.driver.alarms.clear();
@@ -405,39 +446,6 @@ impl<T: Send + 'static> Engine<T> {
             let peers: Vec<_> = self.nodes.read().all().cloned().collect();
             peers.iter().for_each(|peer| peer.streams.wake_tasks());
         }
-    }
-
-    /// Runs `act` with the application's state, when its turn comes.
-    pub(crate) fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
-        let result = self.services.state.enter().map(|mut state| act(&mut state));
-        self.go_on_with_parked();
-        result
-    }
-
-    /// The same for a task, which no thread waits for.
-    #[cfg(feature = "async")]
-    pub(crate) async fn with_state_awaited<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
-        struct Place<'e, T: Send + 'static>(&'e Engine<T>, state_gate::Turn);
-        impl<T: Send + 'static> Drop for Place<'_, T> {
-            fn drop(&mut self) {
-                self.0.services.state.give_up(self.1);
-                self.0.go_on_with_parked();
-            }
-        }
-        let place = Place(self, self.services.state.take_turn(None));
-        let mut act = Some(act);
-        std::future::poll_fn(|cx| {
-            let entered = self.services.state.poll_enter(place.1, cx);
-            entered.map_ok(|mut state| act.take().map(|act| act(&mut state)))
-        })
-        .await?
-        .ok_or(Error::NotRunning)
-    }
-
-    fn take_handlers(&self) -> Vec<Handler<T>> {
-        let mut functions = self.functions_mut();
-        let names: Vec<String> = functions.iter().map(|function| function.name().to_owned()).collect();
-        names.iter().filter_map(|name| functions.remove(name).ok()).map(|(_, handler)| handler).collect()
     }
 
     pub(crate) fn now(&self) -> Instant {

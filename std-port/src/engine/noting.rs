@@ -4,10 +4,14 @@
 #[cfg(feature = "control")]
 pub(super) use crate::control::ProgramCall as Recorded;
 
+#[cfg(feature = "control")]
+use std::sync::Arc;
+
 use cara_core::services::session::RequestOptions;
 
-use super::Engine;
 use super::link::LinkCell;
+#[cfg(feature = "control")]
+use crate::control::Audit;
 
 /// Without operators there is no audit log.
 #[cfg(not(feature = "control"))]
@@ -21,9 +25,15 @@ impl Recorded {
     }
 }
 
-impl<T: Send + 'static> Engine<T> {
-    /// What is to be noted of a call that is about to be made.
+/// Where such calls are noted, if anywhere.
+pub(super) struct Notes {
     #[cfg(feature = "control")]
+    pub(super) audit: Option<Arc<Audit>>,
+}
+
+#[cfg(feature = "control")]
+impl Notes {
+    /// What is to be noted of a call that is about to be made.
     pub(super) fn recorded(&self, link: &LinkCell, function: &str, options: &RequestOptions) -> Option<Recorded> {
         let audit = self.audit.as_ref().filter(|_| !options.operator)?;
         let attributes = link.lock().session.their_function_list().named(function).map(|known| *known.attributes);
@@ -31,19 +41,19 @@ impl<T: Send + 'static> Engine<T> {
         Recorded::of(audit, function, attributes, options.take_over, node)
     }
 
-    #[cfg(not(feature = "control"))]
+    /// Lines that nothing has written.
+    pub(super) fn lines_lost(&self) -> u64 {
+        self.audit.as_ref().map_or(0, |audit| audit.lost())
+    }
+}
+
+#[cfg(not(feature = "control"))]
+impl Notes {
     pub(super) fn recorded(&self, _: &LinkCell, _: &str, _: &RequestOptions) -> Option<Recorded> {
         None
     }
 
-    /// Lines of the audit log that nothing has written.
-    #[cfg(feature = "control")]
-    pub(super) fn audit_lines_lost(&self) -> u64 {
-        self.audit.as_ref().map_or(0, |audit| audit.lost())
-    }
-
-    #[cfg(not(feature = "control"))]
-    pub(super) fn audit_lines_lost(&self) -> u64 {
+    pub(super) fn lines_lost(&self) -> u64 {
         0
     }
 }

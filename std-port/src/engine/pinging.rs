@@ -32,7 +32,7 @@ impl<T: Send + 'static> Engine<T> {
         deadline: Instant,
     ) -> Result<Duration, Error> {
         // A link that is kept is read by no thread until its caller is back.
-        self.read_by(self.now(), link, &mut state, Cause::NeedsPool);
+        self.links.read_by(self.now(), link, &mut state, Cause::NeedsPool);
         loop {
             match self.with(link, &mut state, |session, cx| session.ping(cx)) {
                 Ok(()) => break,

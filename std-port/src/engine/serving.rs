@@ -4,7 +4,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 use cara_core::config::Priority;
-use cara_core::distribution::function_list::{FunctionList, Slot};
+use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::Incoming;
@@ -13,7 +13,10 @@ use cara_core::time::{Duration, Instant};
 use super::Engine;
 use super::details;
 use super::link::{LinkCell, LinkState};
+use super::services::Parked;
 use super::state_gate::{Entered, Turn};
+#[cfg(feature = "async")]
+use super::tasks::Task;
 use super::worker::{Worker, arena};
 use crate::handler::{self, Handler, Run};
 use crate::lease::LeaseWatch;
@@ -29,13 +32,6 @@ pub(super) struct Started {
     pub(super) call: Incoming,
     /// Its turn, where it takes the application's state.
     turn: Option<Turn>,
-}
-
-/// A call whose turn has not come yet, with its arguments.
-pub(crate) struct Parked {
-    link: Arc<LinkCell>,
-    call: Incoming,
-    arguments: Box<ParametersView>,
 }
 
 /// What running a call led to.
@@ -86,15 +82,16 @@ impl<T: Send + 'static> Engine<T> {
                 link.lock().reading.ran(Duration::MAX);
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
-                self.park(turn, Parked { link: link.clone(), call: started.call, arguments });
+                self.services.park(turn, Parked { link: link.clone(), call: started.call, arguments });
                 return None;
             }
             #[cfg(feature = "async")]
             Ran::Apart(reported, begin, to_its_end) => {
                 link.lock().reading.ran(self.now().since(began));
+                let engine = self.me.upgrade()?;
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
-                self.begin_task(link, started.call, *reported, (&*begin, to_its_end), arguments);
+                Task::begin(engine, link, started.call, *reported, (&*begin, to_its_end), arguments);
                 return None;
             }
         };
@@ -130,17 +127,17 @@ impl<T: Send + 'static> Engine<T> {
     /// Begins the next call of a link.
     pub(super) fn take_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Started> {
         let call = self.with(link, state, |session, cx| session.next_call(cx, &mut worker.arguments))?;
-        Some(self.started(&self.functions(), link, call))
+        Some(self.started(&self.services.functions(), link, call))
     }
 
     /// Gives emergencies that have come to the threads of their services. No thread that reads runs them.
     pub(super) fn dispatch_emergencies(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         while state.session.has_next_emergency() {
-            let mut arguments = arena(self.call_bytes());
+            let mut arguments = arena(self.services.call_bytes());
             let call = self.with(link, state, |session, cx| session.next_emergency(cx, &mut arguments));
             let Some(call) = call else { return };
-            let started = self.started(&self.functions(), link, call);
-            self.run_emergency(&self.functions(), link, started, arguments);
+            let started = self.started(&self.services.functions(), link, call);
+            self.run_emergency(&self.services.functions(), link, started, arguments);
         }
     }
 
@@ -165,10 +162,10 @@ impl<T: Send + 'static> Engine<T> {
                 }
                 engine.settle(&link, state);
             }
-            Ran::NotYet(turn) => engine.park(turn, Parked { link, call: started.call, arguments }),
+            Ran::NotYet(turn) => engine.services.park(turn, Parked { link, call: started.call, arguments }),
             #[cfg(feature = "async")]
             Ran::Apart(reported, begin, to_its_end) => {
-                engine.begin_task(&link, started.call, *reported, (&*begin, to_its_end), arguments);
+                Task::begin(engine, &link, started.call, *reported, (&*begin, to_its_end), arguments);
             }
         });
     }
@@ -178,24 +175,10 @@ impl<T: Send + 'static> Engine<T> {
         self.driver.pool().hand_over(link.token());
     }
 
-    fn park(&self, turn: Turn, parked: Parked) {
-        self.services.state.park(turn, parked);
-        self.go_on_with_parked();
-    }
-
-    /// Calls that were parked and have their turn now are left to the pool.
-    pub(super) fn go_on_with_parked(&self) {
-        if self.services.state.has_ready()
-            && let Some(unit_number) = self.driver.unit_number()
-        {
-            self.driver.pool().hand_over(crate::threads::token(unit_number, u64::MAX));
-        }
-    }
-
     /// Runs a call that was parked, and those that wait behind it on its link.
     pub(super) fn serve_parked(&self, worker: &mut Worker) {
         let Some((Parked { link, call, arguments }, turn)) = self.services.state.take_ready() else { return };
-        self.go_on_with_parked();
+        self.services.go_on_with_parked();
         let now = self.now();
         // A call that waited for its turn may be late, and its caller may be gone.
         let is_over = now >= call.deadline || self.serving(&link, call.ticket).is_cancelled();
@@ -204,7 +187,7 @@ impl<T: Send + 'static> Engine<T> {
         let state = match result {
             Ok(()) => self.serve_one(now, &link, Started { call, turn: turn.ok() }, worker).map(|(state, _)| state),
             Err(error) => {
-                self.give_up(turn.ok());
+                self.services.give_up(turn.ok());
                 Some(self.answer(now, &link, link.lock(), &call, Err(error), &worker.arguments))
             }
         };
@@ -215,25 +198,18 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn give_up(&self, turn: Option<Turn>) {
-        if let Some(turn) = turn {
-            self.services.state.give_up(turn);
-            self.go_on_with_parked();
-        }
-    }
-
     fn run(&self, link: &Arc<LinkCell>, started: Started, arguments: &mut ParametersView) -> Ran {
         let Started { call, turn } = started;
         let (run, reported) = match self.prepare(link, &call) {
             Ok(prepared) => prepared,
             Err(error) => {
-                self.give_up(turn);
+                self.services.give_up(turn);
                 return Ran::Over(Err(error));
             }
         };
         match run {
             Run::Free(run) => {
-                self.give_up(turn);
+                self.services.give_up(turn);
                 Ran::Over(guarded(&reported, || run(&reported, arguments)))
             }
             Run::Method(run) => {
@@ -243,15 +219,15 @@ impl<T: Send + 'static> Engine<T> {
                     Entered::NotYet => return Ran::NotYet(turn),
                     Entered::Refused(error) => Err(error),
                 };
-                self.go_on_with_parked();
+                self.services.go_on_with_parked();
                 Ran::Over(result)
             }
             #[cfg(feature = "async")]
             Run::Task(begin) => {
-                self.give_up(turn);
+                self.services.give_up(turn);
                 let reported = handler::Served { given_up: Some(Arc::default()), ..reported };
                 let to_its_end =
-                    self.functions().function(call.slot).is_some_and(|function| function.handler.to_its_end);
+                    self.services.functions().function(call.slot).is_some_and(|function| function.handler.to_its_end);
                 Ran::Apart(Box::new(reported), begin, to_its_end)
             }
         }
@@ -261,7 +237,7 @@ impl<T: Send + 'static> Engine<T> {
     fn prepare(&self, link: &Arc<LinkCell>, call: &Incoming) -> Result<(Run<T>, handler::Served), Error> {
         let peer = link.peer.get().ok_or(Error::NotConnected)?;
         let (run, actuator) = {
-            let functions = self.functions();
+            let functions = self.services.functions();
             let Handler { run, actuator, .. } = functions.function(call.slot).ok_or(Error::StaleFunction)?.handler;
             (run.clone(), actuator.clone())
         };
@@ -318,13 +294,6 @@ impl<T: Send + 'static> Engine<T> {
             state = link.lock();
             state = state.wait(&link.room, PAUSE);
             now = self.now();
-        }
-    }
-
-    /// The lease of a service has ended, and its safe hook is running: whatever waits for the end of the lease looks again.
-    pub(super) fn wake_leased(&self, functions: &FunctionList<Boxed, Handler<T>>, slot: Slot) {
-        if let Some(actuator) = functions.function(slot).and_then(|function| function.handler.actuator.as_ref()) {
-            actuator.lease.wake();
         }
     }
 }

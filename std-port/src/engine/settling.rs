@@ -10,6 +10,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
+use super::services;
 use crate::locks::Locked;
 
 /// A link on which reading is paused is looked at again after this.
@@ -37,7 +38,7 @@ impl<T: Send + 'static> Engine<T> {
             deadline = state.session.deadline();
         }
         self.set_timer(now, deadline, link, state);
-        self.set_interest(link, state);
+        self.links.set_interest(link, state);
         let woken = std::mem::take(&mut state.woken);
         if state.notices.begin() {
             self.act(link, guard);
@@ -73,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
     /// An event that is acted upon when the lock is given up; only what waits for the end of a lease is woken before.
     pub(super) fn note(&self, state: &mut LinkState, event: Event) {
         if let Event::LeaseExpired(slot) = event {
-            self.wake_leased(&self.functions(), slot);
+            services::wake_leased(&self.services.functions(), slot);
         }
         state.notices.push(event);
     }

@@ -52,7 +52,7 @@ impl<T: Send + 'static> Engine<T> {
         let now = self.now();
         let mut state = link.lock();
         let may = state.waiters.is_empty() && state.session.is_live() && !state.is_paused();
-        let token = self.read_by(now, link, &mut state, Cause::Stays { served, may })?;
+        let token = self.links.read_by(now, link, &mut state, Cause::Stays { served, may })?;
         self.settle_at(now, link, state);
         Some((token, staying))
     }
@@ -65,7 +65,7 @@ impl<T: Send + 'static> Engine<T> {
         mut state: Locked<'l, LinkState>,
         token: Token,
     ) -> bool {
-        self.read_by(now, link, &mut state, Cause::Ends(token));
+        self.links.read_by(now, link, &mut state, Cause::Ends(token));
         let stays = state.reading.is_quick() && !state.is_paused() && state.reading.is_held(token);
         self.settle_at(now, link, state);
         stays && self.driver.pool().has_idle() && !self.is_stopping()
@@ -76,7 +76,7 @@ impl<T: Send + 'static> Engine<T> {
         loop {
             let received = link.stream.receive(&mut worker.buffer, Wait::Slice);
             let now = self.now();
-            worker.fit(self.call_bytes());
+            worker.fit(self.services.call_bytes());
             let mut state = link.lock();
             let call = match received {
                 Received::Bytes(count) => {
@@ -92,7 +92,7 @@ impl<T: Send + 'static> Engine<T> {
             };
             let call = call.or_else(|| self.waiting_call(link, &mut state, worker));
             if call.is_some() {
-                self.read_by(now, link, &mut state, Cause::Begins(token));
+                self.links.read_by(now, link, &mut state, Cause::Begins(token));
             }
             let alive = state.session.is_live() && state.waiters.is_empty() && !state.is_paused();
             self.settle_at(now, link, state);

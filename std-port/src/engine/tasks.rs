@@ -31,7 +31,7 @@ type Spawn = dyn Fn(Spawned) + Send + Sync;
 
 /// What runs the handlers that are futures.
 #[derive(Default)]
-pub(super) struct Runner {
+pub(crate) struct Runner {
     /// Of the application.
     spawn: Mutex<Option<Arc<Spawn>>>,
     /// The unit's own thread, once there is a service that needs it.
@@ -39,59 +39,22 @@ pub(super) struct Runner {
 }
 
 impl Runner {
-    /// Ends the unit's own thread.
-    pub(super) fn end(&self) {
-        let own = lock(&self.own).take();
-        own.into_iter().for_each(|executor| executor.end());
-    }
-}
-
-impl<T: Send + 'static> Engine<T> {
     /// Handlers that begin from here on are given to `spawn`.
-    pub(crate) fn run_tasks_on(&self, spawn: Arc<Spawn>) {
-        *lock(&self.services.runner.spawn) = Some(spawn);
+    pub(crate) fn run_on(&self, spawn: Arc<Spawn>) {
+        *lock(&self.spawn) = Some(spawn);
     }
 
     /// There is something that runs futures. [`Error::Network`] when the system refuses the thread.
-    pub(crate) fn make_runner(&self) -> Result<(), Error> {
-        let runner = &self.services.runner;
-        let mut own = lock(&runner.own);
-        if own.is_none() && lock(&runner.spawn).is_none() {
+    pub(crate) fn make(&self) -> Result<(), Error> {
+        let mut own = lock(&self.own);
+        if own.is_none() && lock(&self.spawn).is_none() {
             *own = Some(Arc::new(Executor::start("cara-tasks")?));
         }
         Ok(())
     }
 
-    /// Begins the handler of a call; what it leads to is answered by its task.
-    pub(super) fn begin_task(
-        &self,
-        link: &Arc<LinkCell>,
-        call: Incoming,
-        reported: handler::Served,
-        (begin, to_its_end): (&Begin, bool),
-        arguments: Box<ParametersView>,
-    ) {
-        let Some(engine) = self.me.upgrade() else { return };
-        let (lease, given_up) = (reported.lease_ended(), reported.given_up.clone());
-        let caller = reported.caller.clone();
-        let work = catch_unwind(AssertUnwindSafe(|| begin(reported, arguments)));
-        if work.is_err() {
-            tracing::error!(%caller, "a handler panicked");
-        }
-        let (work, result) = match work {
-            Ok(work) => (Some(work), Err(Error::Service(ServiceError::NotReady))),
-            Err(_) => (None, Err(Error::Service(ServiceError::Panicked))),
-        };
-        let alarm = Alarm::new(engine.driver.clone());
-        let link = link.clone();
-        let (failure, answered) = (None, false);
-        let task = Task { engine, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered };
-        self.spawn(Box::pin(task));
-    }
-
     fn spawn(&self, task: Spawned) {
-        let runner = &self.services.runner;
-        let spawn = lock(&runner.spawn).clone();
+        let spawn = lock(&self.spawn).clone();
         if let Some(spawn) = spawn {
             // A task that the executor does not take is dropped, and so its call is answered.
             if catch_unwind(AssertUnwindSafe(|| spawn(task))).is_err() {
@@ -99,15 +62,21 @@ impl<T: Send + 'static> Engine<T> {
             }
             return;
         }
-        let own = lock(&runner.own).clone();
+        let own = lock(&self.own).clone();
         if let Some(executor) = own {
             OwnTask::start(task, executor);
         }
     }
+
+    /// Ends the unit's own thread.
+    pub(super) fn end(&self) {
+        let own = lock(&self.own).take();
+        own.into_iter().for_each(|executor| executor.end());
+    }
 }
 
 /// One call until it is answered. Dropped before, as by an executor that ends, it is answered as not ready.
-struct Task<T: Send + 'static> {
+pub(super) struct Task<T: Send + 'static> {
     engine: Arc<Engine<T>>,
     link: Arc<LinkCell>,
     call: Incoming,
@@ -126,6 +95,33 @@ struct Task<T: Send + 'static> {
 }
 
 impl<T: Send + 'static> Task<T> {
+    /// Begins the handler of a call; what it leads to is answered by its task.
+    pub(super) fn begin(
+        engine: Arc<Engine<T>>,
+        link: &Arc<LinkCell>,
+        call: Incoming,
+        reported: handler::Served,
+        (begin, to_its_end): (&Begin, bool),
+        arguments: Box<ParametersView>,
+    ) {
+        let (lease, given_up) = (reported.lease_ended(), reported.given_up.clone());
+        let caller = reported.caller.clone();
+        let work = catch_unwind(AssertUnwindSafe(|| begin(reported, arguments)));
+        if work.is_err() {
+            tracing::error!(%caller, "a handler panicked");
+        }
+        let (work, result) = match work {
+            Ok(work) => (Some(work), Err(Error::Service(ServiceError::NotReady))),
+            Err(_) => (None, Err(Error::Service(ServiceError::Panicked))),
+        };
+        let alarm = Alarm::new(engine.driver.clone());
+        let link = link.clone();
+        let (failure, answered) = (None, false);
+        let services = engine.services.clone();
+        let task = Self { engine, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered };
+        services.runner.spawn(Box::pin(task));
+    }
+
     /// Whether nothing wants the call any more: its caller's time is over, its link or its order has ended. Otherwise the
     /// task is woken when that changes.
     fn is_given_up(&mut self, cx: &mut Context<'_>) -> bool {

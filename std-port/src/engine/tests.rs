@@ -103,12 +103,12 @@ fn what_a_link_has_counted_counts_once_when_it_ends() {
     let (engine, near) = (pair.manager.engine(), pair.near());
     let cell = near.peer.get().unwrap();
     let sent = || {
-        let of_peer = value(&engine.peer_readings(cell), Group::Link, "RequestsSent");
+        let of_peer = value(&engine.accounts.of_peer(cell), Group::Link, "RequestsSent");
         (value(&engine.readings(), Group::Links, "RequestsSent"), of_peer)
     };
     assert_eq!(sent(), (3, 3));
     for _ in 0..2 {
-        engine.retire(&near);
+        engine.accounts.retire(&near);
         assert_eq!((sent(), value(&engine.readings(), Group::Unit, "LinksOpen")), ((3, 3), 0));
     }
     pair.agv.stop();
@@ -201,7 +201,7 @@ fn an_event_that_finds_no_room_is_counted_for_its_subscriber_and_the_unit() {
     let lost = || value(&engine.readings(), Group::Unit, "EventsLost");
     let (slow, slow_events) = sync_channel(1);
     let (quick, quick_events) = sync_channel(8);
-    let (lost_by_slow, lost_by_quick) = (engine.subscribe(slow), engine.subscribe(quick));
+    let (lost_by_slow, lost_by_quick) = (engine.events.subscribe(slow), engine.events.subscribe(quick));
     let event = UnitEvent::NetworkChanged { up: Vec::new() };
     (0..4).for_each(|_| engine.notify(event.clone()));
     let counted = [&lost_by_slow, &lost_by_quick].map(|lost| lost.load(Ordering::Relaxed));

@@ -32,24 +32,14 @@ impl<T: Send + 'static> Engine<T> {
         }
         let may = quick && self.driver.pool().may_run_quickly();
         if may {
-            self.begin_watch();
+            self.links.begin_watch();
         }
         may
     }
 
-    /// Bytes that the parameters of a served call may need.
-    pub(super) fn call_bytes(&self) -> usize {
-        self.services.call_bytes()
-    }
-
-    /// Calls are served with room for at least so many bytes of arguments and results.
-    pub(crate) fn make_room_for(&self, bytes: usize) {
-        self.services.make_room_for(bytes);
-    }
-
     pub(super) fn link_ready(&self, ready: Ready, worker: &mut Worker) {
         let Some(link) = self.links.of_token(ready.token) else { return };
-        worker.fit(self.call_bytes());
+        worker.fit(self.services.call_bytes());
         let mut state = link.lock();
         if state.reading.is_opening() && ready.writable {
             self.connected(&link, &mut state);
@@ -108,7 +98,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Runs a call that was parked and has its turn, and the calls of a link that no thread has run yet.
     pub(super) fn serve_link(&self, token: u64, worker: &mut Worker) {
-        worker.fit(self.call_bytes());
+        worker.fit(self.services.call_bytes());
         self.serve_parked(worker);
         let Some(link) = self.links.of_token(token) else { return };
         let state = link.lock();
