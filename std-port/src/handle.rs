@@ -227,7 +227,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
         {
             let held = || control::held(&self.owner.control, &self.identity(), self.fleet());
             self.engine().start_unless(held)?;
-            if self.engine().takes_over() {
+            if self.engine().claims.takes_over() {
                 // The one that steps down has the socket until it ends.
                 wait_until(STEPPING_DOWN, || held().is_none());
             }
@@ -301,12 +301,9 @@ impl<T: Send + 'static, R> Handle<T, R> {
     pub fn end_order(&self, order: &LeaseWatch) -> bool {
         let Some((word, order)) = order.order() else { return false };
         let engine = self.engine();
-        let is_finished = engine.links.all().into_iter().any(|link| {
-            let mut state = link.lock();
-            let is_finished = engine.with(&link, &mut state, |session, cx| session.end_order(cx, &word.lease, order));
-            engine.settle(&link, state);
-            is_finished
-        });
+        let mut links = engine.links.all().into_iter();
+        let is_finished =
+            links.any(|link| engine.on_link(&link, |session, cx| session.end_order(cx, &word.lease, order)));
         word.wake();
         is_finished
     }

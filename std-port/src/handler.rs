@@ -18,7 +18,7 @@ use cara_core::services::stream::Source;
 use cara_core::time::{Duration, Instant};
 
 use crate::actuator::Actuator;
-use crate::engine::details::Serving;
+use crate::engine::served::Serving;
 use crate::engine::streams::OwnStream;
 use crate::executor::Executor;
 use crate::growing::HandlerParameters;
@@ -40,7 +40,7 @@ pub struct Served {
     pub(crate) serving: Serving,
     /// For a handler that is a future.
     #[cfg(feature = "async")]
-    pub(crate) given_up: Option<Arc<crate::engine::GivenUp>>,
+    pub(crate) given_up: Option<Arc<crate::engine::served::GivenUp>>,
 }
 
 impl Served {

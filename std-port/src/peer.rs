@@ -426,10 +426,7 @@ impl<T: Send + 'static> Peer<T> {
 
     /// Sends one-way messages that gather now.
     pub fn flush(&self) -> Result<(), Error> {
-        let link = self.link()?;
-        let mut state = link.lock();
-        self.engine.with(&link, &mut state, |session, cx| session.flush_gathered(cx));
-        self.engine.settle(&link, state);
+        self.engine.on_link(&self.link()?, |session, cx| session.flush_gathered(cx));
         Ok(())
     }
 

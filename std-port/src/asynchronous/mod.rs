@@ -111,6 +111,7 @@
 mod calls;
 mod elsewhere;
 mod events;
+mod looking;
 mod samples;
 mod services;
 mod waiting;

@@ -13,7 +13,8 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::typed::{AsyncFunctions, AsyncState};
 
 use crate::actuator::Actuator;
-use crate::engine::{Engine, GivenUp, Spawned};
+use crate::engine::served::GivenUp;
+use crate::engine::{Engine, Spawned};
 use crate::growing::HandlerParameters;
 use crate::handle::Handle;
 use crate::handler::{IntoHandler, Run, RunOf, Served, ServiceOptions};

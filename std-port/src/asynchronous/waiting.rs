@@ -5,6 +5,7 @@ use cara_core::error::Error;
 use cara_core::time::Duration;
 
 use super::events::{EventQueue, EventStream};
+use super::looking::{LinkWait, look_until};
 use crate::communication_system::CommunicationSystem;
 use crate::handle::Handle;
 use crate::peer::Peer;
@@ -42,7 +43,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// # }
     /// ```
     pub async fn wait_until_async(&self, mut condition: impl FnMut() -> bool) -> Result<(), Error> {
-        self.engine().look_until(|| condition().then_some(())).await
+        look_until(self.engine(), || condition().then_some(())).await
     }
 }
 
@@ -59,14 +60,14 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// # }
     /// ```
     pub async fn wait_for_s_unit_async(&self, name: &str) -> Result<Peer<T>, Error> {
-        self.engine().look_until(|| self.s_unit_here(name)).await?
+        look_until(self.engine(), || self.s_unit_here(name)).await?
     }
 
     /// As [`publish_and_wait`](Self::publish_and_wait): ends when every connected node has read the list, or after `timeout`
     /// with the nodes that have not. Dropped before it has ended, the list is published all the same.
     pub async fn publish_and_wait_async(&self, timeout: impl Into<Duration>) -> Result<Vec<Identity>, Error> {
         let reported = self.engine().publish(None)?;
-        let missing = self.engine().acknowledgements(reported, timeout.into()).await;
+        let missing = LinkWait::new(self.engine(), timeout.into()).acknowledgements(reported).await;
         Ok(missing.iter().filter_map(|link| link.peer.get()).map(|peer| peer.identity.clone()).collect())
     }
 }
@@ -76,7 +77,7 @@ impl<T: Send + 'static> Unit<T> {
     /// Dropping the future loses nothing.
     pub async fn wait_for_manager_async(&self) -> Result<Peer<T>, Error> {
         let here = || self.manager().filter(|manager| manager.cell.is_introduced());
-        self.engine().look_until(here).await
+        look_until(self.engine(), here).await
     }
 }
 
@@ -84,6 +85,6 @@ impl<T: Send + 'static> Peer<T> {
     /// Ends when the node has published `function`, or has come with it. [`Error::NotRunning`] when this unit is stopped.
     /// Dropping the future loses nothing.
     pub async fn wait_for_function_async(&self, function: &str) -> Result<(), Error> {
-        self.engine.look_until(|| self.offers(function).then_some(())).await
+        look_until(&self.engine, || self.offers(function).then_some(())).await
     }
 }

@@ -130,7 +130,7 @@ impl<T: Send + 'static> Pending<T> {
         }
         let now = self.engine.now();
         let options = RequestOptions { timeout: Some(self.deadline.since(now)), made: Some(self.made), ..*options };
-        match self.engine.begin_awaited(now, &self.link, callee, parameters, &options, waker) {
+        match self.begin(now, callee, parameters, &options, waker) {
             Ok(id) => {
                 self.stage = Stage::Sent(id);
                 Ok(None)
@@ -140,6 +140,30 @@ impl<T: Send + 'static> Pending<T> {
                 _ => Err(error),
             },
         }
+    }
+
+    /// Sends a request whose reply the pool reads. Where it finds no room, the task of `waker` looks again when the link has
+    /// changed.
+    fn begin(
+        &self,
+        now: Instant,
+        callee: Callee<'_>,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        waker: &Waker,
+    ) -> Result<CallId, CallError> {
+        let (engine, link) = (&self.engine, &self.link);
+        let mut state = link.lock();
+        // A link that is kept is read by no thread until its caller is back.
+        engine.links.read_by(now, link, &mut state, Cause::NeedsPool);
+        let sent = engine.request_on(now, link, &mut state, callee, parameters, options, true);
+        match &sent {
+            Ok(id) => state.await_reply(*id, Wake::Task(Some(waker.clone()))),
+            Err(error) if matches!(error.error, Error::Full(_)) => state.await_change(waker),
+            Err(_) => {}
+        }
+        engine.settle(link, state);
+        sent
     }
 
     fn poll_reply(
@@ -219,32 +243,6 @@ impl<T: Send + 'static> Drop for Pending<T> {
         if let Stage::Sent(id) = self.stage {
             self.engine.give_up_call(&self.link, id);
         }
-    }
-}
-
-impl<T: Send + 'static> Engine<T> {
-    /// Sends a request whose reply the pool reads. Where it finds no room, the task of `waker` looks again when the link has
-    /// changed.
-    fn begin_awaited(
-        &self,
-        now: Instant,
-        link: &Arc<LinkCell>,
-        callee: Callee<'_>,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-        waker: &Waker,
-    ) -> Result<CallId, CallError> {
-        let mut state = link.lock();
-        // A link that is kept is read by no thread until its caller is back.
-        self.links.read_by(now, link, &mut state, Cause::NeedsPool);
-        let sent = self.request_on(now, link, &mut state, callee, parameters, options, true);
-        match &sent {
-            Ok(id) => state.await_reply(*id, Wake::Task(Some(waker.clone()))),
-            Err(error) if matches!(error.error, Error::Full(_)) => state.await_change(waker),
-            Err(_) => {}
-        }
-        self.settle(link, state);
-        sent
     }
 }
 

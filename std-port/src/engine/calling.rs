@@ -7,7 +7,6 @@ use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Limit};
 use cara_core::services::call::{Callee, Detail, Outgoing};
-use cara_core::services::heart::Beats;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -16,6 +15,7 @@ use super::Engine;
 use super::details::Canceller;
 use super::inbound::OwnCall;
 use super::link::{LinkCell, LinkState, Wake};
+use super::pinging::{self, Turn};
 use super::reader::{Cause, Token};
 use super::settling::RETRY;
 use super::worker::READ_BYTES;
@@ -330,6 +330,39 @@ impl<T: Send + 'static> Engine<T> {
         })
     }
 
+    /// Asks for a sign of life and returns how long it took. Of several callers on a link each has its turn.
+    pub(crate) fn ping(&self, link: &Arc<LinkCell>, timeout: Duration) -> Result<Duration, Error> {
+        let deadline = self.now() + timeout;
+        let (_turn, state) = Turn::wait(link, self.driver.clock(), deadline)?;
+        self.round_trip(link, state, deadline)
+    }
+
+    fn round_trip<'l>(
+        &self,
+        link: &'l Arc<LinkCell>,
+        mut state: Locked<'l, LinkState>,
+        deadline: Instant,
+    ) -> Result<Duration, Error> {
+        let clock = self.driver.clock();
+        // A link that is kept is read by no thread until its caller is back.
+        self.links.read_by(clock.now(), link, &mut state, Cause::NeedsPool);
+        loop {
+            match self.with(link, &mut state, |session, cx| session.ping(cx)) {
+                Ok(()) => break,
+                Err(Error::Full(_)) => state = pinging::wait(link, state, clock, deadline)?,
+                Err(error) => return Err(error),
+            }
+        }
+        self.settle(link, state);
+        state = link.lock();
+        loop {
+            if let Some(took) = state.session.round_trip() {
+                return Ok(took);
+            }
+            state = pinging::wait(link, state, clock, deadline)?;
+        }
+    }
+
     /// Nothing waits for a call any more, and what it started is not wanted.
     pub(crate) fn give_up_call(&self, link: &Arc<LinkCell>, id: CallId) {
         let mut state = link.lock();
@@ -337,16 +370,7 @@ impl<T: Send + 'static> Engine<T> {
         self.settle(link, state);
     }
 
-    /// A loop has ended: what it wanted is released on all links.
-    pub(crate) fn release_beats(&self, beats: Beats) {
-        for link in self.links.all() {
-            let mut state = link.lock();
-            self.with(&link, &mut state, |session, cx| session.release_beats(cx, beats));
-            self.settle(&link, state);
-        }
-    }
-
-    pub(super) fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
+    fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
         self.with_at(now, link, state, |session, cx| session.cancel(cx, id));
         state.forget(id);
     }

@@ -3,20 +3,20 @@
 
 use std::fs::File;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 use std::time::{Instant, SystemTime};
 
 use cara_core::distribution::claim::{Claim, TaggedClaim};
-use cara_core::distribution::connection_handler::ClaimEvent;
 use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::time::Duration;
 use core::net::SocketAddr;
 
-use super::Engine;
+use super::hub::SharedHub;
+use super::keys::Keys;
 use crate::claims::ClaimFile;
+use crate::clock::Clock;
 use crate::error::StartError;
-use crate::event::UnitEvent;
 use crate::keys::{KeptClaims, KeptObeyed, KeyRing};
 use crate::locks::lock;
 use crate::sys::random;
@@ -40,10 +40,10 @@ const STORING: std::time::Duration = std::time::Duration::from_secs(2);
 const LOOK: std::time::Duration = std::time::Duration::from_millis(5);
 
 /// What is stored, and by whom.
-pub(super) struct Claims {
+pub(crate) struct Claims {
     folder: Option<PathBuf>,
     /// A manager starts beside a live one, and fences it.
-    pub(super) take_over: TakeOver,
+    take_over: TakeOver,
     writer: Mutex<Writer>,
     /// Says that the unit runs.
     held: Mutex<Option<File>>,
@@ -59,48 +59,62 @@ struct Writer {
     ends: bool,
 }
 
+/// What is to be stored.
 #[derive(Debug)]
-enum Job {
+pub(super) enum Job {
     Keep(Identity, TaggedClaim),
     Raise(Claim),
     /// Of a manager that steps down.
     Heard(Claim),
 }
 
+/// What came of a job.
+pub(super) enum Written {
+    Nothing,
+    /// A claim is not stored.
+    Failed(Job),
+    /// Orders may not be obeyed any more.
+    Obeyed,
+    /// The raised claim is stored: it counts.
+    Raised(Claim),
+}
+
 impl Claims {
     pub(super) fn new(folder: Option<PathBuf>, take_over: TakeOver) -> Self {
         Self { folder, take_over, writer: Mutex::default(), held: Mutex::default() }
     }
-}
 
-impl<T: Send + 'static> Engine<T> {
-    #[cfg(feature = "control")]
     pub(crate) fn takes_over(&self) -> bool {
-        self.claims.take_over != TakeOver::No
+        self.take_over != TakeOver::No
     }
 
-    fn claim_file(&self) -> Option<ClaimFile> {
-        let (identity, fleet) = self.hub.lock().identity();
-        self.claims.folder.as_ref().map(|folder| ClaimFile::of(folder, &identity, fleet))
+    fn file(&self, hub: &SharedHub) -> Option<ClaimFile> {
+        let (identity, fleet) = hub.lock().identity();
+        self.folder.as_ref().map(|folder| ClaimFile::of(folder, &identity, fleet))
     }
 
-    fn store(&self, kept: &KeptClaims) -> Result<(), String> {
-        self.claim_file().map_or(Ok(()), |file| file.keep(kept).map_err(|error| error.to_string()))
+    fn store(&self, hub: &SharedHub, kept: &KeptClaims) -> Result<(), String> {
+        self.file(hub).map_or(Ok(()), |file| file.keep(kept).map_err(|error| error.to_string()))
     }
 
     /// A live manager of this identity was found before the start: whether this one starts all the same.
-    pub(super) fn may_start_beside(&self, at: SocketAddr, running: Option<&ClaimReport>) -> Result<(), StartError> {
-        let (identity, fleet) = self.hub.lock().identity();
+    pub(super) fn may_start_beside(
+        &self,
+        hub: &SharedHub,
+        at: SocketAddr,
+        running: Option<&ClaimReport>,
+    ) -> Result<(), StartError> {
+        let (identity, fleet) = hub.lock().identity();
         let since = running.map_or(ClaimReport::NEVER, |report| report.since);
         let rests = Duration::from_millis(since.into()) >= TAKE_OVER_REST;
-        match self.claims.take_over {
+        match self.take_over {
             TakeOver::Forced => return Ok(()),
             TakeOver::Yes if rests => return Ok(()),
             TakeOver::Yes | TakeOver::No => {}
         }
         // What was heard is stored, so that the next start claims above it.
         let heard = running.map_or(Claim::NONE, ClaimReport::claim);
-        if let Some(file) = self.claim_file() {
+        if let Some(file) = self.file(hub) {
             let kept = file.read();
             if heard > kept.own
                 && let Err(error) = file.keep(&KeptClaims { own: heard, ..kept })
@@ -108,7 +122,7 @@ impl<T: Send + 'static> Engine<T> {
                 tracing::error!(%error, "the claim that was heard is not stored");
             }
         }
-        match self.claims.take_over {
+        match self.take_over {
             TakeOver::No => Err(StartError::AlreadyRunning { identity, fleet, at }),
             _ => Err(StartError::JustTakenOver { identity, fleet, at }),
         }
@@ -116,15 +130,15 @@ impl<T: Send + 'static> Engine<T> {
 
     /// At the start: a unit obeys what it has stored. An m_unit claims above what it has stored and `heard`, and stores that
     /// before anything is sent with it.
-    pub(super) fn claim(&self, heard: Claim) -> Result<(), StartError> {
-        let (identity, _) = self.hub.lock().identity();
-        let file = self.claim_file();
+    pub(super) fn claim(&self, hub: &SharedHub, keys: &Keys, clock: Clock, heard: Claim) -> Result<(), StartError> {
+        let (identity, _) = hub.lock().identity();
+        let file = self.file(hub);
         if let Some(file) = &file {
             // Before it is read: what is forgotten later would be written back. Where nothing can be written, nothing can be forgotten.
-            *lock(&self.claims.held) = file.hold().ok();
+            *lock(&self.held) = file.hold().ok();
         }
         let mut kept = file.as_ref().map(ClaimFile::read).unwrap_or_default();
-        let codes = self.keys().codes();
+        let codes = keys.codes();
         if identity.role() == Role::MUnit {
             if file.is_none() {
                 tracing::info!("no folder of state is set (CARA_STATE): the claim of this manager is not stored");
@@ -136,176 +150,127 @@ impl<T: Send + 'static> Engine<T> {
             let Some(tagged) = kept.own.tagged(&identity, &codes) else {
                 return Err(StartError::NoOwnKey { identity });
             };
-            self.store(&kept).map_err(StartError::Claim)?;
-            let mut cell = self.hub.lock();
+            self.store(hub, &kept).map_err(StartError::Claim)?;
+            let mut cell = hub.lock();
             cell.hub.node.set_claim(tagged);
-            if self.claims.take_over != TakeOver::No {
-                cell.hub.node.take_over(self.now());
+            if self.takes_over() {
+                cell.hub.node.take_over(clock.now());
             }
         }
-        if let Some(live) = self.keys().ring() {
+        if let Some(live) = keys.ring() {
             let ring = live.ring();
-            let mut cell = self.hub.lock();
+            let mut cell = hub.lock();
             // With other keys than it was obeyed with, a claim does not count.
             kept.obeyed.retain(|obeyed| has_key(&ring, obeyed));
             for KeptObeyed { manager, tagged, .. } in &kept.obeyed {
-                cell.hub.node.keep_obeyed(self.now(), manager, *tagged);
+                cell.hub.node.keep_obeyed(clock.now(), manager, *tagged);
             }
             if file.is_some() {
                 cell.hub.node.store_claims();
             }
         }
-        lock(&self.claims.writer).kept = kept;
+        lock(&self.writer).kept = kept;
         Ok(())
     }
 
-    /// Does what the node wants done about claims.
-    pub(super) fn look_at_claims(&self) {
-        loop {
-            let event = self.hub.lock().hub.node.take_claim_event();
-            match event {
-                None => return,
-                Some(ClaimEvent::Keep(manager, tagged)) => self.leave_to_writer(Job::Keep(manager, tagged)),
-                Some(ClaimEvent::Raise(above)) => self.leave_to_writer(Job::Raise(above)),
-                Some(ClaimEvent::Unkept(peer, claim)) => {
-                    tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored");
-                    self.notify(UnitEvent::ClaimNotKept { peer, claim });
-                }
-                Some(ClaimEvent::StepDown(by)) => self.step_down(by.claim),
-                Some(event) => tracing::debug!(?event, "not understood"),
-            }
-        }
-    }
-
-    /// The thread that writes is started where it does not run; a hung disk holds up nothing else.
-    fn leave_to_writer(&self, job: Job) {
-        let mut writer = lock(&self.claims.writer);
+    /// Has the thread that writes do a job. Where it does not run, one is started, which does what `write` does: a hung disk
+    /// holds up nothing else. Returns the jobs that are not done.
+    pub(super) fn leave_to_writer(&self, job: Job, write: impl FnOnce() + Send + 'static) -> Vec<Job> {
+        let mut writer = lock(&self.writer);
         if writer.waiting.len() >= WAITING {
-            drop(writer);
-            return self.failed(&job);
+            return vec![job];
         }
         writer.waiting.push(job);
         if std::mem::replace(&mut writer.runs, true) {
-            return;
+            return Vec::new();
         }
         drop(writer);
-        let Some(me) = self.me.upgrade() else { return };
-        let started = std::thread::Builder::new().name("cara-claims".into()).spawn(move || me.write_claims());
-        if let Err(error) = started {
-            tracing::error!(%error, "no thread is left to store a claim with");
-            let mut writer = lock(&self.claims.writer);
-            writer.runs = false;
-            let jobs = std::mem::take(&mut writer.waiting);
-            drop(writer);
-            jobs.iter().for_each(|job| self.failed(job));
-        }
-    }
-
-    fn failed(&self, job: &Job) {
-        if let Job::Keep(manager, tagged) = job {
-            self.hub.lock().hub.node.claim_kept(manager, tagged.claim, false);
-            self.driver.wake();
-        }
+        let Err(error) = std::thread::Builder::new().name("cara-claims".into()).spawn(write) else { return Vec::new() };
+        tracing::error!(%error, "no thread is left to store a claim with");
+        let mut writer = lock(&self.writer);
+        writer.runs = false;
+        std::mem::take(&mut writer.waiting)
     }
 
     /// What the thread that writes does, until nothing waits.
-    fn write_claims(self: Arc<Self>) {
-        loop {
-            let (job, mut kept) = {
-                let mut writer = lock(&self.claims.writer);
-                if writer.waiting.is_empty() {
-                    writer.runs = false;
-                    return;
+    pub(super) fn write_next(&self, hub: &SharedHub, keys: &Keys) -> Option<Written> {
+        let (job, mut kept) = {
+            let mut writer = lock(&self.writer);
+            if writer.waiting.is_empty() {
+                writer.runs = false;
+                return None;
+            }
+            (writer.waiting.remove(0), writer.kept.clone())
+        };
+        Some(match job {
+            Job::Keep(manager, tagged) => self.keep_obeyed(hub, keys, kept, manager, tagged),
+            Job::Heard(claim) => {
+                kept.own = kept.own.max(claim);
+                if let Err(error) = self.store(hub, &kept) {
+                    tracing::error!(%error, "the claim that was heard is not stored");
                 }
-                (writer.waiting.remove(0), writer.kept.clone())
-            };
-            match job {
-                Job::Keep(manager, tagged) => self.keep_obeyed(kept, manager, tagged),
-                Job::Heard(claim) => {
-                    kept.own = kept.own.max(claim);
-                    if let Err(error) = self.store(&kept) {
-                        tracing::error!(%error, "the claim that was heard is not stored");
+                Written::Nothing
+            }
+            Job::Raise(above) => {
+                let claim = above.raised(random());
+                kept.own = claim;
+                match self.store(hub, &kept) {
+                    Ok(()) => {
+                        lock(&self.writer).kept = kept;
+                        Written::Raised(claim)
                     }
-                }
-                Job::Raise(above) => {
-                    kept.own = above.raised(random());
-                    match self.store(&kept) {
-                        Ok(()) => self.raised(kept),
-                        Err(error) => tracing::error!(%error, "a raised claim cannot be stored, and is not announced"),
+                    Err(error) => {
+                        tracing::error!(%error, "a raised claim cannot be stored, and is not announced");
+                        Written::Nothing
                     }
                 }
             }
-        }
+        })
     }
 
-    fn keep_obeyed(&self, mut kept: KeptClaims, manager: Identity, tagged: TaggedClaim) {
-        let ring = self.keys().ring().map(|live| live.ring());
+    fn keep_obeyed(
+        &self,
+        hub: &SharedHub,
+        keys: &Keys,
+        mut kept: KeptClaims,
+        manager: Identity,
+        tagged: TaggedClaim,
+    ) -> Written {
+        let ring = keys.ring().map(|live| live.ring());
         let key = ring.as_ref().and_then(|ring| ring.pair(&manager)).map(|key| key.fingerprint());
-        let Some(key) = key else { return self.failed(&Job::Keep(manager, tagged)) };
+        let Some(key) = key else { return Written::Failed(Job::Keep(manager, tagged)) };
         let obeyed = KeptObeyed { manager: manager.clone(), tagged, key };
         if kept.obeyed.contains(&obeyed) {
-            return self.hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
+            hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
+            return Written::Nothing;
         }
         kept.obeyed.retain(|obeyed| obeyed.manager != manager);
         kept.obeyed.push(obeyed);
-        match self.store(&kept) {
-            Ok(()) => {
-                tracing::info!(claim = %tagged.claim, manager = manager.name(), "a claim is obeyed, and stored");
-                lock(&self.claims.writer).kept = kept;
-                self.hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
-                self.links.look_at_orders();
-            }
-            Err(error) => {
-                tracing::error!(%error, "a claim cannot be stored");
-                self.failed(&Job::Keep(manager, tagged));
-            }
+        if let Err(error) = self.store(hub, &kept) {
+            tracing::error!(%error, "a claim cannot be stored");
+            return Written::Failed(Job::Keep(manager, tagged));
         }
+        tracing::info!(claim = %tagged.claim, manager = manager.name(), "a claim is obeyed, and stored");
+        lock(&self.writer).kept = kept;
+        hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
+        Written::Obeyed
     }
 
-    /// The raised claim is stored: it counts, and all peers hear of it.
-    fn raised(&self, kept: KeptClaims) {
-        let claim = kept.own;
-        tracing::warn!(%claim, "no other manager of this identity answers: its claim is raised above the one that vehicles obeyed");
-        lock(&self.claims.writer).kept = kept;
-        self.announce_claim(claim);
-        self.notify(UnitEvent::Raised { claim });
-        self.broadcast();
+    /// The unit steps down; whether it does so already.
+    pub(super) fn step_down(&self) -> bool {
+        std::mem::replace(&mut lock(&self.writer).ends, true)
     }
 
-    /// Tells all peers this manager's claim, with a tag of the keys as they are now.
-    pub(super) fn announce_claim(&self, claim: Claim) {
-        let (identity, _) = self.hub.lock().identity();
-        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
-        self.hub.lock().hub.node.set_claim(tagged);
-        for link in self.links.all() {
-            let mut state = link.lock();
-            self.with(&link, &mut state, |session, cx| session.announce_claim(cx));
-            self.settle(&link, state);
-        }
+    /// It does not after all.
+    pub(super) fn stay(&self) {
+        lock(&self.writer).ends = false;
     }
 
-    /// A live manager of this identity has a higher claim. Stopping ends the links, and with them all that this one ordered. What
-    /// was heard is stored, so that the next start claims above it.
-    fn step_down(&self, claim: Claim) {
-        if std::mem::replace(&mut lock(&self.claims.writer).ends, true) {
-            return;
-        }
-        tracing::error!(%claim, "another manager of this name and id commands with a higher claim: this one steps down");
-        let Some(me) = self.me.upgrade() else { return };
-        // A thread of the unit would wait for itself.
-        let stop = move || {
-            me.stop();
-            // Before the application hears of it and ends; a hung disk does not keep it from ending.
-            me.leave_to_writer(Job::Heard(claim));
-            let until = Instant::now() + STORING;
-            while lock(&me.claims.writer).runs && Instant::now() < until {
-                std::thread::sleep(LOOK);
-            }
-            me.notify(UnitEvent::Fenced { claim });
-        };
-        if let Err(error) = std::thread::Builder::new().name("cara-fenced".into()).spawn(stop) {
-            tracing::error!(%error, "no thread is left to step down with: tries again when the other one is heard again");
-            lock(&self.claims.writer).ends = false;
+    /// Waits until everything is written, but not for a hung disk.
+    pub(super) fn await_writer(&self) {
+        let until = Instant::now() + STORING;
+        while lock(&self.writer).runs && Instant::now() < until {
+            std::thread::sleep(LOOK);
         }
     }
 }

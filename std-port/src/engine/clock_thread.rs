@@ -2,6 +2,7 @@
 //! hooks, never sleeps, and looks at no file: [`look_around`](crate::threads::Driven::look_around) has a thread of its own.
 
 use cara_core::distribution::claim::Claim;
+use cara_core::distribution::connection_handler::ClaimEvent;
 use cara_core::distribution::datagram;
 use cara_core::distribution::identity::Role;
 use cara_core::time::Instant;
@@ -9,6 +10,7 @@ use core::net::SocketAddr;
 use std::sync::Arc;
 
 use super::Engine;
+use super::claims::{Job, Written};
 use super::link::LinkCell;
 use super::worker::Worker;
 use crate::event::UnitEvent;
@@ -141,6 +143,81 @@ impl<T: Send + 'static> Engine<T> {
                 self.with(&link, &mut state, |session, cx| session.revoke(cx));
             }
             self.settle(&link, state);
+        }
+    }
+
+    /// Does what the node wants done about claims.
+    pub(super) fn look_at_claims(&self) {
+        loop {
+            let event = self.hub.lock().hub.node.take_claim_event();
+            match event {
+                None => return,
+                Some(ClaimEvent::Keep(manager, tagged)) => self.leave_to_writer(Job::Keep(manager, tagged)),
+                Some(ClaimEvent::Raise(above)) => self.leave_to_writer(Job::Raise(above)),
+                Some(ClaimEvent::Unkept(peer, claim)) => {
+                    tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored");
+                    self.notify(UnitEvent::ClaimNotKept { peer, claim });
+                }
+                Some(ClaimEvent::StepDown(by)) => self.step_down(by.claim),
+                Some(event) => tracing::debug!(?event, "not understood"),
+            }
+        }
+    }
+
+    fn leave_to_writer(&self, job: Job) {
+        let Some(me) = self.me.upgrade() else { return };
+        let write = move || {
+            while let Some(written) = me.claims.write_next(&me.hub, me.keys()) {
+                me.claim_written(written);
+            }
+        };
+        self.claims.leave_to_writer(job, write).into_iter().for_each(|job| self.claim_written(Written::Failed(job)));
+    }
+
+    fn claim_written(&self, written: Written) {
+        match written {
+            Written::Failed(Job::Keep(manager, tagged)) => {
+                self.hub.lock().hub.node.claim_kept(&manager, tagged.claim, false);
+                self.driver.wake();
+            }
+            Written::Obeyed => self.links.look_at_orders(),
+            Written::Raised(claim) => {
+                tracing::warn!(%claim, "no other manager of this identity answers: its claim is raised above the one that vehicles obeyed");
+                self.announce_claim(claim);
+                self.notify(UnitEvent::Raised { claim });
+                self.broadcast();
+            }
+            Written::Failed(_) | Written::Nothing => {}
+        }
+    }
+
+    /// Tells all peers this manager's claim, with a tag of the keys as they are now.
+    fn announce_claim(&self, claim: Claim) {
+        let (identity, _) = self.hub.lock().identity();
+        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
+        self.hub.lock().hub.node.set_claim(tagged);
+        self.on_each_link(|session, cx| session.announce_claim(cx));
+    }
+
+    /// A live manager of this identity has a higher claim. Stopping ends the links, and with them all that this one ordered. What
+    /// was heard is stored, so that the next start claims above it.
+    fn step_down(&self, claim: Claim) {
+        if self.claims.step_down() {
+            return;
+        }
+        tracing::error!(%claim, "another manager of this name and id commands with a higher claim: this one steps down");
+        let Some(me) = self.me.upgrade() else { return };
+        // A thread of the unit would wait for itself.
+        let stop = move || {
+            me.stop();
+            // Before the application hears of it and ends.
+            me.leave_to_writer(Job::Heard(claim));
+            me.claims.await_writer();
+            me.notify(UnitEvent::Fenced { claim });
+        };
+        if let Err(error) = std::thread::Builder::new().name("cara-fenced".into()).spawn(stop) {
+            tracing::error!(%error, "no thread is left to step down with: tries again when the other one is heard again");
+            self.claims.stay();
         }
     }
 }

@@ -320,11 +320,9 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
         let (slot, _) = self.services.functions_mut().remove(name)?;
         self.hub.lock().hub.publications.withdraw(slot);
-        for link in self.links.all() {
-            let mut state = link.lock();
-            self.with(&link, &mut state, |session, cx| session.withdraw(cx, slot));
-            self.settle(&link, state);
-        }
+        self.on_each_link(|session, cx| {
+            session.withdraw(cx, slot);
+        });
         Ok(())
     }
 

@@ -36,8 +36,6 @@ mod interfaces;
 mod keys;
 pub(crate) mod link;
 mod links;
-#[cfg(feature = "async")]
-mod looking;
 mod membership;
 pub(crate) mod notices;
 mod noting;
@@ -48,6 +46,7 @@ mod presence;
 pub(crate) mod reader;
 mod reading;
 mod roster;
+pub(crate) mod served;
 mod services;
 mod serving;
 mod settling;
@@ -75,9 +74,11 @@ pub(crate) use driving::Alarm;
 pub(crate) use events::Delivered;
 pub(crate) use hub::HubCell;
 pub(crate) use keys::Keys;
+#[cfg(feature = "async")]
+pub(crate) use pinging::Turn;
 pub(crate) use tables::node_storage;
 #[cfg(feature = "async")]
-pub(crate) use tasks::{GivenUp, Spawned};
+pub(crate) use tasks::Spawned;
 pub(crate) use worker::{arena, arena_bytes, room};
 
 use std::path::PathBuf;
@@ -87,7 +88,6 @@ use std::sync::{Arc, Mutex, Weak};
 use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::claim::Claim;
 use cara_core::distribution::function_list::FunctionList;
-use cara_core::distribution::hello::ClaimReport;
 use cara_core::distribution::identity::Fleet;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::secure::Seal;
@@ -115,7 +115,6 @@ use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Listener;
 use crate::threads::Threads;
-use claims::TakeOver;
 use driving::Driver;
 use events::Events;
 use hub::{HubDoor, SharedHub};
@@ -145,7 +144,7 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) pool: MessagePool,
     pub(crate) key_watch: KeyWatch,
     pub(crate) guard: access::Guard,
-    claims: claims::Claims,
+    pub(crate) claims: claims::Claims,
     pub(crate) latch: Keeper,
     pub(crate) accounts: accounts::Accounts,
     notes: Notes,
@@ -267,6 +266,23 @@ impl<T: Send + 'static> Engine<T> {
         act(session, &mut cx)
     }
 
+    /// Has the session of a link do something, and acts on what happens.
+    pub(crate) fn on_link<R>(
+        &self,
+        link: &Arc<LinkCell>,
+        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
+    ) -> R {
+        let mut state = link.lock();
+        let result = self.with(link, &mut state, act);
+        self.settle(link, state);
+        result
+    }
+
+    /// The same on every link, one after the other.
+    pub(crate) fn on_each_link(&self, mut act: impl FnMut(&mut Session<Linux>, &mut Context<'_, Linux>)) {
+        self.links.all().iter().for_each(|link| self.on_link(link, &mut act));
+    }
+
     /// Tells subscribers.
     pub(crate) fn notify(&self, event: UnitEvent) {
         self.events.notify(&event);
@@ -336,9 +352,7 @@ impl<T: Send + 'static> Engine<T> {
         let unit = *self.hub.lock().hub.node.constraints();
         peer.set_constraints(unit, constraints)?;
         if let Some(link) = peer.link() {
-            let mut state = link.lock();
-            self.with(&link, &mut state, |session, cx| session.set_constraints(cx, constraints));
-            self.settle(&link, state);
+            self.on_link(&link, |session, cx| session.set_constraints(cx, constraints));
         }
         Ok(())
     }
@@ -387,14 +401,14 @@ impl<T: Send + 'static> Engine<T> {
             None
         };
         if let Some((at, report)) = &running {
-            self.may_start_beside(*at, report.as_ref())?;
+            self.claims.may_start_beside(&self.hub, *at, report.as_ref())?;
         }
-        let takes_over = self.claims.take_over != TakeOver::No;
-        if let Some(path) = (self.driver.asks_for_itself && !takes_over).then(holds).flatten() {
+        if let Some(path) = (self.driver.asks_for_itself && !self.claims.takes_over()).then(holds).flatten() {
             let (identity, fleet) = self.hub.lock().identity();
             return Err(StartError::SocketHeld { identity, fleet, path });
         }
-        self.claim(running.and_then(|(_, report)| report).map_or(Claim::NONE, |report: ClaimReport| report.claim()))?;
+        let heard = running.and_then(|(_, report)| report).map_or(Claim::NONE, |report| report.claim());
+        self.claims.claim(&self.hub, self.keys(), self.driver.clock(), heard)?;
         self.driver.start(self.clone(), &self.sockets)?;
         self.warn_of_plain_mode();
         self.driver.wake_looker();
@@ -428,11 +442,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         // Those that wait for a node wait in vain.
         self.news.add();
-        for link in self.links.all() {
-            let mut state = link.lock();
-            self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::StoppedHere));
-            self.settle(&link, state);
-        }
+        self.on_each_link(|session, cx| session.close(cx, CloseReason::StoppedHere));
         self.services.state.stop();
         self.services.go_on_with_parked();
         // Dropped at the end, when no thread of the unit is left.

@@ -1,69 +1,57 @@
-//! Round trips of the protocol itself.
-
-use std::sync::Arc;
+//! Turns to measure round trips of the protocol itself: a link has one ping at a time.
 
 use cara_core::error::Error;
-use cara_core::time::{Duration, Instant};
+use cara_core::time::Instant;
 
-use super::Engine;
 use super::link::{LinkCell, LinkState};
-use super::reader::Cause;
+use crate::clock::Clock;
 use crate::locks::Locked;
 
-impl<T: Send + 'static> Engine<T> {
-    /// Asks for a sign of life and returns how long it took. Of several callers on a link each has its turn.
-    pub(crate) fn ping(&self, link: &Arc<LinkCell>, timeout: Duration) -> Result<Duration, Error> {
-        let deadline = self.now() + timeout;
+/// This caller's turn to ping.
+pub(crate) struct Turn<'l>(&'l LinkCell);
+
+impl<'l> Turn<'l> {
+    /// Each of several callers on a link has its turn.
+    pub(super) fn wait(
+        link: &'l LinkCell,
+        clock: Clock,
+        deadline: Instant,
+    ) -> Result<(Self, Locked<'l, LinkState>), Error> {
         let mut state = link.lock();
         while state.pinging {
-            state = self.wait(link, state, deadline)?;
+            state = wait(link, state, clock, deadline)?;
         }
         state.pinging = true;
-        let took = self.round_trip(link, state, deadline);
-        link.lock().pinging = false;
-        link.notify();
-        took
+        Ok((Self(link), state))
     }
 
-    fn round_trip<'l>(
-        &self,
-        link: &'l Arc<LinkCell>,
-        mut state: Locked<'l, LinkState>,
-        deadline: Instant,
-    ) -> Result<Duration, Error> {
-        // A link that is kept is read by no thread until its caller is back.
-        self.links.read_by(self.now(), link, &mut state, Cause::NeedsPool);
-        loop {
-            match self.with(link, &mut state, |session, cx| session.ping(cx)) {
-                Ok(()) => break,
-                Err(Error::Full(_)) => state = self.wait(link, state, deadline)?,
-                Err(error) => return Err(error),
-            }
-        }
-        self.settle(link, state);
-        state = link.lock();
-        loop {
-            if let Some(took) = state.session.round_trip() {
-                return Ok(took);
-            }
-            state = self.wait(link, state, deadline)?;
-        }
+    /// Unless another caller has it. The link is locked: no turn is made that would be dropped here.
+    #[cfg(feature = "async")]
+    pub(crate) fn take(link: &'l LinkCell, state: &mut LinkState) -> Option<Self> {
+        (!std::mem::replace(&mut state.pinging, true)).then(|| Self(link))
     }
+}
 
-    /// Waits until something has happened on the link.
-    fn wait<'l>(
-        &self,
-        link: &'l LinkCell,
-        state: Locked<'l, LinkState>,
-        deadline: Instant,
-    ) -> Result<Locked<'l, LinkState>, Error> {
-        if !state.session.is_live() {
-            return Err(Error::NotConnected);
-        }
-        let now = self.now();
-        if now >= deadline {
-            return Err(Error::TimedOut);
-        }
-        Ok(state.wait(&link.room, deadline.since(now)))
+impl Drop for Turn<'_> {
+    fn drop(&mut self) {
+        self.0.lock().pinging = false;
+        self.0.notify();
     }
+}
+
+/// Waits until something has happened on the link.
+pub(super) fn wait<'l>(
+    link: &'l LinkCell,
+    state: Locked<'l, LinkState>,
+    clock: Clock,
+    deadline: Instant,
+) -> Result<Locked<'l, LinkState>, Error> {
+    if !state.session.is_live() {
+        return Err(Error::NotConnected);
+    }
+    let now = clock.now();
+    if now >= deadline {
+        return Err(Error::TimedOut);
+    }
+    Ok(state.wait(&link.room, deadline.since(now)))
 }

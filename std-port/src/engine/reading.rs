@@ -15,7 +15,7 @@ use crate::sys::epoll::{Interest, Trigger};
 
 impl Links {
     /// Something happens that may change which thread reads the link. The token, if the thread that asked for it gets it.
-    pub(super) fn read_by(&self, now: Instant, link: &LinkCell, state: &mut LinkState, cause: Cause) -> Option<Token> {
+    pub(crate) fn read_by(&self, now: Instant, link: &LinkCell, state: &mut LinkState, cause: Cause) -> Option<Token> {
         let duties = state.reading.on(now, cause);
         if let Some(id) = duties.wake {
             state.wake(id);

@@ -7,12 +7,13 @@ use cara_core::config::Priority;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
+use cara_core::services::Ticket;
 use cara_core::services::session::Incoming;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
-use super::details;
 use super::link::{LinkCell, LinkState};
+use super::served::{self, Reports, Serving};
 use super::services::Parked;
 use super::state_gate::{Entered, Turn};
 #[cfg(feature = "async")]
@@ -181,7 +182,7 @@ impl<T: Send + 'static> Engine<T> {
         self.services.go_on_with_parked();
         let now = self.now();
         // A call that waited for its turn may be late, and its caller may be gone.
-        let is_over = now >= call.deadline || self.serving(&link, call.ticket).is_cancelled();
+        let is_over = now >= call.deadline || Serving::new(self.me.clone(), &link, call.ticket).is_cancelled();
         let result = if is_over { Err(Error::Expired) } else { turn.map(drop) };
         let own = std::mem::replace(&mut worker.arguments, arguments);
         let state = match result {
@@ -257,7 +258,7 @@ impl<T: Send + 'static> Engine<T> {
             deadline: call.deadline,
             wants_reply: call.wants_reply,
             lease: moved.map(|(actuator, order)| LeaseWatch::of(order, actuator)),
-            serving: self.serving(link, call.ticket),
+            serving: Serving::new(self.me.clone(), link, call.ticket),
             #[cfg(feature = "async")]
             given_up: None,
         };
@@ -281,7 +282,7 @@ impl<T: Send + 'static> Engine<T> {
                 Err(error) => Err(error),
             };
             let kept = self.with_at(now, link, &mut state, |session, cx| {
-                details::answer(session, cx, call.ticket, answer, failure.as_deref())
+                served::answer(session, cx, call.ticket, answer, failure.as_deref())
             });
             if kept.is_ok() {
                 return state;
@@ -295,6 +296,15 @@ impl<T: Send + 'static> Engine<T> {
             state = state.wait(&link.room, PAUSE);
             now = self.now();
         }
+    }
+}
+
+impl<T: Send + 'static> Reports for Engine<T> {
+    fn notify(&self, link: &Arc<LinkCell>, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
+        let mut state = link.lock();
+        let reported = self.send_progress(self.now(), link, &mut state, ticket, values);
+        self.settle(link, state);
+        reported
     }
 }
 

@@ -4,7 +4,9 @@
 use std::sync::Arc;
 use std::task::Waker;
 
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
+use cara_core::services::Ticket;
 use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 
@@ -34,7 +36,10 @@ impl<T: Send + 'static> Engine<T> {
             deadline = state.session.deadline();
         }
         if state.details.has_progress_to_send() {
-            self.notify_again(now, link, state);
+            for (ticket, values) in state.details.take_progress() {
+                // What is wrong with it was told when it was new.
+                let _ = self.send_progress(now, link, state, ticket, &values);
+            }
             deadline = state.session.deadline();
         }
         self.set_timer(now, deadline, link, state);
@@ -46,6 +51,19 @@ impl<T: Send + 'static> Engine<T> {
             drop(guard);
         }
         woken.into_iter().for_each(Waker::wake);
+    }
+
+    /// Tells the peer how far its call is, or keeps that until there is room for it.
+    pub(super) fn send_progress(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        state: &mut LinkState,
+        ticket: Ticket,
+        values: &ParametersView,
+    ) -> Result<(), Error> {
+        let reported = self.with_at(now, link, state, |session, cx| session.progress(cx, ticket, values));
+        state.details.keep_progress(ticket, values, reported)
     }
 
     pub(super) fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {

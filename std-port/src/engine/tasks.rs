@@ -15,9 +15,9 @@ use cara_core::services::session::Incoming;
 
 use super::Engine;
 use super::calling::PAUSE;
-use super::details;
 use super::driving::Alarm;
 use super::link::LinkCell;
+use super::served::{self, GivenUp};
 use crate::executor::Executor;
 use crate::handler::{self, Begin, Work};
 use crate::lease::LeaseEnded;
@@ -176,7 +176,7 @@ impl<T: Send + 'static> Task<T> {
         }
         let failure = self.failure.as_deref();
         let kept =
-            engine.with_at(now, link, &mut state, |session, cx| details::answer(session, cx, ticket, answer, failure));
+            engine.with_at(now, link, &mut state, |session, cx| served::answer(session, cx, ticket, answer, failure));
         match waker.filter(|_| kept.is_err() && now < self.call.deadline) {
             Some(waker) => {
                 state.await_change(waker);
@@ -221,31 +221,6 @@ impl<T: Send + 'static> Drop for Task<T> {
     }
 }
 
-/// Whether the call of a handler is given up, for whatever awaits it.
-#[derive(Debug, Default)]
-pub(crate) struct GivenUp(Mutex<(bool, Vec<Waker>)>);
-
-impl GivenUp {
-    fn notify(&self) {
-        let mut state = lock(&self.0);
-        state.0 = true;
-        let tasks = std::mem::take(&mut state.1);
-        drop(state);
-        tasks.into_iter().for_each(Waker::wake);
-    }
-
-    pub(crate) fn poll(&self, cx: &Context<'_>) -> Poll<()> {
-        let mut state = lock(&self.0);
-        if state.0 {
-            return Poll::Ready(());
-        }
-        if !state.1.iter().any(|task| task.will_wake(cx.waker())) {
-            state.1.push(cx.waker().clone());
-        }
-        Poll::Pending
-    }
-}
-
 /// A task that the unit's own thread runs.
 struct OwnTask {
     work: Mutex<Option<Spawned>>,
@@ -277,19 +252,5 @@ impl Wake for OwnTask {
             let task = self.clone();
             self.executor.run(move || task.poll());
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_awaits_the_end_of_a_call_is_woken_and_late_comers_see_it_at_once() {
-        let given_up = GivenUp::default();
-        let cx = Context::from_waker(Waker::noop());
-        assert!(given_up.poll(&cx).is_pending());
-        given_up.notify();
-        assert!(given_up.poll(&cx).is_ready());
     }
 }
