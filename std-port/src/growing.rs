@@ -8,7 +8,7 @@ use cara_core::distribution::parameters::{ListWriter, Parameters, ParametersView
 use cara_core::error::{Error, Limit};
 use cara_core::typed::Variables;
 
-use crate::engine::{arena_bytes, room};
+use crate::engine::worker::{arena_bytes, room};
 
 /// Bytes of names and values that [`GrowingParameters`] may have.
 const MOST: usize = arena_bytes(usize::MAX);

@@ -18,7 +18,8 @@ use cara_core::typed::{AnyCall, Free, Functions, Interface, Method};
 
 use crate::actuator::Actuator;
 use crate::engine::details::Canceller;
-use crate::engine::{Answered, Pending, room};
+use crate::engine::worker::room;
+use crate::engine::{Answered, Pending};
 use crate::error::{BoxedDetail, CallError};
 use crate::handler::{IntoHandler, Served, ServiceOptions};
 use crate::heart::Hold;

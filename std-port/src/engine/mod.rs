@@ -1,18 +1,20 @@
 //! What a unit's threads share, and the few ways in which they touch a link.
 //!
-//! Each part owns its state and its locks, and knows nothing of the others; the [`Engine`] joins them. Around it stand the
-//! things that happen, a module each, which see all parts. From below:
+//! Each part owns its state and its locks, is given the other parts that it needs, and returns what happened. It knows
+//! nothing of what is built on it. From below:
 //!
 //! | modules | what |
 //! |---|---|
-//! | `reader`, `watch`, `notices`, `worker`, `state_gate` | state machines and memory, without any link |
-//! | `link`, `peers`, `roster`, `links` | a link and its session, the nodes, the tables of both |
-//! | `keys`, `access`, `events`, `sockets`, `services`, `driving` | the other parts |
-//! | `Engine` | all of them |
-//! | `reading`, `inbound`, `settling` | what every thread does with a link that it has locked |
-//! | `calling`, `awaiting`, `alarms`, `looking`, `pinging`, `workers`, `staying`, `serving`, `tasks`, `afterwards` | requests of this unit, and those of its peers |
-//! | `streams` | values that this unit publishes, and those that it reads |
-//! | `membership`, `tables`, `clock_thread`, `presence`, `interfaces`, `accounts` | the node and its links, the clock, counters |
+//! | `reader`, `watch`, `notices`, `details`, `streams`, `worker`, `state_gate`, `alarms`, `events` | state machines and memory, without any link |
+//! | `link`, `peer_cell`, `roster`, `pinging`, `served` | a link and its session, a node, a call as its handler has it |
+//! | `sockets`, `driving`, `hub`, `keys`, `peers`, `links` | sockets, threads and clock, the node, its keys, all nodes and all links |
+//! | `reading`, `tables`, `interfaces`, `presence`, `claims`, `access`, `noting`, `accounts` | what is decided and counted with those |
+//! | `afterwards`, `tasks`, `services` | functions, and whatever runs with the application's state |
+//! | [`Engine`] | joins the parts, lends a session what it needs, and acts on what the parts return |
+//! | `settling`, `inbound` | its methods for a link that a thread has locked |
+//! | `calling`, `serving`, `workers` | for requests of this unit, those of its peers, and the threads of the pool |
+//! | `membership`, `clock_thread` | for links that come and go, and for the thread that keeps time |
+//! | `awaiting` | calls that are futures: built on all of it, as the handles are |
 //!
 //! Locks are taken in the order of [`Rank`](crate::locks::Rank), which a debug build asserts: the accounts, the table of
 //! links, a link, the functions, the node, then any other; never two links. Handlers, hooks and subscribers run without
@@ -52,7 +54,6 @@ mod serving;
 mod settling;
 mod sockets;
 mod state_gate;
-mod staying;
 pub(crate) mod streams;
 mod tables;
 #[cfg(feature = "async")]
@@ -79,7 +80,7 @@ pub(crate) use pinging::Turn;
 pub(crate) use tables::node_storage;
 #[cfg(feature = "async")]
 pub(crate) use tasks::Spawned;
-pub(crate) use worker::{arena, arena_bytes, room};
+pub(crate) use worker::{arena, arena_bytes};
 
 use std::path::PathBuf;
 use std::sync::atomic;

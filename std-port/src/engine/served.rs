@@ -10,26 +10,15 @@ use std::task::{self, Poll, Waker};
 use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::services::session::Session;
-use cara_core::services::{Context, Ticket};
+use cara_core::services::Ticket;
+use cara_core::time::{Duration, Instant};
 
-use super::link::{LinkCell, Linux};
+use super::link::{LinkCell, LinkState};
 #[cfg(feature = "async")]
-use crate::locks::lock;
+use crate::locks::{Locked, lock};
 
-/// Answers a call, with what its handler has said of its failure.
-pub(super) fn answer(
-    session: &mut Session<Linux>,
-    cx: &mut Context<'_, Linux>,
-    ticket: Ticket,
-    result: Result<&ParametersView, Error>,
-    failure: Option<&Failure>,
-) -> Result<(), Error> {
-    match (result, failure) {
-        (Err(error), Some(failure)) if error == failure.into() => session.answer_failed(cx, ticket, failure),
-        _ => session.answer(cx, ticket, result),
-    }
-}
+/// How long an answer waits for room at a time.
+pub(super) const PAUSE: Duration = Duration::from_millis(20);
 
 /// A call of a peer, for its handler.
 #[derive(Clone)]
@@ -47,7 +36,21 @@ impl fmt::Debug for Serving {
 
 /// The engine, whatever the application's state is.
 pub(super) trait Reports: Send + Sync {
+    /// Tells the caller how far its call is.
     fn notify(&self, link: &Arc<LinkCell>, ticket: Ticket, values: &ParametersView) -> Result<(), Error>;
+    /// Answers a call, with what its handler has said of its failure, unless there is no room for that now.
+    fn try_answer(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        state: &mut LinkState,
+        ticket: Ticket,
+        result: Result<&ParametersView, Error>,
+        failure: Option<&Failure>,
+    ) -> Result<(), Error>;
+    /// Gives the lock of a link up, and acts on what happened under it.
+    #[cfg(feature = "async")]
+    fn give_up_lock<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, state: Locked<'l, LinkState>);
 }
 
 impl Serving {
@@ -106,7 +109,8 @@ impl GivenUp {
     }
 }
 
-#[cfg(all(test, feature = "async"))]
+#[cfg(test)]
+#[cfg(feature = "async")]
 mod tests {
     use super::*;
 

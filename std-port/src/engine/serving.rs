@@ -4,6 +4,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 use cara_core::config::Priority;
+use cara_core::distribution::failure::Failure;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
@@ -13,7 +14,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
-use super::served::{self, Reports, Serving};
+use super::served::{PAUSE, Reports, Serving};
 use super::services::Parked;
 use super::state_gate::{Entered, Turn};
 #[cfg(feature = "async")]
@@ -23,9 +24,6 @@ use crate::handler::{self, Handler, Run};
 use crate::lease::LeaseWatch;
 use crate::locks::Locked;
 use crate::storage::Boxed;
-
-/// How long an answer waits for room at a time.
-const PAUSE: Duration = Duration::from_millis(20);
 
 /// A call that has begun.
 #[derive(Clone, Copy)]
@@ -89,10 +87,9 @@ impl<T: Send + 'static> Engine<T> {
             #[cfg(feature = "async")]
             Ran::Apart(reported, begin, to_its_end) => {
                 link.lock().reading.ran(self.now().since(began));
-                let engine = self.me.upgrade()?;
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
-                Task::begin(engine, link, started.call, *reported, (&*begin, to_its_end), arguments);
+                self.begin_task(link, started.call, *reported, (&*begin, to_its_end), arguments);
                 return None;
             }
         };
@@ -166,9 +163,23 @@ impl<T: Send + 'static> Engine<T> {
             Ran::NotYet(turn) => engine.services.park(turn, Parked { link, call: started.call, arguments }),
             #[cfg(feature = "async")]
             Ran::Apart(reported, begin, to_its_end) => {
-                Task::begin(engine, &link, started.call, *reported, (&*begin, to_its_end), arguments);
+                engine.begin_task(&link, started.call, *reported, (&*begin, to_its_end), arguments);
             }
         });
+    }
+
+    #[cfg(feature = "async")]
+    fn begin_task(
+        &self,
+        link: &Arc<LinkCell>,
+        call: Incoming,
+        reported: handler::Served,
+        begin: (&handler::Begin, bool),
+        arguments: Box<ParametersView>,
+    ) {
+        let Some(me) = self.me.upgrade() else { return };
+        let task = Task::begin(me, self.driver.clone(), link, call, reported, begin, arguments);
+        self.services.runner.spawn(Box::pin(task));
     }
 
     /// Leaves a link's calls to another thread of the pool.
@@ -281,10 +292,7 @@ impl<T: Send + 'static> Engine<T> {
                 Ok(()) => Ok(results),
                 Err(error) => Err(error),
             };
-            let kept = self.with_at(now, link, &mut state, |session, cx| {
-                served::answer(session, cx, call.ticket, answer, failure.as_deref())
-            });
-            if kept.is_ok() {
+            if self.try_answer(now, link, &mut state, call.ticket, answer, failure.as_deref()).is_ok() {
                 return state;
             }
             if now >= call.deadline {
@@ -305,6 +313,26 @@ impl<T: Send + 'static> Reports for Engine<T> {
         let reported = self.send_progress(self.now(), link, &mut state, ticket, values);
         self.settle(link, state);
         reported
+    }
+
+    fn try_answer(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        state: &mut LinkState,
+        ticket: Ticket,
+        result: Result<&ParametersView, Error>,
+        failure: Option<&Failure>,
+    ) -> Result<(), Error> {
+        self.with_at(now, link, state, |session, cx| match (result, failure) {
+            (Err(error), Some(failure)) if error == failure.into() => session.answer_failed(cx, ticket, failure),
+            _ => session.answer(cx, ticket, result),
+        })
+    }
+
+    #[cfg(feature = "async")]
+    fn give_up_lock<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, state: Locked<'l, LinkState>) {
+        self.settle_at(now, link, state);
     }
 }
 

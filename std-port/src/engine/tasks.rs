@@ -13,11 +13,9 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::Incoming;
 
-use super::Engine;
-use super::calling::PAUSE;
-use super::driving::Alarm;
+use super::driving::{Alarm, Driver};
 use super::link::LinkCell;
-use super::served::{self, GivenUp};
+use super::served::{GivenUp, PAUSE, Reports};
 use crate::executor::Executor;
 use crate::handler::{self, Begin, Work};
 use crate::lease::LeaseEnded;
@@ -53,7 +51,7 @@ impl Runner {
         Ok(())
     }
 
-    fn spawn(&self, task: Spawned) {
+    pub(super) fn spawn(&self, task: Spawned) {
         let spawn = lock(&self.spawn).clone();
         if let Some(spawn) = spawn {
             // A task that the executor does not take is dropped, and so its call is answered.
@@ -76,8 +74,9 @@ impl Runner {
 }
 
 /// One call until it is answered. Dropped before, as by an executor that ends, it is answered as not ready.
-pub(super) struct Task<T: Send + 'static> {
-    engine: Arc<Engine<T>>,
+pub(super) struct Task {
+    unit: Arc<dyn Reports>,
+    driver: Arc<Driver>,
     link: Arc<LinkCell>,
     call: Incoming,
     /// The handler, while it runs.
@@ -94,16 +93,17 @@ pub(super) struct Task<T: Send + 'static> {
     answered: bool,
 }
 
-impl<T: Send + 'static> Task<T> {
-    /// Begins the handler of a call; what it leads to is answered by its task.
+impl Task {
+    /// Begins the handler of a call; what it leads to is answered by the task.
     pub(super) fn begin(
-        engine: Arc<Engine<T>>,
+        unit: Arc<dyn Reports>,
+        driver: Arc<Driver>,
         link: &Arc<LinkCell>,
         call: Incoming,
         reported: handler::Served,
         (begin, to_its_end): (&Begin, bool),
         arguments: Box<ParametersView>,
-    ) {
+    ) -> Self {
         let (lease, given_up) = (reported.lease_ended(), reported.given_up.clone());
         let caller = reported.caller.clone();
         let work = catch_unwind(AssertUnwindSafe(|| begin(reported, arguments)));
@@ -114,12 +114,10 @@ impl<T: Send + 'static> Task<T> {
             Ok(work) => (Some(work), Err(Error::Service(ServiceError::NotReady))),
             Err(_) => (None, Err(Error::Service(ServiceError::Panicked))),
         };
-        let alarm = Alarm::new(engine.driver.clone());
+        let alarm = Alarm::new(driver.clone());
         let link = link.clone();
         let (failure, answered) = (None, false);
-        let services = engine.services.clone();
-        let task = Self { engine, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered };
-        services.runner.spawn(Box::pin(task));
+        Self { unit, driver, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered }
     }
 
     /// Whether nothing wants the call any more: its caller's time is over, its link or its order has ended. Otherwise the
@@ -132,7 +130,7 @@ impl<T: Send + 'static> Task<T> {
         }
         drop(state);
         let waits = self.call.wants_reply;
-        if !is_live || (waits && self.engine.now() >= self.call.deadline) {
+        if !is_live || (waits && self.driver.clock().now() >= self.call.deadline) {
             return true;
         }
         if waits {
@@ -167,20 +165,19 @@ impl<T: Send + 'static> Task<T> {
 
     /// Answers, unless there is no room for it now. Without a waker, or after the deadline, the answer is dropped then.
     fn answer(&mut self, waker: Option<&Waker>) -> Poll<()> {
-        let (engine, link) = (&self.engine, &self.link);
-        let (now, ticket) = (engine.now(), self.call.ticket);
+        let (link, ticket) = (&self.link, self.call.ticket);
+        let now = self.driver.clock().now();
         let answer = self.result.as_deref().map_err(|error| *error);
         let mut state = link.lock();
         if self.failure.is_none() {
             self.failure = state.details.take_failure(ticket);
         }
         let failure = self.failure.as_deref();
-        let kept =
-            engine.with_at(now, link, &mut state, |session, cx| served::answer(session, cx, ticket, answer, failure));
+        let kept = self.unit.try_answer(now, link, &mut state, ticket, answer, failure);
         match waker.filter(|_| kept.is_err() && now < self.call.deadline) {
             Some(waker) => {
                 state.await_change(waker);
-                engine.settle_at(now, link, state);
+                self.unit.give_up_lock(now, link, state);
                 self.alarm.set(self.call.deadline.min(now + PAUSE), waker);
                 Poll::Pending
             }
@@ -190,9 +187,9 @@ impl<T: Send + 'static> Task<T> {
                 }
                 state.await_no_end(ticket);
                 if state.session.has_next_call() {
-                    engine.hand_over(link);
+                    self.driver.pool().hand_over(link.token());
                 }
-                engine.settle_at(now, link, state);
+                self.unit.give_up_lock(now, link, state);
                 self.answered = true;
                 Poll::Ready(())
             }
@@ -200,7 +197,7 @@ impl<T: Send + 'static> Task<T> {
     }
 }
 
-impl<T: Send + 'static> Future for Task<T> {
+impl Future for Task {
     type Output = ();
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
@@ -211,7 +208,7 @@ impl<T: Send + 'static> Future for Task<T> {
     }
 }
 
-impl<T: Send + 'static> Drop for Task<T> {
+impl Drop for Task {
     fn drop(&mut self) {
         if !self.answered {
             // What it holds may be what the call's order is to find free.
