@@ -70,6 +70,6 @@ impl<T: Send + 'static> Unit<T> {
     /// makes safe belongs into the hook of a [lease](crate::ServiceOptions::lease). [`Error::Network`] when the system
     /// refuses the thread that it runs on.
     pub fn on_manager_lost(&self, hook: impl Fn(&mut T) + Send + Sync + 'static) -> Result<(), Error> {
-        self.engine().services.on_lost(Arc::new(hook))
+        self.engine().services.afterwards.on_lost(Arc::new(hook))
     }
 }

@@ -30,7 +30,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// ```
     pub fn events_async(&self) -> EventStream {
         let queue = EventQueue::new(self.events_waiting());
-        self.engine().subscribe_queue(&queue);
+        let engine = self.engine();
+        engine.events.subscribe_queue(&queue);
+        if engine.is_stopping() {
+            engine.events.end_queues();
+        }
         EventStream::new(queue)
     }
 

@@ -11,7 +11,7 @@ use crate::handler::Hook;
 use crate::locks::lock;
 
 /// The thread, once there is a hook, and the hook for the loss of a peer.
-pub(super) struct Afterwards<T> {
+pub(crate) struct Afterwards<T> {
     executor: Mutex<Option<Arc<Executor>>>,
     lost: Mutex<Option<Arc<Pending<T>>>>,
 }
@@ -51,7 +51,7 @@ impl<T> Afterwards<T> {
     }
 
     /// Runs `hook` whenever a peer is lost.
-    pub(super) fn on_lost(&self, hook: Arc<Hook<T>>) -> Result<(), Error> {
+    pub(crate) fn on_lost(&self, hook: Arc<Hook<T>>) -> Result<(), Error> {
         self.start()?;
         *lock(&self.lost) = Some(Pending::new(hook));
         Ok(())

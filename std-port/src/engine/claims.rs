@@ -256,14 +256,9 @@ impl Claims {
         Written::Obeyed
     }
 
-    /// The unit steps down; whether it does so already.
-    pub(super) fn step_down(&self) -> bool {
-        std::mem::replace(&mut lock(&self.writer).ends, true)
-    }
-
-    /// It does not after all.
-    pub(super) fn stay(&self) {
-        lock(&self.writer).ends = false;
+    /// Whether the unit steps down from here on, and whether it did before.
+    pub(super) fn step_down(&self, ends: bool) -> bool {
+        std::mem::replace(&mut lock(&self.writer).ends, ends)
     }
 
     /// Waits until everything is written, but not for a hung disk.

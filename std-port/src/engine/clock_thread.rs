@@ -14,7 +14,6 @@ use super::claims::{Job, Written};
 use super::link::LinkCell;
 use super::worker::Worker;
 use crate::event::UnitEvent;
-use crate::keys::KeyRing;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Ready;
@@ -126,24 +125,20 @@ impl<T: Send + 'static> Engine<T> {
                 cell.hub.node.expect(ring.nodes());
                 cell.hub.node.claim()
             };
-            self.end_links_without_keys(&ring);
+            // A peer that was revoked loses its link.
+            for link in self.links.all() {
+                let mut state = link.lock();
+                if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
+                    self.with(&link, &mut state, |session, cx| session.revoke(cx));
+                }
+                self.settle(&link, state);
+            }
             // Its tag is of the keys before.
             if self.hub.lock().identity().0.role() == Role::MUnit && claim != Claim::NONE {
                 self.announce_claim(claim);
             }
         }
         due
-    }
-
-    /// A peer that was revoked loses its link.
-    fn end_links_without_keys(&self, ring: &KeyRing) {
-        for link in self.links.all() {
-            let mut state = link.lock();
-            if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
-                self.with(&link, &mut state, |session, cx| session.revoke(cx));
-            }
-            self.settle(&link, state);
-        }
     }
 
     /// Does what the node wants done about claims.
@@ -202,7 +197,7 @@ impl<T: Send + 'static> Engine<T> {
     /// A live manager of this identity has a higher claim. Stopping ends the links, and with them all that this one ordered. What
     /// was heard is stored, so that the next start claims above it.
     fn step_down(&self, claim: Claim) {
-        if self.claims.step_down() {
+        if self.claims.step_down(true) {
             return;
         }
         tracing::error!(%claim, "another manager of this name and id commands with a higher claim: this one steps down");
@@ -217,7 +212,7 @@ impl<T: Send + 'static> Engine<T> {
         };
         if let Err(error) = std::thread::Builder::new().name("cara-fenced".into()).spawn(stop) {
             tracing::error!(%error, "no thread is left to step down with: tries again when the other one is heard again");
-            self.claims.stay();
+            self.claims.step_down(false);
         }
     }
 }

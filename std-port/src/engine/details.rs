@@ -17,7 +17,7 @@ pub(crate) struct Details {
     /// What handlers have said of the failures of calls that are not answered yet.
     failures: Vec<(Ticket, Box<Failure>)>,
     /// The newest progress of each call of the peer that could not be sent.
-    progress: Vec<(Ticket, Box<ParametersView>)>,
+    pub(super) progress: Vec<(Ticket, Box<ParametersView>)>,
 }
 
 impl Details {
@@ -25,14 +25,6 @@ impl Details {
         self.progress.retain(|(known, _)| *known != ticket);
         let index = self.failures.iter().position(|(known, _)| *known == ticket)?;
         Some(self.failures.swap_remove(index).1)
-    }
-
-    pub(super) const fn has_progress_to_send(&self) -> bool {
-        !self.progress.is_empty()
-    }
-
-    pub(super) fn take_progress(&mut self) -> Vec<(Ticket, Box<ParametersView>)> {
-        std::mem::take(&mut self.progress)
     }
 
     /// What a handler has said of the failure of a call.

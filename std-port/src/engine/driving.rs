@@ -11,7 +11,6 @@ use super::sockets::Sockets;
 use crate::clock::Clock;
 use crate::error::{StartError, system_refused};
 use crate::locks::lock;
-use crate::sys::datagram::Socket;
 use crate::sys::stream::Listener;
 use crate::threads::{Driven, Source, ThreadPool, Threads};
 
@@ -83,15 +82,8 @@ impl Driver {
         self.pool().start()?;
         let unit_number = self.pool().register(unit)?;
         let _ = self.unit_number.set(unit_number);
-        self.watch(unit_number, sockets).map_err(system_refused)?;
-        Ok(())
-    }
-
-    fn watch(&self, unit_number: u16, sockets: &Sockets) -> std::io::Result<()> {
-        for socket in [Socket::Shared, Socket::Own] {
-            self.pool().watch(unit_number, Source::Datagrams(socket), sockets.datagrams.fd(socket))?;
-        }
-        sockets.listener.as_ref().map_or(Ok(()), |listener| self.pool().watch(unit_number, Source::Listener, listener))
+        let mut watched = sockets.sources().map(|(source, fd)| self.pool().watch(unit_number, source, fd));
+        Ok(watched.try_for_each(|watched| watched).map_err(system_refused)?)
     }
 
     /// Something is to be done now, or the time of the next thing has changed.
@@ -141,12 +133,7 @@ impl Driver {
     /// From here on no thread works for the unit any more, except the one that calls. Then no thread puts a link on the
     /// clock's list, which `clear` empties.
     pub(super) fn release_threads(&self, sockets: &Sockets, clear: impl FnOnce() -> usize) {
-        for socket in [Socket::Shared, Socket::Own] {
-            self.pool().unwatch(sockets.datagrams.fd(socket));
-        }
-        if let Some(listener) = &sockets.listener {
-            self.pool().unwatch(listener);
-        }
+        sockets.sources().for_each(|(_, fd)| self.pool().unwatch(fd));
         if let Some(unit_number) = self.unit_number() {
             self.pool().leave(unit_number);
         }

@@ -65,13 +65,13 @@ impl Events {
     }
 
     #[cfg(feature = "async")]
-    pub(super) fn subscribe_queue(&self, queue: &Arc<EventQueue>) {
+    pub(crate) fn subscribe_queue(&self, queue: &Arc<EventQueue>) {
         Rank::Leaf.lock(&self.subscribers).push(Subscriber::Queue(Arc::downgrade(queue)));
     }
 
     /// No queue is told anything any more, so that its stream ends.
     #[cfg(feature = "async")]
-    pub(super) fn end_queues(&self) {
+    pub(crate) fn end_queues(&self) {
         let mut subscribers = Rank::Leaf.lock(&self.subscribers);
         let queues = subscribers.iter().filter_map(Subscriber::queue).collect::<Vec<_>>();
         subscribers.retain(|subscriber| !matches!(subscriber, Subscriber::Queue(_)));

@@ -22,13 +22,9 @@ pub(crate) struct HubCell {
 }
 
 /// The hub as the threads share it.
-pub(crate) struct SharedHub(Mutex<HubCell>);
+pub(crate) struct SharedHub(pub(super) Mutex<HubCell>);
 
 impl SharedHub {
-    pub(super) fn new(cell: HubCell) -> Self {
-        Self(Mutex::new(cell))
-    }
-
     #[track_caller]
     pub(crate) fn lock(&self) -> Locked<'_, HubCell> {
         Rank::Hub.lock(&self.0)

@@ -234,14 +234,11 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
     fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
-        {
+        let (host, dialed) = {
             let mut state = link.lock();
             // It is not put back.
             state.registration.is_out = false;
             let _ = self.driver.pool().epoll.remove(&link.stream);
-        }
-        let (host, dialed) = {
-            let state = link.lock();
             (state.session.address().ip(), state.session.dialed())
         };
         self.sockets.note_segments(host, dialed, reason);
@@ -347,17 +344,14 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn tell_interval_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
-        let mut state = link.lock();
         // Read under the lock of the link: of two threads the last one tells what holds.
-        let interval = peer.streams.interval(&watched.name);
-        let reported = self.with(link, &mut state, |session, cx| match interval {
+        let reported = self.on_link(link, |session, cx| match peer.streams.interval(&watched.name) {
             Some(interval) => session.subscribe(cx, &watched.name, interval).map(drop),
             None => {
                 session.unsubscribe(cx, &watched.name);
                 Ok(())
             }
         });
-        self.settle(link, state);
         if let Err(error @ Error::UnknownFunction) = reported {
             watched.was_answered(Err(error));
         }

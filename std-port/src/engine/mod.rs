@@ -197,8 +197,8 @@ impl<T: Send + 'static> Engine<T> {
                 parts.state,
                 parts.hub.longest_message(),
             )),
-            hub: SharedHub::new(parts.hub),
-            nodes: Nodes::new(),
+            hub: SharedHub(Mutex::new(parts.hub)),
+            nodes: Nodes::default(),
             pool: parts.pool,
             key_watch: KeyWatch::new(parts.keys, driver.born()),
             driver,
@@ -288,15 +288,6 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn notify(&self, event: UnitEvent) {
         self.events.notify(&event);
         self.news.add();
-    }
-
-    /// Puts into `queue` what happens from here on, until the unit is stopped.
-    #[cfg(feature = "async")]
-    pub(crate) fn subscribe_queue(&self, queue: &Arc<crate::asynchronous::EventQueue>) {
-        self.events.subscribe_queue(queue);
-        if self.is_stopping() {
-            self.events.end_queues();
-        }
     }
 
     /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the process may
@@ -411,19 +402,15 @@ impl<T: Send + 'static> Engine<T> {
         let heard = running.and_then(|(_, report)| report).map_or(Claim::NONE, |report| report.claim());
         self.claims.claim(&self.hub, self.keys(), self.driver.clock(), heard)?;
         self.driver.start(self.clone(), &self.sockets)?;
-        self.warn_of_plain_mode();
-        self.driver.wake_looker();
-        self.driver.wake();
-        Ok(())
-    }
-
-    fn warn_of_plain_mode(&self) {
         if self.keys().mode() == Mode::Plain {
             tracing::warn!(
                 unit = %self.hub.lock().hub.node.identity(), discovery_port = self.sockets.datagrams.discovery_port(),
                 "plain mode, without keys: whoever is on the network can read what this unit says, and speak as any unit"
             );
         }
+        self.driver.wake_looker();
+        self.driver.wake();
+        Ok(())
     }
 
     /// What the unit moves has been stopped, or reset.

@@ -120,13 +120,10 @@ impl Peers {
 }
 
 /// The nodes as the threads share them.
+#[derive(Default)]
 pub(crate) struct Nodes(RwLock<Peers>);
 
 impl Nodes {
-    pub(super) fn new() -> Self {
-        Self(RwLock::new(Peers::default()))
-    }
-
     #[track_caller]
     pub(crate) fn read(&self) -> Held<RwLockReadGuard<'_, Peers>> {
         Rank::Leaf.read(&self.0)

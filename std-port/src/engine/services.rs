@@ -27,7 +27,7 @@ pub(crate) struct Services<T: 'static> {
     driver: Arc<Driver>,
     functions: RwLock<Functions<T>>,
     pub(super) state: StateGate<T, Parked>,
-    afterwards: Afterwards<T>,
+    pub(crate) afterwards: Afterwards<T>,
     #[cfg(feature = "async")]
     pub(crate) runner: Runner,
     /// Longest block of parameters that this unit takes.
@@ -143,11 +143,6 @@ impl<T: Send + 'static> Services<T> {
                 services.run_afterwards(&pending);
             }
         }))
-    }
-
-    /// Runs `hook` whenever a peer is lost.
-    pub(crate) fn on_lost(&self, hook: Arc<Hook<T>>) -> Result<(), Error> {
-        self.afterwards.on_lost(hook)
     }
 
     pub(super) fn run_lost_hook(self: &Arc<Self>) {

@@ -35,8 +35,8 @@ impl<T: Send + 'static> Engine<T> {
             self.poll_session(link, state);
             deadline = state.session.deadline();
         }
-        if state.details.has_progress_to_send() {
-            for (ticket, values) in state.details.take_progress() {
+        if !state.details.progress.is_empty() {
+            for (ticket, values) in std::mem::take(&mut state.details.progress) {
                 // What is wrong with it was told when it was new.
                 let _ = self.send_progress(now, link, state, ticket, &values);
             }

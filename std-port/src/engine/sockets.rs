@@ -2,13 +2,15 @@
 
 use std::collections::HashSet;
 use std::net::IpAddr;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Mutex;
 
 use cara_core::error::CloseReason;
 
 use crate::locks::lock;
-use crate::sys::datagram::Datagrams;
+use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::stream::Listener;
+use crate::threads::Source;
 
 /// Hosts that are remembered for the size of their segments. Beyond them all are forgotten, and found again.
 const SHORTENED: usize = 256;
@@ -23,6 +25,14 @@ pub(crate) struct Sockets {
 impl Sockets {
     pub(super) fn new(datagrams: Datagrams, listener: Option<Listener>) -> Self {
         Self { datagrams, listener, short_segments: Mutex::default() }
+    }
+
+    /// All of them, as the clock watches them.
+    pub(super) fn sources(&self) -> impl Iterator<Item = (Source, BorrowedFd<'_>)> {
+        let datagrams =
+            [Socket::Shared, Socket::Own].map(|socket| (Source::Datagrams(socket), self.datagrams.fd(socket)));
+        let listener = self.listener.iter().map(|listener| (Source::Listener, listener.as_fd()));
+        datagrams.into_iter().chain(listener)
     }
 
     /// Where the unit takes connections; 0 for nowhere.
