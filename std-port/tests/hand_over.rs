@@ -386,7 +386,7 @@ impl Link {
         self.leave(self.lock(), Some(token));
     }
 
-    /// `Engine::watch_links`: the clock looks when it is told to, and until it finds nothing on its list.
+    /// `Links::look`: the clock looks when it is told to, and until it finds nothing on its list.
     fn clock(&self) {
         let mut state = self.lock();
         loop {
@@ -689,7 +689,7 @@ impl Pool {
         }
     }
 
-    /// `Engine::watch_links`: looks when it is told to, and until it finds that nothing has happened.
+    /// `Links::look`: looks when it is told to, and until it finds that nothing has happened.
     fn clock(&self) {
         let mut flags = self.flags.lock().unwrap();
         while !flags.released {
