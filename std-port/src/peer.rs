@@ -160,6 +160,12 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.left().map(|(ago, reason)| (ago.into(), reason))
     }
 
+    /// How long ago the node was heard searching for this unit, and from where, while it is not connected and if that was after it
+    /// left. `None` also where it was told this unit's address: it dials, and does not search.
+    pub fn searched(&self) -> Option<(Duration, SocketAddr)> {
+        self.cell.searched().map(|(ago, from)| (ago.into(), from))
+    }
+
     /// The claim of the manager of this unit's name that it obeys instead, and where the node is: it refuses this unit until this one's
     /// claim is the higher one. `None` otherwise.
     pub fn under(&self) -> Option<(Claim, SocketAddr)> {

@@ -173,7 +173,7 @@ mod tests {
         let (role, functions) = ("s_unit".into(), 0);
         let name = name.into();
         let (address, version, epoch, connected_ms, limits, link) = (None, None, None, None, None, None);
-        let (left_ms, left_reason, left_text) = (None, None, None);
+        let (left_ms, left_reason, left_text, searched_ms, searched_from) = (None, None, None, None, None);
         NodeInfo {
             name,
             id,
@@ -187,6 +187,8 @@ mod tests {
             left_ms,
             left_reason,
             left_text,
+            searched_ms,
+            searched_from,
             limits,
             link,
             functions,

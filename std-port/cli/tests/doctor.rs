@@ -3,6 +3,8 @@
 
 #[path = "doctor/datagrams.rs"]
 mod datagrams;
+#[path = "doctor/joining.rs"]
+mod joining;
 #[path = "doctor/namespace.rs"]
 mod namespace;
 #[path = "doctor/secured.rs"]

@@ -54,7 +54,7 @@ fn interface(interface: &Interface) -> InterfaceInfo {
 }
 
 pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInfo {
-    let (limits, left) = (peer.limits(), peer.left());
+    let (limits, left, searched) = (peer.limits(), peer.left(), peer.searched());
     let under = under(peer);
     NodeInfo {
         name: peer.name().to_owned(),
@@ -69,6 +69,8 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInf
         left_ms: left.map(|(ago, _)| ago.as_millis()),
         left_reason: under.as_ref().map(|_| name_of(&Refusal::Fenced)).or(left.map(|(_, reason)| name_of(&reason))),
         left_text: under.or(left.map(|(_, reason)| reason.to_string())),
+        searched_ms: searched.map(|(ago, _)| ago.as_millis()),
+        searched_from: searched.map(|(_, from)| from.to_string()),
         limits: limits.map(self::limits),
         link: peer.link_info(),
         functions: peer.their_function_list().len(),

@@ -489,6 +489,13 @@ pub struct NodeInfo {
     /// Likewise in words.
     #[serde(default)]
     pub left_text: Option<String>,
+    /// How long ago it was heard searching for this unit, while it is not connected and if that was after it left. Why it was not
+    /// taken stands in [`Answer::Refused`], where it is known.
+    #[serde(default)]
+    pub searched_ms: Option<u64>,
+    /// From where.
+    #[serde(default)]
+    pub searched_from: Option<String>,
     /// What it takes, while it is connected.
     pub limits: Option<LimitsInfo>,
     /// Its link, while it is connected; absent where the unit is older than this.

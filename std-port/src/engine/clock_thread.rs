@@ -66,11 +66,15 @@ impl<T: Send + 'static> Engine<T> {
             return self.session_datagram(&link, from, nonce, body);
         }
         let codes = self.keys().codes();
-        let duplicate = {
+        let (duplicate, seeker) = {
             let mut cell = self.hub.lock();
             cell.hub.node.datagram(self.now(), from, bytes, &codes);
-            cell.hub.node.take_duplicate()
+            let seeker = cell.hub.node.asked_by().map(|(who, from)| (who.clone(), from));
+            (cell.hub.node.take_duplicate(), seeker)
         };
+        if let Some((who, from)) = seeker {
+            self.nodes.heard_searching(self.keys(), &who, from);
+        }
         if let Some(address) = duplicate {
             self.duplicate_heard(address);
         }
@@ -238,7 +242,8 @@ impl<T: Send + 'static> Driven for Engine<T> {
         if let Some(up) = up {
             self.notify(UnitEvent::NetworkChanged { up });
         }
-        interfaces.min(self.watch_keys())
+        let unjoined = self.unjoined.warn(self.now(), &self.hub, self.sockets.datagrams.discovery_port());
+        interfaces.min(self.watch_keys()).min(unjoined)
     }
 
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {

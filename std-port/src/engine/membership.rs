@@ -126,7 +126,8 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
-        let stream = Stream::connect(to, self.sockets.shortens(to.ip())).ok();
+        let stream = Stream::connect(to, self.sockets.shortens(to.ip()));
+        let stream = stream.map_err(|errno| self.unjoined.dial_ended(Some(errno.into()))).ok();
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
             self.hub.lock().hub.node.dial_failed(self.now(), identity);
             let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
@@ -247,6 +248,7 @@ impl<T: Send + 'static> Engine<T> {
             peer.leave(link, reason);
             self.services.run_lost_hook();
         }
+        self.unjoined.dial_ended(super::unjoined::dial_error(link, reason));
         self.notify_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
         self.hub.lock().hub.node.left(self.now(), link.id, reason);

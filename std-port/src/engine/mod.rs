@@ -8,7 +8,7 @@
 //! | `reader`, `watch`, `notices`, `details`, `streams`, `worker`, `state_gate`, `alarms`, `events` | state machines and memory, without any link |
 //! | `link`, `peer_cell`, `roster`, `pinging`, `served` | a link and its session, a node, a call as its handler has it |
 //! | `sockets`, `driving`, `hub`, `keys`, `peers`, `links` | sockets, threads and clock, the node, its keys, all nodes and all links |
-//! | `reading`, `tables`, `interfaces`, `presence`, `claims`, `access`, `noting`, `accounts` | what is decided and counted with those |
+//! | `reading`, `tables`, `interfaces`, `presence`, `claims`, `access`, `noting`, `accounts`, `unjoined` | what is decided and counted with those |
 //! | `afterwards`, `tasks`, `services` | functions, and whatever runs with the application's state |
 //! | [`Engine`] | joins the parts, lends a session what it needs, and acts on what the parts return |
 //! | `settling`, `inbound` | its methods for a link that a thread has locked |
@@ -60,6 +60,7 @@ mod tables;
 mod tasks;
 #[cfg(test)]
 mod tests;
+mod unjoined;
 mod watch;
 pub(crate) mod worker;
 mod workers;
@@ -150,6 +151,7 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) accounts: accounts::Accounts,
     notes: Notes,
     pub(crate) events: Events,
+    unjoined: unjoined::Unjoined,
     /// For threads that look for themselves at what has happened.
     pub(crate) news: News,
 }
@@ -211,6 +213,7 @@ impl<T: Send + 'static> Engine<T> {
                 audit: parts.audit,
             },
             events: Events::default(),
+            unjoined: unjoined::Unjoined::default(),
             news: News::default(),
         })
     }
@@ -286,6 +289,9 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Tells subscribers.
     pub(crate) fn notify(&self, event: UnitEvent) {
+        if self.unjoined.note(self.now(), &event) {
+            self.driver.wake_looker();
+        }
         self.events.notify(&event);
         self.news.add();
     }

@@ -1,6 +1,7 @@
 //! A node, whether it is connected or not, and what is known of it beyond its links.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -27,6 +28,8 @@ pub(crate) struct PeerCell {
     joined: Mutex<Option<std::time::Instant>>,
     /// When and why its last link ended.
     left: Mutex<Option<(std::time::Instant, CloseReason)>>,
+    /// When and from where it asked for this unit last.
+    searched: Mutex<Option<(std::time::Instant, SocketAddr)>>,
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
     /// The newest call of each function that was to move something, and the link that it was made by.
@@ -71,6 +74,18 @@ impl PeerCell {
         left.filter(|_| !self.is_connected()).map(|(at, reason)| (at.elapsed(), reason))
     }
 
+    pub(super) fn heard_searching(&self, from: SocketAddr) {
+        *lock(&self.searched) = Some((std::time::Instant::now(), from));
+    }
+
+    /// How long ago it was heard searching for this unit, and from where, while it is not connected and if that was after it left.
+    pub(crate) fn searched(&self) -> Option<(std::time::Duration, SocketAddr)> {
+        let (searched, left) = (*lock(&self.searched), *lock(&self.left));
+        let is_news = |at| left.is_none_or(|(left, _)| left < at);
+        let heard = searched.filter(|(at, _)| !self.is_connected() && is_news(*at));
+        heard.map(|(at, from)| (at.elapsed(), from))
+    }
+
     /// Whether it is connected and what it offers is known.
     pub(crate) fn is_introduced(&self) -> bool {
         self.link().is_some_and(|link| link.is_introduced())
@@ -103,6 +118,7 @@ impl PeerCell {
             link: Mutex::new(None),
             joined: Mutex::new(None),
             left: Mutex::new(None),
+            searched: Mutex::new(None),
             own: Mutex::new(None),
             orders: Mutex::default(),
             streams: Streams::default(),

@@ -2,6 +2,7 @@
 //! another one leaves, and finds it again when it comes back.
 
 use std::collections::HashMap;
+use std::net::SocketAddr;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
@@ -147,6 +148,13 @@ impl Nodes {
     /// The s_units that this manager is to have.
     pub(crate) fn roster(&self, keys: &Keys) -> Vec<Arc<PeerCell>> {
         self.with_roster(keys, Peers::expected)
+    }
+
+    /// A node asks for this manager. Of those that are not expected nothing is kept: anybody may make names up.
+    pub(super) fn heard_searching(&self, keys: &Keys, identity: &Identity, from: SocketAddr) {
+        if let Some(peer) = self.of(keys, identity) {
+            peer.heard_searching(from);
+        }
     }
 
     /// The only node that is meant; [`Error::Ambiguous`] where several are.

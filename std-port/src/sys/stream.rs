@@ -64,28 +64,33 @@ pub(crate) struct Stream {
     socket: OwnedFd,
     /// This end's address, once it was asked for.
     local: OnceLock<Option<Ipv4Addr>>,
+    /// Why it could not be opened.
+    failed: OnceLock<Errno>,
 }
 
 impl Stream {
     /// Starts to connect to `to` and returns at once; the stream is writable when the attempt has ended, and
     /// [`finish_connect`](Self::finish_connect) tells how. Sending or receiving before that finds it closed or blocked.
     /// With `short` neither end sends segments above [`SHORT_SEGMENT`].
-    pub(crate) fn connect(to: SocketAddr, short: bool) -> Result<Self, CloseReason> {
+    pub(crate) fn connect(to: SocketAddr, short: bool) -> Result<Self, Errno> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-        let socket = socket_with(AddressFamily::of(to), SocketType::STREAM, flags, None).map_err(dial_failed)?;
-        set_options(&socket).map_err(dial_failed)?;
+        let socket = socket_with(AddressFamily::of(to), SocketType::STREAM, flags, None)?;
+        set_options(&socket)?;
         if short {
             limit_segments(&socket, true);
         }
         match connect(&socket, &to) {
             Ok(()) | Err(Errno::INPROGRESS | Errno::INTR) => Ok(Self::new(socket)),
-            Err(errno) => Err(dial_failed(errno)),
+            Err(errno) => Err(errno),
         }
     }
 
     /// How the attempt to connect has ended: `Ok(true)` connected and ready to use, `Ok(false)` not ended yet.
     pub(crate) fn finish_connect(&self) -> Result<bool, CloseReason> {
-        sockopt::socket_error(&self.socket).and_then(|outcome| outcome).map_err(dial_failed)?;
+        sockopt::socket_error(&self.socket).and_then(|outcome| outcome).map_err(|errno| {
+            let _ = self.failed.set(errno);
+            dial_failed(errno)
+        })?;
         let peer = match getpeername(&self.socket) {
             Ok(peer) => peer,
             Err(Errno::NOTCONN) => return Ok(false),
@@ -97,6 +102,11 @@ impl Stream {
         }
         ioctl_fionbio(&self.socket, false).map_err(dial_failed)?;
         Ok(true)
+    }
+
+    /// Why it could not be opened, if it could not.
+    pub(crate) fn dial_error(&self) -> Option<std::io::Error> {
+        self.failed.get().map(|errno| (*errno).into())
     }
 
     /// The same stream behind the lowest descriptor that is free, if that is lower than its own.
@@ -132,7 +142,7 @@ impl Stream {
     }
 
     fn new(socket: OwnedFd) -> Self {
-        Self { socket, local: OnceLock::new() }
+        Self { socket, local: OnceLock::new(), failed: OnceLock::new() }
     }
 
     /// Sends what the kernel takes of `slices`, in order, without waiting; 0 when it has no room.
@@ -475,11 +485,10 @@ mod tests {
     #[test]
     fn a_port_where_nobody_listens_is_a_failed_dial() {
         let unused = Listener::open(Ipv4Addr::LOCALHOST, 0).unwrap().port();
-        let failed = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, unused).into(), false).and_then(|stream| {
-            await_ready(&stream, Interest::WRITE_ONCE);
-            stream.finish_connect()
-        });
-        assert_eq!(failed, Err(CloseReason::DialFailed));
+        let stream = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, unused).into(), false).unwrap();
+        await_ready(&stream, Interest::WRITE_ONCE);
+        assert_eq!(stream.finish_connect(), Err(CloseReason::DialFailed));
+        assert_eq!(stream.dial_error().map(|error| error.kind()), Some(std::io::ErrorKind::ConnectionRefused));
     }
 
     #[test]

@@ -104,6 +104,11 @@ impl<P: Port> Node<P> {
         }
     }
 
+    /// Who has asked this unit last, and from where, as long as its answer waits.
+    pub fn asked_by(&self) -> Option<(&Identity, P::Endpoint)> {
+        self.answers.single.last().map(|answer| (&answer.who, answer.to))
+    }
+
     /// An s_unit that looks for no manager looks at the network. There is no key of it and this unit: in secured mode it
     /// gets the answer of a broadcast, which the fleet's code alone is for.
     pub(super) fn answer_survey(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas, mode: Mode) {

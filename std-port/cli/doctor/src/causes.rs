@@ -159,20 +159,41 @@ pub(crate) fn deaf(seen: &Evidence, name: &str, at: SocketAddr) -> Finding {
     Finding::error(Id::BroadcastOneWay, found, advice).about(name)
 }
 
-/// A node looks for a manager that does not run.
+/// A node looks for a manager that was not heard.
 pub(crate) fn missing_manager(seen: &Evidence, node: &str, wanted: &Manager) -> Finding {
-    let wanted_text = text_of(wanted);
-    let managers = seen.managers();
+    let wanted = text_of(wanted);
+    let (managers, not_heard) = (seen.managers(), not_heard(seen, &wanted));
     if managers.is_empty() {
-        let found =
-            format!("{node} looks for its manager {wanted_text}, and no manager of fleet {} runs", seen.fleet.0);
-        return Finding::error(Id::NoManager, found, format!("start {wanted_text}")).about(node);
+        let found = format!("{node} looks for its manager {wanted}, and {}", no_manager(seen));
+        return Finding::error(Id::NoManager, found, not_heard).about(node);
     }
-    let running = managers.join(", ");
-    let found = format!("{node} looks for the manager {wanted_text}, and {running} runs");
+    let others = managers.join(", ");
+    let found = format!(
+        "{node} looks for the manager {wanted}, which was not heard in {:.0} s; {others} runs",
+        seen.listened.as_secs_f32()
+    );
     let advice =
-        format!("set the manager's name and id in {node} to those of the one that runs, or start {wanted_text}");
+        format!("if {others} is meant, set the manager's name and id in {node} to it. If {wanted} is: {not_heard}");
     Finding::error(Id::WrongManager, found, advice).about(node)
+}
+
+/// That none was heard is known, and that none runs is not.
+pub(crate) fn no_manager(seen: &Evidence) -> String {
+    format!(
+        "no manager of fleet {} was heard in {:.0} s, and none runs on this host",
+        seen.fleet.0,
+        seen.listened.as_secs_f32()
+    )
+}
+
+/// What to do where a manager is not heard.
+pub(crate) fn not_heard(seen: &Evidence, manager: &str) -> String {
+    format!(
+        "look on its host whether {manager} runs (`cara doctor {}` there), and start it if not; if it does, let UDP port {} in there, \
+         and look for what drops broadcasts between",
+        quoted(manager),
+        seen.port
+    )
 }
 
 /// A node that a unit of this host has refused.

@@ -14,7 +14,7 @@ use super::evidence::{Evidence, KeysSeen, Life};
 use super::finding::Finding;
 use super::running::{Running, Sources};
 use super::which::Which;
-use super::{holder, host, network, node, unasked};
+use super::{holder, host, left, network, node, unasked};
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
 use cara_tools::listening;
@@ -248,7 +248,9 @@ impl Looking {
         };
         let others =
             evidence.m_units().into_iter().filter_map(|(heard, identity)| Some((heard.listens_at()?, identity)));
-        let tries_own = evidence.listened >= TRIES_OWN;
+        // Where a node is heard and does not come, a connection is what has to be known.
+        let heard_here = evidence.running.iter().flat_map(|unit| &unit.nodes).any(left::searches);
+        let tries_own = heard_here || evidence.listened >= TRIES_OWN;
         for (at, _) in others.filter(|(at, identity)| tries_own || !is_own(identity, at.port())) {
             self.dials.try_once(at);
         }

@@ -6,8 +6,8 @@ use std::net::IpAddr;
 use cara_std::Role;
 
 use super::causes::{
-    dial_of, duplicate, duplicate_managers, full, missing_manager, one_way, other_version, refusal, restarting,
-    tcp_blocked, text_of,
+    dial_of, duplicate, duplicate_managers, full, missing_manager, no_manager, one_way, other_version, refusal,
+    restarting, tcp_blocked, text_of,
 };
 use super::connected::{lossy, ways};
 use super::evidence::Evidence;
@@ -76,8 +76,12 @@ fn managers(seen: &Evidence) -> Vec<Finding> {
         }
     }
     if seen.managers().is_empty() {
-        let text = format!("no m_unit of fleet {} answers, and none runs on this host", seen.fleet.0);
-        let advice = "start the manager, or say with --fleet which fleet is meant";
+        let text = no_manager(seen);
+        let advice = format!(
+            "look on the manager's host whether it runs, and start it if not; if it does, let UDP port {} in there; or say with \
+             --fleet which fleet is meant",
+            seen.port
+        );
         found.push(Finding::warning(Id::NoManager, text, advice));
     }
     found.extend(seen.answered_alone.iter().map(|at| one_way(seen, *at)));

@@ -7,8 +7,8 @@ use cara_std::survey::Heard;
 use cara_std::{Identity, Manager, Role};
 
 use super::causes::{
-    deaf, dial_of, duplicate, duplicate_manager, duplicate_managers, full, missing_manager, one_way, other_fleet,
-    other_version, refusal, restarting, tcp_blocked, text_of,
+    deaf, dial_of, duplicate, duplicate_manager, duplicate_managers, full, missing_manager, no_manager,
+    not_heard as not_heard_there, one_way, other_fleet, other_version, refusal, restarting, tcp_blocked, text_of,
 };
 use super::connected;
 use super::evidence::Evidence;
@@ -93,8 +93,13 @@ fn apart(seen: &Evidence, about: &str, heard: &Heard) -> Finding {
         return other_fleet(seen, about, heard);
     }
     if seen.mode.is_some_and(|mode| mode != heard.mode) {
-        let wanted = heard.wanted.as_ref().map_or_else(|| format!("fleet {} here", seen.fleet.0), text_of);
-        return secured::mode_mismatch(seen, about, heard, &wanted);
+        // Of a manager that was not heard the mode is not known.
+        let known = |manager: &&Manager| seen.managers().contains(&text_of(manager));
+        let wanted = heard.wanted.as_ref();
+        let finding = secured::mode_mismatch(seen, about, heard, wanted.filter(known));
+        let Some(unknown) = wanted.filter(|wanted| !known(wanted)).map(text_of) else { return finding };
+        let found = format!("{}; it looks for the manager {unknown}, which was not heard", finding.found);
+        return Finding { found, ..finding };
     }
     secured::wrong_keys(seen, about, heard)
 }
@@ -129,11 +134,13 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     let m_units = seen.m_units();
     let dials = m_units.iter().filter_map(|(heard, identity)| Some((dial_of(seen, heard)?, identity)));
     let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(&identity.to_string(), dial));
-    // It may still turn out to search for another manager.
-    found.extend(blocked.map(|finding| finding.certain(false)));
+    // It may still turn out to search for another manager, unless that of this host has heard it search for it.
+    let searches = left(seen, which).is_some_and(|(_, node)| left::searches(node));
+    found.extend(blocked.map(|finding| finding.certain(searches)));
     // Its manager hears whatever it says, so that once it has had time to come back there is nothing to wait for.
     let lost = left::of(seen, which).map(|lost| lost.certain(seen.listened >= ANSWERED && left::for_long(seen, which)));
     if !found.is_empty() {
+        let lost = lost.filter(|lost| lost.id == Id::Lost);
         return found.into_iter().chain(lost).chain(behind).collect();
     }
     if let Some(cause) = lost.or_else(|| no_manager_for_any(seen, which)) {
@@ -229,11 +236,12 @@ fn no_manager_for_any(seen: &Evidence, which: &Which) -> Option<Finding> {
     let (wanted, other) = seen.ours().find_map(|(heard, identity)| Some((heard.wanted.as_ref()?, identity)))?;
     let wanted = text_of(wanted);
     let found = format!(
-        "no manager of fleet {} runs: {other} looks for {wanted} in vain. {} was not heard; of nodes that look for one manager \
-         in vain they hold back for each other, so that it may be among them",
-        seen.fleet.0, which.0
+        "{}; {other} looks for {wanted}. {} was not heard; of nodes that look for one manager in vain they hold back for each \
+         other, so that it may be among them",
+        no_manager(seen),
+        which.0
     );
-    let advice = format!("start {wanted}; if {} does not join it then, run the doctor again", which.0);
+    let advice = format!("{}; if {} does not join then, run the doctor again", not_heard_there(seen, &wanted), which.0);
     Some(Finding::error(Id::NoManager, found, advice).about(&which.0).certain(seen.listened >= ANSWERED))
 }
 
@@ -357,10 +365,14 @@ fn not_joining(seen: &Evidence, name: &str, wanted: &Manager) -> Finding {
     );
     let advice = format!(
         "if it does not join within the next seconds: what {manager} sends (UDP port {}) does not reach {name}, or {port} of \
-         {manager} is closed to it; look at the firewalls of both, and run `cara doctor {}` on the manager's host",
-        seen.port,
-        quoted(name)
+         {manager} is closed to it; look at the firewalls of both",
+        seen.port
     );
+    let is_here = seen.running.iter().any(|unit| unit.name() == manager);
+    let advice = match is_here {
+        true => format!("{advice}; the log of {name} says how far it comes"),
+        false => format!("{advice}, and run `cara doctor {}` on the manager's host", quoted(name)),
+    };
     Finding::error(Id::NotJoining, found, advice).about(name)
 }
 

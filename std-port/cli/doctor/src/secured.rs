@@ -78,7 +78,7 @@ pub(crate) fn two_modes(seen: &Evidence, node: &str, heard: &Heard) -> Option<Fi
     let manager = heard.wanted.as_ref()?;
     let modes: BTreeSet<bool> = modes_of(seen, manager).map(|mode| mode == Mode::Secured).collect();
     let is_secured = heard.mode == Mode::Secured;
-    (!modes.is_empty() && !modes.contains(&is_secured)).then(|| mode_mismatch(seen, node, heard, &text_of(manager)))
+    (!modes.is_empty() && !modes.contains(&is_secured)).then(|| mode_mismatch(seen, node, heard, Some(manager)))
 }
 
 /// In which modes a manager runs here, or was heard.
@@ -91,8 +91,11 @@ fn modes_of<'e>(seen: &'e Evidence, manager: &'e Manager) -> impl Iterator<Item 
     here.chain(seen.units().filter(of_fleet).map(|(heard, _)| heard.mode))
 }
 
-/// A unit of the other mode than its fleet's, or its manager's.
-pub(crate) fn mode_mismatch(seen: &Evidence, about: &str, heard: &Heard, other: &str) -> Finding {
+/// A unit of the other mode than its fleet's, or than that of its manager where this one is known.
+pub(crate) fn mode_mismatch(seen: &Evidence, about: &str, heard: &Heard, manager: Option<&Manager>) -> Finding {
+    let other = manager.map_or_else(|| format!("fleet {} here", seen.fleet.0), text_of);
+    let keyless = manager
+        .map_or_else(|| "MANAGER/ID@m_unit".to_owned(), |manager| quoted(&format!("{}@m_unit", text_of(manager))));
     let (fleet, node) = (seen.fleet.0, quoted(&named(heard, about)));
     let derive = |node: &str| format!("`cara keys derive --fleet {fleet} {node}`");
     let (mode, others, advice) = match heard.mode {
@@ -107,10 +110,7 @@ pub(crate) fn mode_mismatch(seen: &Evidence, about: &str, heard: &Heard, other: 
         Mode::Secured => (
             "secured",
             "in plain mode",
-            format!(
-                "give {other} its keys ({}) and start it without `--insecure`",
-                derive(&quoted(&format!("{other}@m_unit")))
-            ),
+            format!("give {other} its keys ({}) and start it without `--insecure`", derive(&keyless)),
         ),
     };
     let found = format!("{about} at {} is {mode}, and {other} is {others}: the two modes do not meet", heard.source);

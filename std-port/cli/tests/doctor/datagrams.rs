@@ -7,6 +7,8 @@ use cara_std::keys::DiscoveryKey;
 
 /// The part of a far host that is a manager: see `namespace`.
 pub(crate) const MANAGER: &str = "manager";
+/// And that of a vehicle.
+pub(crate) const VEHICLE: &str = "vehicle";
 
 /// Bytes of the fleet's code, and of the shortest `WhoHas` with it.
 const CODE: usize = 16;

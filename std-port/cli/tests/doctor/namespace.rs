@@ -4,10 +4,10 @@ use std::io::{Read, Write};
 use std::process::{Child, ChildStdin, Command, Stdio};
 
 use cara_processes::network::{self, Namespace};
-use cara_std::CommunicationSystem;
 use cara_std::control::Control;
+use cara_std::{CommunicationSystem, Unit};
 
-use crate::datagrams::MANAGER;
+use crate::datagrams::{MANAGER, VEHICLE};
 
 /// What a far host is.
 const PART: &str = "CARA_TEST_PART";
@@ -64,12 +64,25 @@ impl Drop for Peer {
 fn as_peer() {
     let part = std::env::var(PART).expect("the part to play");
     let words: Vec<&str> = part.split(' ').collect();
-    let [MANAGER, fleet, port, keys] = words[..] else { panic!("{part}") };
+    let [part, fleet, port, keys] = words[..] else { panic!("{part}") };
     let mut input = std::io::stdin();
     input.read_exact(&mut [0; 3]).unwrap();
-    let system = CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet.parse().unwrap());
-    let system = system.discovery_port(port.parse().unwrap()).control(Control::Off).key_file(keys).build().unwrap();
-    system.start().unwrap();
+    let (fleet, port): (u32, u16) = (fleet.parse().unwrap(), port.parse().unwrap());
+    let _unit: Box<dyn std::any::Any> = match part {
+        MANAGER => {
+            let system = CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
+            let system = system.control(Control::Off).key_file(keys).build().unwrap();
+            system.start().unwrap();
+            Box::new(system)
+        }
+        VEHICLE => {
+            let unit = Unit::builder("agv", 7, "boss", 1).unwrap().fleet(fleet).discovery_port(port);
+            let unit = unit.key_file(keys).build().unwrap();
+            unit.start().unwrap();
+            Box::new(unit)
+        }
+        part => panic!("{part}"),
+    };
     // Until the other end goes.
     let _ = input.read_to_end(&mut Vec::new());
 }

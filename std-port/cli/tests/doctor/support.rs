@@ -14,6 +14,7 @@ use cara_std::{Builder, CommunicationSystem, Constraints, Fleet, Identity, Inter
 use serde_json::Value;
 
 use crate::datagrams::Search;
+use crate::namespace::Peer;
 
 /// Longest wait for anything that is to happen.
 const PATIENCE: Duration = Duration::from_secs(180);
@@ -96,7 +97,18 @@ impl Clinic {
 
     /// The file with the keys of the m_unit `name/1`.
     pub(crate) fn key_file(&self, name: &str) -> PathBuf {
-        self.keys.path().join(location::file_name(&Identity::m_unit(name, 1).unwrap(), Fleet(self.fleet)))
+        self.key_file_of(&Identity::m_unit(name, 1).unwrap())
+    }
+
+    /// The file with the keys of any node.
+    pub(crate) fn key_file_of(&self, identity: &Identity) -> PathBuf {
+        self.keys.path().join(location::file_name(identity, Fleet(self.fleet)))
+    }
+
+    /// Another host on which this node plays its part once it is told to.
+    pub(crate) fn peer(&self, part: &str, identity: &Identity) -> Peer {
+        let (fleet, port) = (self.fleet.to_string(), self.port.to_string());
+        Peer::start(&[part, &fleet, &port, self.key_file_of(identity).to_str().unwrap()])
     }
 
     pub(crate) fn started(&self, unit: Builder<(), SUnit>) -> Unit {

@@ -133,6 +133,8 @@ pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
         left_ms: (!connected).then_some(9_000),
         left_reason: (!connected).then(|| "Silent".into()),
         left_text: (!connected).then(|| "nothing was heard".into()),
+        searched_ms: None,
+        searched_from: None,
         limits: None,
         link: None,
         functions: 0,

@@ -33,6 +33,8 @@ fn node(name: &str, id: u32) -> NodeInfo {
         left_ms: None,
         left_reason: None,
         left_text: None,
+        searched_ms: None,
+        searched_from: None,
         limits: Some(LimitsInfo { message_size: 32_768, chunk_size: 4_096, calls: 8, minimum_interval_us: 0 }),
         link: Some(LinkInfo {
             silent_ms: 120,
