@@ -160,6 +160,8 @@ pub struct Constraints {
     pub keep_alive: Duration,
     /// Calls that one peer may have waiting or running here; the next one is answered with `Busy`.
     pub calls_per_peer: u16,
+    /// Which of a peer's calls that wait here and move nothing begins next, within a class.
+    pub scheduling: Scheduling,
     /// How long orders of a manager go on once another one of its identity, with a higher claim, wants to command.
     pub handover: Duration,
     /// Streams of this unit that one peer may be subscribed to; the next subscription is refused.
@@ -178,6 +180,7 @@ impl Constraints {
         chunk_size: CHUNK_BYTES as u16,
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 64,
+        scheduling: Scheduling::EarliestDeadline,
         handover: Duration::from_secs(10),
         subscriptions_per_peer: 1_024,
         stream_bytes: 1_000_000,
@@ -191,10 +194,36 @@ impl Constraints {
         chunk_size: 1024,
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 8,
+        scheduling: Scheduling::EarliestDeadline,
         handover: Duration::from_secs(10),
         subscriptions_per_peer: 8,
         stream_bytes: 100_000,
     };
+}
+
+/// Which of the calls that wait begins next. Calls that move, stop or reset something keep their order in both, and of equal
+/// time-outs the call that came first is first in both.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Scheduling {
+    /// The one with the earliest deadline, but one that has waited half its time-out before all others. Where no more calls may
+    /// wait, the one with the latest deadline is refused.
+    #[default]
+    EarliestDeadline,
+    /// The one that came first. Where no more calls may wait, the one that comes is refused.
+    Fifo,
+}
+
+impl Scheduling {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::EarliestDeadline, Self::Fifo];
+
+    /// As people and files write it: `deadline` or `fifo`.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::EarliestDeadline => "deadline",
+            Self::Fifo => "fifo",
+        }
+    }
 }
 
 /// Whether units prove their identity and seal their frames. Units of different modes never connect.

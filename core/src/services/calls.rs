@@ -99,6 +99,8 @@ pub struct CallHead {
     pub operator: bool,
     /// Whether its results let what was stopped move again; known once it begins.
     pub resets: bool,
+    /// Whether it moves, stops or resets something: no call overtakes it, and it overtakes none.
+    pub keeps_order: bool,
     /// After this the caller no longer waits, and the call is not begun.
     pub deadline: Instant,
     /// The earliest time at which the caller can have made the request: its age is counted from here.
@@ -109,6 +111,9 @@ pub struct CallHead {
 
 /// So many requests that were given up before they arrived are remembered beside the windows.
 const UNWANTED: usize = 8;
+
+/// Of so many calls that wait the one with the earliest deadline begins; those behind them wait longer.
+const LOOKED_AT: usize = 16;
 
 /// Bytes of a call's head in a queue.
 const HEAD_BYTES: usize = 36;
@@ -393,6 +398,40 @@ impl<S: Storage> Calls<S> {
         taken
     }
 
+    /// Puts the call first that [`take_next`](Self::take_next) is to take by deadlines; whether others had come earlier.
+    pub(crate) fn put_next_first(&mut self, now: Instant) -> bool {
+        let class = self.next_class().filter(|class| *class != Priority::Emergency);
+        let Some((bytes, span)) = class.and_then(|class| self.queue(class)) else { return false };
+        let Some((next, size)) = span.by_deadline(bytes, now) else { return false };
+        let is_first = next == span.start;
+        if !is_first {
+            span.put_first(bytes, next, size);
+        }
+        !is_first
+    }
+
+    /// Takes out the call of this class with the latest deadline, so that one with an earlier deadline and a block of `length`
+    /// bytes can wait in its place.
+    pub(crate) fn displace(
+        &mut self,
+        now: Instant,
+        class: Priority,
+        deadline: Instant,
+        length: usize,
+    ) -> Option<CallHead> {
+        let (bytes, span) = self.queue(class).filter(|_| class != Priority::Emergency)?;
+        let (last, head, size) = span.latest(bytes, now)?;
+        let needed = HEAD_BYTES.saturating_add(length);
+        if head.deadline <= deadline || span.room(bytes).saturating_add(size) < needed {
+            return None;
+        }
+        span.put_first(bytes, last, size);
+        // The buffer stays, also when it is empty now: the other call waits in it.
+        let (head, ()) = span.pop(bytes, class, |_, _| ())?;
+        self.held = self.held.saturating_sub(1);
+        Some(head)
+    }
+
     fn next_class(&self) -> Option<Priority> {
         if !self.any_waiting() {
             return None;
@@ -486,6 +525,41 @@ impl Span {
         bytes.get_mut(deadline).unwrap_or_default().fill(0);
     }
 
+    /// Where the call is that is next by deadlines, and how long it is there. What has waited half its time-out goes before
+    /// all others, so that calls with short time-outs cannot keep one with a long time-out waiting until it has run out.
+    fn by_deadline(self, bytes: &[u8], now: Instant) -> Option<(usize, usize)> {
+        let (mut next, mut earliest, mut sent_at) = (None, Instant::FAR_FUTURE, Instant::START);
+        for (at, head, block) in self.heads(bytes).take(LOOKED_AT) {
+            if next.is_some() && head.keeps_order {
+                break;
+            }
+            // Each is an estimate, and a later call's may be the earlier time: equal time-outs keep their order all the same.
+            sent_at = sent_at.max(head.sent_at);
+            let due = due(&head, sent_at, now);
+            if next.is_none() || due < earliest {
+                (next, earliest) = (Some((at, HEAD_BYTES.saturating_add(block.len()))), due);
+            }
+            if head.keeps_order {
+                break;
+            }
+        }
+        next
+    }
+
+    /// The call with the latest deadline of those that may be refused for another one, and how long it is in the queue.
+    fn latest(self, bytes: &[u8], now: Instant) -> Option<(usize, CallHead, usize)> {
+        let may_go = |head: &CallHead| !head.keeps_order && head.sent_at + half(head) > now;
+        let (at, head, block) =
+            self.heads(bytes).filter(|(_, head, _)| may_go(head)).max_by_key(|(_, head, _)| head.deadline)?;
+        Some((at, head, HEAD_BYTES.saturating_add(block.len())))
+    }
+
+    /// Puts a call before all others, which keep their order.
+    fn put_first(self, bytes: &mut [u8], at: usize, size: usize) {
+        let moved = bytes.get_mut(self.start..at.saturating_add(size));
+        bytes::rotate_up(moved.unwrap_or_default(), size);
+    }
+
     fn pop<R>(
         &mut self,
         bytes: &[u8],
@@ -500,11 +574,25 @@ impl Span {
     }
 }
 
+/// Half of a call's time-out.
+const fn half(head: &CallHead) -> Duration {
+    head.deadline.since(head.sent_at).divided_by(2)
+}
+
+/// The order of calls, here of one that was made at `sent_at`. Where half the time-out is over, that time counts, which is past
+/// and so before all deadlines of calls that can wait.
+fn due(head: &CallHead, sent_at: Instant, now: Instant) -> Instant {
+    let half = half(head);
+    let due = sent_at + half;
+    if due <= now { due } else { due + half }
+}
+
 fn encode_head(head: &CallHead, block: usize) -> [u8; HEAD_BYTES] {
     let [l0, l1, l2, l3] = (block as u32).to_le_bytes();
     let [i0, i1, i2, i3] = head.id.to_le_bytes();
     let ([s0, s1], [g0, g1]) = (head.slot.0.to_le_bytes(), head.generation.0.to_le_bytes());
     let [f0, f1, f2, f3] = [head.wants_reply, head.takes_over, head.operator, head.wants_progress].map(u8::from);
+    let f0 = f0 | u8::from(head.keeps_order) << 1;
     let [d0, d1, d2, d3, d4, d5, d6, d7] = head.deadline.as_micros().to_le_bytes();
     let [m0, m1, m2, m3, m4, m5, m6, m7] = head.sent_at.as_micros().to_le_bytes();
     let [n0, n1, n2, n3] = head.number.to_le_bytes();
@@ -523,12 +611,13 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         slot: Slot(u16::from_le_bytes([s0, s1])),
         generation: Generation(u16::from_le_bytes([g0, g1])),
         priority,
-        wants_reply: wants_reply != 0,
+        wants_reply: wants_reply & 1 != 0,
         wants_progress: wants_progress != 0,
         cancelled: Cancelled::No,
         takes_over: takes_over != 0,
         operator: operator != 0,
         resets: false,
+        keeps_order: wants_reply & 2 != 0,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
         sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
         number: u32::from_le_bytes([n0, n1, n2, n3]),

@@ -90,6 +90,10 @@ counters! {
         RenewalsStopped,
         /// Leases of calls of this unit that it released because the peer answered no renewal for the length of the lease.
         RenewalsUnanswered,
+        /// Requests that began before ones that had come earlier, by their deadlines.
+        RequestsAhead,
+        /// Requests refused while they waited, for others with earlier deadlines.
+        RequestsDisplaced,
         /// Texts or values of failures that were cut or dropped, because they were too long or did not fit the signature.
         DetailsDropped,
         /// Progress of calls sent.

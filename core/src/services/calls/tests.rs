@@ -27,6 +27,7 @@ fn head(id: u32, priority: Priority) -> CallHead {
         takes_over: id.is_multiple_of(3),
         operator: id.is_multiple_of(5),
         resets: false,
+        keeps_order: id.is_multiple_of(11),
         deadline: Instant::from_micros(u64::from(id) << 20),
         sent_at: Instant::from_micros(u64::from(id) << 10),
         number: id ^ 0x8000_0001,
@@ -275,4 +276,79 @@ fn the_last_buffers_are_left_to_answers_and_to_what_is_received() {
     let (mut calls, mut pool) = (calls(3), pool(LEFT_BY_WAITING, 100));
     assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(1, Priority::Normal), b""), Err(Error::Busy));
     assert_eq!((calls.held(), pool.free()), (0, LEFT_BY_WAITING));
+}
+
+/// A call that was made at `sent` and may take until `deadline`, both in milliseconds.
+fn timed(id: u32, sent: u64, deadline: u64) -> CallHead {
+    let at = |millis: u64| Instant::from_micros(millis * 1_000);
+    CallHead { sent_at: at(sent), deadline: at(deadline), keeps_order: false, ..head(id, Priority::Normal) }
+}
+
+/// The ids of calls in the order in which they begin, each with its block; `now` in milliseconds.
+fn begun(waiting: &[CallHead], now: u64) -> Vec<u32> {
+    let (mut calls, mut pool) = (calls(4), pool(3, 4_000));
+    for head in waiting {
+        calls.wait(&mut pool, LEFT_BY_WAITING, *head, &vec![head.id as u8; head.id as usize]).unwrap();
+    }
+    let mut ids = Vec::new();
+    loop {
+        calls.put_next_first(Instant::from_micros(now * 1_000));
+        let Some((head, block)) = calls.take_next(&mut pool, |_, block| block.to_vec()) else { return ids };
+        assert_eq!(block, vec![head.id as u8; head.id as usize]);
+        ids.push(head.id);
+    }
+}
+
+#[test]
+fn the_earliest_deadline_begins_and_of_equal_time_outs_the_first() {
+    let waiting = [timed(1, 10, 1_000), timed(2, 11, 500), timed(3, 12, 2_000), timed(4, 13, 502), timed(5, 14, 1_004)];
+    assert_eq!(begun(&waiting, 20), [2, 4, 1, 5, 3]);
+    // What is known of when they were made changes a little with each keep-alive.
+    assert_eq!(begun(&[timed(1, 12, 112), timed(2, 10, 110), timed(3, 11, 111)], 20), [1, 2, 3]);
+}
+
+#[test]
+fn what_has_waited_half_its_time_out_is_next() {
+    let waiting = [timed(1, 0, 10_000), timed(2, 4_999, 5_009), timed(3, 4_999, 5_019)];
+    assert_eq!(begun(&waiting, 4_999), [2, 3, 1]);
+    assert_eq!(begun(&waiting, 5_000), [1, 2, 3]);
+    // What was given up goes out of the way.
+    assert_eq!(begun(&[timed(1, 4_998, 10_000), timed(2, 4_999, 0)], 4_999), [2, 1]);
+}
+
+#[test]
+fn what_moves_overtakes_nothing_and_is_overtaken_by_nothing() {
+    let moving = |id, deadline| CallHead { keeps_order: true, ..timed(id, 0, deadline) };
+    let waiting =
+        [timed(1, 0, 900), timed(2, 0, 800), moving(3, 100), timed(4, 0, 700), timed(5, 0, 600), moving(6, 50)];
+    assert_eq!(begun(&waiting, 1), [2, 1, 3, 5, 4, 6]);
+    assert_eq!(begun(&waiting[2..], 1), [3, 5, 4, 6]);
+}
+
+#[test]
+fn no_more_calls_are_looked_at_than_the_limit() {
+    let last = LOOKED_AT as u32 + 1;
+    let mut waiting: Vec<_> = (1..last).map(|id| timed(id, 0, 1_000)).collect();
+    waiting.push(timed(last, 0, 10));
+    assert_eq!(begun(&waiting, 1)[..2], [1, last]);
+}
+
+#[test]
+fn the_latest_deadline_makes_room_and_what_moves_or_is_next_does_not() {
+    let (mut calls, mut pool) = (calls(4), pool(3, 3 * HEAD_BYTES + 24));
+    let moving = CallHead { keeps_order: true, ..timed(1, 0, 9_000) };
+    for head in [moving, timed(2, 0, 900), timed(3, 0, 800)] {
+        calls.wait(&mut pool, LEFT_BY_WAITING, head, &[head.id as u8; 8]).unwrap();
+    }
+    let at = |millis: u64| Instant::from_micros(millis * 1_000);
+    let mut displaced = |now, deadline, length| {
+        let displaced = calls.displace(at(now), Priority::Normal, at(deadline), length);
+        (displaced.map(|head| head.id), calls.held())
+    };
+    assert_eq!(displaced(1, 900, 8), (None, 3), "it is not later than the newcomer's");
+    assert_eq!(displaced(1, 100, 9), (None, 3), "the newcomer would not fit");
+    assert_eq!(displaced(450, 700, 8), (None, 3), "both have waited half their time-outs");
+    assert_eq!(displaced(1, 850, 8), (Some(2), 2));
+    assert_eq!(displaced(1, 100, 8), (Some(3), 1));
+    assert_eq!(displaced(1, 100, 8), (None, 1), "it moves");
 }

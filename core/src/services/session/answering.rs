@@ -3,7 +3,7 @@
 use super::permitting::{decide_call, log_refusal};
 use super::{Incoming, Phase, Session};
 use crate::ability::DETAILS;
-use crate::config::Priority;
+use crate::config::{Priority, Scheduling};
 use crate::distribution::block;
 use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature};
@@ -46,6 +46,9 @@ impl<P: Port> Session<P> {
         arguments: &mut ParametersView,
     ) -> Option<Result<Incoming, Error>> {
         let (functions, now, access, remote) = (cx.functions, cx.now, cx.table(), self.remote.as_ref());
+        if self.constraints.scheduling == Scheduling::EarliestDeadline && self.calls.put_next_first(now) {
+            self.link.counters.count(LinkCounter::RequestsAhead);
+        }
         let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
             if head.deadline <= now {
                 return Err(Error::Expired);
@@ -159,6 +162,19 @@ impl<P: Port> Session<P> {
             self.pump(cx);
         }
         Ok(())
+    }
+
+    /// A call that waits is refused in favour of one with an earlier deadline that came later. Whether that can wait now.
+    pub(super) fn displace(&mut self, cx: &mut Context<'_, P>, newcomer: &CallHead, length: usize) -> bool {
+        if self.constraints.scheduling == Scheduling::Fifo {
+            return false;
+        }
+        let displaced = self.calls.displace(cx.now, newcomer.priority, newcomer.deadline, length);
+        if let Some(CallHead { id, slot, priority, wants_reply, .. }) = displaced {
+            self.link.counters.count(LinkCounter::RequestsDisplaced);
+            self.refuse_request(cx, id, slot, priority, wants_reply, Error::Busy);
+        }
+        displaced.is_some()
     }
 
     /// Gives up on answering a call whose answer could not be kept.

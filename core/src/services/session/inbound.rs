@@ -527,7 +527,11 @@ impl<P: Port> Session<P> {
                 None => {
                     // A buffer that the request lies in is back in the pool at once.
                     let left = LEFT_BY_WAITING.saturating_sub(usize::from(block.is_in_buffer()));
-                    self.calls.wait(cx.buffers, left, head, bytes).map(|()| None)
+                    let waits = self.calls.wait(cx.buffers, left, head, bytes);
+                    if waits.is_ok() || !self.displace(cx, &head, length) {
+                        return waits.map(|()| None);
+                    }
+                    self.calls.wait(cx.buffers, left, head, self.link.view(block, lent)).map(|()| None)
                 }
             }
         });
@@ -595,8 +599,6 @@ impl<P: Port> Session<P> {
         if priority != Priority::Emergency && !function.attributes.stop {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;
         }
-        let is_emergency = is_emergency(function.attributes, priority);
-        self.calls.admit(header.slot, is_emergency, self.constraints.calls_per_peer)?;
         let head = CallHead {
             id: header.id,
             slot: header.slot,
@@ -608,10 +610,16 @@ impl<P: Port> Session<P> {
             takes_over: header.takes_over,
             operator: header.operator,
             resets: false,
+            keeps_order: function.attributes.lease.is_some() || function.attributes.stop || function.attributes.reset,
             deadline,
             sent_at,
             number: header.number,
         };
+        let is_emergency = is_emergency(function.attributes, priority);
+        let admitted = self.calls.admit(header.slot, is_emergency, self.constraints.calls_per_peer);
+        if admitted.is_err() && !self.displace(cx, &head, length) {
+            return admitted.map(|()| (head, function));
+        }
         Ok((head, function))
     }
 }

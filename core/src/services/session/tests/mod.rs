@@ -30,6 +30,7 @@ mod orders;
 mod overtaking;
 mod pair;
 mod requests;
+mod scheduling;
 mod serving;
 mod setup;
 mod side;
