@@ -108,7 +108,7 @@ pub use actuator::Actuator;
 #[cfg(feature = "async")]
 pub use asynchronous::{CallGivenUp, EventStream, EventsLost, SampleStream};
 pub use builder::{BuildError, Builder};
-pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT};
+pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT, Scheduling};
 pub use cara_core::distribution::claim::Claim;
 pub use cara_core::distribution::connection_handler::NodeCounter;
 pub use cara_core::distribution::failure::Failure;

@@ -292,6 +292,11 @@ impl ThreadPool {
         self.pool_waker.wake();
     }
 
+    /// Whether calls of other links wait and no thread of the pool is idle.
+    pub(crate) fn others_wait(&self, link: u64) -> bool {
+        !self.has_idle() && lock(&self.ready).iter().any(|ready| *ready != link)
+    }
+
     /// Whether a thread of the pool waits for something to do.
     pub(crate) fn has_idle(&self) -> bool {
         self.idle.load(Ordering::Acquire) > 0

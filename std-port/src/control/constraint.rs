@@ -1,14 +1,13 @@
 //! Constraints by name, as an operator sets them.
 
-use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES};
+use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES, Scheduling};
 use cara_core::error::Error;
 use cara_core::time::Duration;
 
 use super::protocol::Failure;
 use crate::builder::{LONGEST_MESSAGE, SHORTEST_MESSAGE};
 
-const NAMES: &str =
-    "request_timeout, minimum_interval, maximum_nodes, message_size, chunk_size, keep_alive, calls_per_peer";
+const NAMES: &str = "request_timeout, minimum_interval, maximum_nodes, message_size, chunk_size, keep_alive, calls_per_peer, scheduling";
 /// What may differ from node to node.
 const FOR_ONE: [&str; 3] = ["request_timeout", "minimum_interval", "calls_per_peer"];
 
@@ -23,6 +22,7 @@ pub(super) fn changed(before: Constraints, name: &str, value: u64) -> Result<Con
         "chunk_size" => after.chunk_size = narrow(name, value)?,
         "keep_alive" => after.keep_alive = Duration::from_micros(value),
         "calls_per_peer" => after.calls_per_peer = narrow(name, value)?,
+        "scheduling" => after.scheduling = scheduling(value).ok_or_else(|| bad(name, value))?,
         _ => {
             let text = format!("there is no constraint '{name}'; there are {NAMES}");
             return Err(Failure::configuration("UnknownConstraint", text));
@@ -53,6 +53,11 @@ fn plain(name: &str) -> &str {
     name.strip_suffix("_us").unwrap_or(name)
 }
 
+/// By its place in the table of all.
+fn scheduling(value: u64) -> Option<Scheduling> {
+    Scheduling::ALL.get(usize::try_from(value).ok()?).copied()
+}
+
 fn narrow<N: TryFrom<u64>>(name: &str, value: u64) -> Result<N, Failure> {
     N::try_from(value).map_err(|_| bad(name, value))
 }
@@ -73,6 +78,7 @@ fn bad(name: &str, value: u64) -> Failure {
             cara_core::config::LONGEST_KEEP_ALIVE.as_micros()
         ),
         "calls_per_peer" => format!("it is 1 to {}", u16::MAX),
+        "scheduling" => "it is 0 for deadline or 1 for fifo".to_owned(),
         _ => "this unit cannot hold it".to_owned(),
     };
     Failure::configuration("BadConstraint", format!("{name} cannot be {value}: {bounds}"))

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::Finding;
-use cara_core::config::{Constraints, Priority, VERSIONS};
+use cara_core::config::{Constraints, Priority, Scheduling, VERSIONS};
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::services::lease::{ActuatorState, LastOrder, Latch, LeaseEnd};
 use cara_core::time::Duration;
@@ -11,7 +11,7 @@ use cara_core::time::Duration;
 use super::failure::name_of;
 use super::protocol::{
     Answer, ConstraintsInfo, FunctionInfo, InhibitedInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo, OrderInfo,
-    RefusedInfo, UnitInfo,
+    RefusedInfo, SchedulingInfo, UnitInfo,
 };
 use crate::keys::LiveRing;
 use crate::{CommunicationSystem, Interface, Limits, Peer, Refusal, TheirFunction, UnitEvent};
@@ -149,6 +149,10 @@ pub(super) const fn constraints(constraints: &Constraints) -> ConstraintsInfo {
         chunk_size: constraints.chunk_size,
         keep_alive_us: constraints.keep_alive.as_micros(),
         calls_per_peer: constraints.calls_per_peer,
+        scheduling: match constraints.scheduling {
+            Scheduling::EarliestDeadline => SchedulingInfo::Deadline,
+            Scheduling::Fifo => SchedulingInfo::Fifo,
+        },
     }
 }
 

@@ -456,6 +456,20 @@ pub struct ConstraintsInfo {
     pub keep_alive_us: u64,
     /// Calls that one peer may have waiting or running here.
     pub calls_per_peer: u16,
+    /// Which of them begins next.
+    #[serde(default)]
+    pub scheduling: SchedulingInfo,
+}
+
+/// Which of the calls that wait begins next; set by its number, in this order.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SchedulingInfo {
+    /// The one with the earliest deadline.
+    #[default]
+    Deadline,
+    /// The one that came first.
+    Fifo,
 }
 
 /// A node as the unit sees it.

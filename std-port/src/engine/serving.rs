@@ -59,7 +59,14 @@ impl<T: Send + 'static> Engine<T> {
         let mut next = Some(started);
         while let Some(started) = next {
             let served = self.serve_one(self.now(), link, started, worker);
-            next = self.next_call(link, served.map_or_else(|| link.lock(), |(state, _)| state), worker);
+            let state = served.map_or_else(|| link.lock(), |(state, _)| state);
+            // Peers take turns: where no thread is left for the others, theirs come before this peer's next call.
+            if state.session.has_next_call() && self.thread_pool().others_wait(link.token()) {
+                self.hand_over(link);
+                self.settle(link, state);
+                return;
+            }
+            next = self.next_call(link, state, worker);
         }
     }
 

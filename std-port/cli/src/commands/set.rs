@@ -2,6 +2,7 @@
 
 use std::process::ExitCode;
 
+use cara_std::Scheduling;
 use cara_std::control::protocol::{Answer, ConstraintsInfo, Question};
 
 use crate::nodes;
@@ -22,13 +23,14 @@ Constraints:
   message_size      longest message received; a size from 16 B to 256 KiB
   chunk_size        longest frame received; a size from 320 B to 4 KiB
   keep_alive        between two signs of life; a time
-  calls_per_peer    calls that one peer may have waiting or running here; a number")]
+  calls_per_peer    calls that one peer may have waiting or running here; a number
+  scheduling        which of the calls that wait begins next: deadline or fifo")]
 pub(crate) struct Arguments {
     /// The unit itself, by its name or as `.`; or a node, for this unit's side towards it: NAME, NAME/ID or #ID.
     node: String,
     /// Which constraint.
     constraint: String,
-    /// Its new value: 50ms, 2s, 32KiB, 64.
+    /// Its new value: 50ms, 2s, 32KiB, 64, fifo.
     value: String,
 }
 
@@ -37,12 +39,13 @@ enum Kind {
     Time,
     Size,
     Number,
+    Scheduling,
 }
 
 /// The constraints by name, with what their values are and how they are found among those in force.
 type Known = (&'static str, Kind, fn(&ConstraintsInfo) -> u64);
 
-const CONSTRAINTS: [Known; 7] = [
+const CONSTRAINTS: [Known; 8] = [
     ("request_timeout", Kind::Time, |c| c.request_timeout_us),
     ("minimum_interval", Kind::Time, |c| c.minimum_interval_us),
     ("maximum_nodes", Kind::Number, |c| c.maximum_nodes.into()),
@@ -50,6 +53,7 @@ const CONSTRAINTS: [Known; 7] = [
     ("chunk_size", Kind::Size, |c| c.chunk_size.into()),
     ("keep_alive", Kind::Time, |c| c.keep_alive_us),
     ("calls_per_peer", Kind::Number, |c| c.calls_per_peer.into()),
+    ("scheduling", Kind::Scheduling, |c| c.scheduling as u64),
 ];
 
 pub(crate) fn run(Arguments { node, constraint, value }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
@@ -86,6 +90,11 @@ fn parse(name: &str, kind: Kind, text: &str) -> anyhow::Result<u64> {
     let value = match kind {
         Kind::Time => parse_micros(text),
         Kind::Size => parse_bytes(text),
+        Kind::Scheduling => Scheduling::ALL
+            .iter()
+            .position(|known| known.word() == text)
+            .map(|at| at as u64)
+            .ok_or_else(|| format!("it is `deadline` or `fifo`, not `{text}`")),
         Kind::Number => text.parse().map_err(|_| format!("write a whole number, as 64, not `{text}`")),
     };
     value.map_err(|wrong| Ended::usage(format!("{name}: {wrong}")))
@@ -99,6 +108,10 @@ fn table(constraints: &ConstraintsInfo, changed: &str) -> Rows {
             Kind::Time => show_micros(value as f64),
             Kind::Size => show_bytes(value),
             Kind::Number => value.to_string(),
+            Kind::Scheduling => {
+                let known = Scheduling::ALL.get(value as usize);
+                known.map_or_else(|| value.to_string(), |known| known.word().to_owned())
+            }
         };
         rows.add(if name == changed { HEADING } else { PLAIN }, [name.into(), value]);
     }
@@ -121,7 +134,14 @@ mod tests {
         assert_eq!(parse("request_timeout", Kind::Time, "50ms").unwrap(), 50_000);
         assert_eq!(parse("message_size", Kind::Size, "32KiB").unwrap(), 32_768);
         assert_eq!(parse("maximum_nodes", Kind::Number, "64").unwrap(), 64);
-        for (kind, wrong) in [(Kind::Time, "50"), (Kind::Size, "1s"), (Kind::Number, "64KiB"), (Kind::Number, "-1")] {
+        assert_eq!(parse("scheduling", Kind::Scheduling, "fifo").unwrap(), 1);
+        for (kind, wrong) in [
+            (Kind::Scheduling, "lifo"),
+            (Kind::Time, "50"),
+            (Kind::Size, "1s"),
+            (Kind::Number, "64KiB"),
+            (Kind::Number, "-1"),
+        ] {
             assert!(parse("x", kind, wrong).is_err(), "{wrong}");
         }
     }

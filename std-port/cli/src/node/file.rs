@@ -81,6 +81,15 @@ pub(super) struct Constraints {
     pub(super) chunk_size: Maybe<Size>,
     pub(super) keep_alive: Maybe<Time>,
     pub(super) calls_per_peer: Maybe<Size>,
+    pub(super) scheduling: Maybe<Scheduling>,
+}
+
+/// `constraints.scheduling`
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Scheduling {
+    Deadline,
+    Fifo,
 }
 
 /// `[capacities]`

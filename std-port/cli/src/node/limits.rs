@@ -2,7 +2,7 @@
 
 use std::ops::{Range, RangeInclusive};
 
-use cara_std::{Capacities, Constraints, Duration};
+use cara_std::{Capacities, Constraints, Duration, Scheduling};
 
 use super::file::{self, Maybe, Role};
 use super::mistake::Mistake;
@@ -27,6 +27,12 @@ pub(super) fn constraints(table: &file::Constraints, role: Role, mistakes: &mut 
     set(&mut limits.message_size, &table.message_size, 16..=LONGEST_MESSAGE, mistakes);
     set(&mut limits.chunk_size, &table.chunk_size, CHUNKS, mistakes);
     set(&mut limits.calls_per_peer, &table.calls_per_peer, 1..=65_535, mistakes);
+    if let Some(scheduling) = &table.scheduling {
+        limits.scheduling = match scheduling.get_ref() {
+            file::Scheduling::Deadline => Scheduling::EarliestDeadline,
+            file::Scheduling::Fifo => Scheduling::Fifo,
+        };
+    }
     limits
 }
 
@@ -114,6 +120,8 @@ mod tests {
             ("keep_alive = \"999us\"", None),
             ("calls_per_peer = 1", Some(Constraints { calls_per_peer: 1, ..base })),
             ("calls_per_peer = 0", None),
+            ("scheduling = \"fifo\"", Some(Constraints { scheduling: Scheduling::Fifo, ..base })),
+            ("scheduling = \"deadline\"", Some(base)),
             ("minimum_interval = 0", Some(base)),
         ];
         for (text, expected) in cases {

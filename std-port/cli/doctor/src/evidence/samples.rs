@@ -99,6 +99,7 @@ pub(crate) fn running(name: &str, id: u32) -> Running {
         chunk_size: 4096,
         keep_alive_us: 1_000_000,
         calls_per_peer: 64,
+        scheduling: Default::default(),
     };
     let unit = UnitInfo {
         name: name.into(),

@@ -86,6 +86,7 @@ fn unit() -> UnitInfo {
         chunk_size: 4_096,
         keep_alive_us: 1_000_000,
         calls_per_peer: 64,
+        scheduling: Default::default(),
     };
     UnitInfo {
         name: "depot".into(),
