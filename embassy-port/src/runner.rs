@@ -124,7 +124,9 @@ impl<T> Runner<T> {
 
     fn read(&mut self, machine: &mut Machine<T>) -> Step {
         let busy = self.unanswered.is_some();
-        for index in machine.indices() {
+        // Peers take turns: that whose call began last comes last.
+        let last = usize::from(machine.started_on);
+        for index in machine.indices().cycle().skip(last.saturating_add(1)).take(machine.indices().len()) {
             let arguments = if busy { None } else { Some(&mut *self.arguments) };
             if let Some(event) = machine.read_link(index, self.scratch, arguments) {
                 let job = event.and_then(|event| machine.recorded(index, event));
