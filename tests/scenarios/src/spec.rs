@@ -27,6 +27,7 @@ pub struct Spec {
     pub(crate) published: bool,
     pub(crate) their_functions: usize,
     pub(crate) message_buffers: usize,
+    pub(crate) one_call_at_a_time: bool,
     pub(crate) same_seed: bool,
     pub(crate) beside_another: bool,
     pub(crate) takes_over: bool,
@@ -56,6 +57,7 @@ impl Spec {
             published: true,
             their_functions: 48,
             message_buffers: 32,
+            one_call_at_a_time: false,
             same_seed: false,
             beside_another: false,
             takes_over: false,
@@ -81,6 +83,11 @@ impl Spec {
     /// The manager that an s_unit joins instead.
     pub fn joins(self, name: &str, id: u32) -> Self {
         Self { role: SpecRole::Agv(name.to_owned(), id), ..self }
+    }
+
+    /// Of each peer one call runs at a time, and all others wait for it.
+    pub fn one_call_at_a_time(self) -> Self {
+        Self { one_call_at_a_time: true, ..self }
     }
 
     /// Another fleet within the scenario.

@@ -9,6 +9,7 @@
 
 mod child;
 mod counted;
+mod deadlines;
 mod experiments;
 mod lanes;
 mod nodes;
@@ -46,6 +47,11 @@ enum Command {
         /// Where they go.
         folder: PathBuf,
     },
+    /// The share of deadlines met at loads of 50 to 150 %, in the simulator; prints a table.
+    Deadlines {
+        /// Where the figure goes.
+        folder: Option<PathBuf>,
+    },
     /// The process that answers; started by the others.
     #[command(hide = true)]
     Serve(End),
@@ -75,6 +81,11 @@ fn main() -> Result<()> {
             experiments::run(&options)
         }
         Command::Plots { json, folder } => plots::draw(&results::Results::read(&json)?, &folder),
+        Command::Deadlines { folder } => {
+            let shares = deadlines::measure()?;
+            print!("{}", deadlines::table(&shares));
+            folder.map_or(Ok(()), |folder| plots::draw_deadlines(&shares, &folder))
+        }
         Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),
         Command::Call(end) => child::call(&end),
         Command::Further(end) => further(&*peers::named(&end.peer)?, &end),

@@ -9,11 +9,13 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 
+use crate::deadlines::Share;
 use crate::experiments::SIMULATED;
 use crate::results::{Availability, Mode, Response, Results};
 use axis::Axis;
 use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
+use cara_core::config::Scheduling;
 use chart::{Chart, Kind, Line, Point};
 
 /// The size of figure 8.
@@ -37,6 +39,20 @@ pub(crate) fn draw(results: &Results, folder: &Path) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Draws the share of deadlines that are met over the load.
+pub(crate) fn draw_deadlines(shares: &[Share], folder: &Path) -> Result<()> {
+    let line = |scheduling: Scheduling| {
+        let of = shares.iter().filter(|share| share.scheduling == scheduling);
+        let points = of.map(|share| Point::new(share.load as f64, share.met)).collect();
+        Line::measured(scheduling.word(), points)
+    };
+    let (x, y) = (Axis::linear("load, %"), Axis::share("deadlines met / calls"));
+    let chart = Chart::new("Deadlines met, one call at a time", x, y, Scheduling::ALL.map(line).into());
+    let about = ["simulator; calls of 5 to 15 ms", "time-outs of 50, 100, 200 and 400 ms"].map(str::to_owned);
+    std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
+    chart::draw(&[vec![chart]], &about, &folder.join("deadlines"))
 }
 
 fn figures(results: &Results) -> Vec<Figure> {

@@ -347,6 +347,7 @@ impl LinuxNode {
         let capacities = Capacities {
             their_functions: *their_functions,
             message_buffers: *message_buffers,
+            calls_running: if self.spec.one_call_at_a_time { 1 } else { Capacities::default().calls_running },
             ..Capacities::default()
         };
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);

@@ -148,6 +148,7 @@ impl World for SimWorld {
         let new = if spec.same_seed { new.boot_seed(4) } else { new };
         let new = spec.m_units.iter().fold(new, |new, m_units| new.m_units(m_units));
         let new = new.fleet(fleet).constraints(constraints).functions(their_functions).message_buffers(message_buffers);
+        let new = if spec.one_call_at_a_time { new.calls_running(1) } else { new };
         let new = match self.renews_every {
             Some(span) => new.renews_every(span),
             None => new,

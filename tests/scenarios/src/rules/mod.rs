@@ -22,6 +22,7 @@ mod message_size;
 mod orders;
 mod priorities;
 mod publishing;
+mod scheduling;
 mod slow;
 mod stops;
 mod streams;
@@ -55,6 +56,7 @@ pub fn all() -> Vec<Scenario> {
         turns::SCENARIOS,
         links::SCENARIOS,
         priorities::SCENARIOS,
+        scheduling::SCENARIOS,
         emergency::SCENARIOS,
         best_effort::SCENARIOS,
         slow::SCENARIOS,

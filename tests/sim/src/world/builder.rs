@@ -45,6 +45,7 @@ impl NewUnit {
             m_units: None,
             constraints,
             message_buffers: 16,
+            calls_running: None,
             links: usize::from(constraints.maximum_nodes) + 4,
             functions: 64,
             boot_seed: None,
@@ -92,6 +93,12 @@ impl NewUnit {
     /// How many message buffers its links share (16).
     pub fn message_buffers(mut self, count: usize) -> Self {
         self.settings.message_buffers = count;
+        self
+    }
+
+    /// Calls of one peer that run at the same time; others wait. As many as may wait or run, if it is not said.
+    pub fn calls_running(mut self, count: usize) -> Self {
+        self.settings.calls_running = Some(count);
         self
     }
 

@@ -52,6 +52,7 @@ pub(super) struct Settings {
     pub(super) m_units: Option<Box<[Identity]>>,
     pub(super) constraints: Constraints,
     pub(super) message_buffers: usize,
+    pub(super) calls_running: Option<usize>,
     pub(super) links: usize,
     pub(super) functions: usize,
     pub(super) boot_seed: Option<u64>,
@@ -100,6 +101,7 @@ pub(super) struct UnitState {
 pub(super) struct Machine {
     pub(super) links: Links,
     pub(super) constraints: Constraints,
+    calls_running: Option<usize>,
     node_timer: Instant,
 }
 
@@ -173,6 +175,7 @@ impl UnitState {
         self.machine = Some(Machine {
             links: Links::new(self.host, settings.links, functions, buffers, hub, keys, arguments),
             constraints: settings.constraints,
+            calls_running: settings.calls_running,
             node_timer: Instant::FAR_FUTURE,
         });
     }
@@ -195,7 +198,7 @@ impl Machine {
         let storage = SessionStorage {
             small: Boxed::slice(cara_core::config::LINK_BUFFER_BYTES),
             pending: Boxed::slice(calls),
-            running: Boxed::slice(slots_for(calls)),
+            running: Boxed::slice(slots_for(self.calls_running.unwrap_or(calls))),
             publications: Boxed::slice(functions),
             their_functions: Boxed::slice(functions),
             their_signatures: Boxed::slice(functions * SIGNATURE_BYTES),

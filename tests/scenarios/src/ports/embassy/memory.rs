@@ -28,6 +28,8 @@ const AGV: Limits = Limits {
     arguments: 8_192,
     ..Limits::S_UNIT
 };
+/// One call of its manager runs at a time, and a slot is kept for emergencies.
+const ONE_AT_A_TIME: Limits = Limits { calls: 2, ..AGV };
 const MANAGER: Limits = Limits {
     links: LINKS,
     message_size: 32 * 1024,
@@ -54,6 +56,9 @@ macro_rules! unit {
 pub(super) fn unit(spec: &Spec, stack: Stack<'static>, config: Config) -> Result<(Handle, Runner<()>), Error> {
     if spec.their_functions <= 4 {
         return unit!(FORGETFUL, stack, config);
+    }
+    if spec.one_call_at_a_time {
+        return unit!(ONE_AT_A_TIME, stack, config);
     }
     if spec.message_buffers < FEW && spec.constraints.message_size < LONG {
         return unit!(TIGHT, stack, config);
