@@ -61,7 +61,7 @@ impl<T: Send + 'static> Engine<T> {
             let served = self.serve_one(self.now(), link, started, worker);
             let state = served.map_or_else(|| link.lock(), |(state, _)| state);
             // Peers take turns: where no thread is left for the others, theirs come before this peer's next call.
-            if state.session.has_next_call() && self.thread_pool().others_wait(link.token()) {
+            if state.session.has_next_call() && self.driver.pool().others_wait(link.token()) {
                 self.hand_over(link);
                 self.settle(link, state);
                 return;
