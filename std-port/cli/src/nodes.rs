@@ -5,7 +5,7 @@ use cara_std::control::protocol::{Answer, FunctionInfo, NodeInfo, Question};
 use cara_tools::close_names::close;
 
 use crate::operator::Operator;
-use cara_tools::exit::Ended;
+use cara_tools::exit::{Ended, Exit};
 pub(crate) use cara_tools::name_and_id::full_name;
 use cara_tools::name_and_id::quoted;
 
@@ -142,6 +142,24 @@ pub(crate) fn functions(operator: &mut Operator, node: &str) -> anyhow::Result<V
 /// A function that a node does not offer: close names, and all that it does.
 pub(crate) fn no_such_function(node: &str, name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
     Ended::usage(not_offered(format!("{node} has not published `{name}`"), "it has", name, functions))
+}
+
+/// The error for a stream that `node` does not have: what it has instead, and how that is used.
+pub(crate) fn no_such_stream(node: &str, name: &str, published: &[FunctionInfo]) -> anyhow::Error {
+    let without = quoted(without_role(node));
+    if published.iter().any(|function| function.name == name) {
+        let text = format!("`{name}` of {node} is a function and no stream: `cara call {without} {name}` calls it");
+        return Ended::usage(text);
+    }
+    let streams: Vec<_> = published.iter().filter(|function| is_stream(function)).cloned().collect();
+    let text =
+        not_offered(format!("{node} has not published the stream `{name}`"), "as streams it has", name, &streams);
+    // The name that a unit itself gives to it.
+    Ended { exit: Exit::Usage, text, name: "UnknownFunction".into() }.into()
+}
+
+pub(crate) fn is_stream(function: &FunctionInfo) -> bool {
+    function.attributes.stream.is_some()
 }
 
 /// A function that no connected node offers: a mistake, unless one that `is_missing` may offer it.

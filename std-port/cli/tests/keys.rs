@@ -140,6 +140,16 @@ fn managers_know_each_other_and_their_own_vehicles() {
 }
 
 #[test]
+fn a_name_that_one_node_has_is_enough_to_revoke_it() {
+    let home = Home::with_fleet();
+    home.refused(&["revoke", "agv"], 2, "write agv/1 or agv/2");
+    home.refused(&["revoke", "agw"], 2, "no node of the fleet is called `agw`");
+    home.done(&["derive", "lift/3"]);
+    assert!(home.done(&["revoke", "lift"]).contains("lift/3"));
+    assert!(home.done(&["revoke", "lift"]).contains("lift/3 is revoked already"));
+}
+
+#[test]
 fn who_is_revoked_is_in_nobody_s_file() {
     let home = Home::with_fleet();
     let stolen = home.ring("agv/1");
@@ -267,6 +277,14 @@ fn every_mistake_is_reported() {
     assert!(!home.folder().exists());
     let home = Home::with_fleet();
     home.refused(&["new-fleet", "--fleet", "7"], 1, "is there already");
+    // Whatever else is wrong, the advice is a command that this fleet takes.
+    home.refused(&["new-fleet", "--fleet", "7", "agv/8"], 1, "`cara keys derive --fleet 7 agv/8`");
+    home.done(&["derive", "--fleet", "7", "agv/8"]);
+    home.refused(
+        &["new-fleet", "--fleet", "7", "--dir", ".config/cara/keys", "a/9"],
+        1,
+        "--dir .config/cara/keys a/9`",
+    );
     home.refused(&["derive", "agv/3", "--manager", "agv/1"], 2, "agv/1 is no m_unit of the fleet");
     home.refused(&["show", "--fleet", "8"], 1, "`cara keys new-fleet --fleet 8`");
     home.refused(&["show", "agv/1"], 2, "is no file");

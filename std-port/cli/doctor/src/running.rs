@@ -137,7 +137,7 @@ fn clients(global: &Global) -> anyhow::Result<(Vec<Client>, Vec<RunningUnit>, Op
         return Ok((vec![Client::connect(path).map_err(no_unit)?], Vec::new(), None));
     }
     let (running, refused) = match &global.unit {
-        Some(unit) => (named(&unit.to_string()).map_err(no_unit)?, None),
+        Some(unit) => (named(unit).map_err(no_unit)?, None),
         None => match control::running() {
             Ok(running) => (running, None),
             Err(error) => (Vec::new(), Some(error.to_string())),

@@ -6,18 +6,18 @@ mod show;
 
 use report::Done;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_std::keys::location::own_folder;
-use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, parse_node};
+use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, full_name, parse_node};
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::interrupt::Asked;
 use cara_tools::keys::failed;
-use cara_tools::name_and_id::NameAndId;
+use cara_tools::name_and_id::{NameAndId, quoted};
 
 /// Makes the keys of a fleet and of its nodes, shows whose there are, takes nodes out, and changes keys.
 ///
@@ -53,9 +53,9 @@ enum Action {
     },
     /// Takes nodes out: begins a generation of keys that they have nothing of.
     Revoke {
-        /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
-        #[arg(required = true, value_name = "NODE", value_parser = parse_node)]
-        nodes: Vec<Identity>,
+        /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit; NAME where no other node has it.
+        #[arg(required = true, value_name = "NODE")]
+        nodes: Vec<String>,
     },
     /// Changes all keys, in three steps: begins a generation that all nodes take beside the one in use.
     Rotate {
@@ -105,6 +105,23 @@ pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
 }
 
 impl Nodes {
+    /// Says how the nodes are added to a fleet, in words that can be typed as they stand.
+    fn of_fleet_that_is_there(&self, fleet: Fleet, folder: &Path) -> String {
+        let mut command = format!("cara keys derive --fleet {}", fleet.0);
+        if own_folder().is_none_or(|own| own != folder) {
+            command += &format!(" --dir {}", quoted(&folder.display().to_string()));
+        }
+        self.nodes.iter().for_each(|node| command += &format!(" {}", quoted(&full_name(node))));
+        self.manager.iter().for_each(|manager| command += &format!(" --manager {}", quoted(&manager.to_string())));
+        let root = folder.join(format!("fleet-{}.root", fleet.0));
+        format!(
+            "fleet {} is there already: `{command}` adds nodes to it, and another --fleet makes another one. If its root has \
+             been read by others, move {} away: then new-fleet makes all keys anew",
+            fleet.0,
+            root.display()
+        )
+    }
+
     fn managers(&self) -> anyhow::Result<Vec<Identity>> {
         self.manager.iter().map(m_unit).collect()
     }
@@ -115,7 +132,12 @@ fn m_unit(NameAndId { name, id }: &NameAndId) -> anyhow::Result<Identity> {
 }
 
 fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
-    let mut keys = FleetKeys::draw(Fleet(global.fleet.unwrap_or(0))).map_err(failed)?;
+    let fleet = Fleet(global.fleet.unwrap_or(0));
+    // Before what is wrong with the nodes: advice on that names this verb, which fails as long as the fleet is there.
+    if Store::fleets(&folder).contains(&fleet) {
+        return Err(Ended::failed("Keys", nodes.of_fleet_that_is_there(fleet, &folder)));
+    }
+    let mut keys = FleetKeys::draw(fleet).map_err(failed)?;
     let added = keys.add_all(&nodes.nodes, &nodes.managers()?);
     added.map_err(|error| wrong(error.of_new_fleet()))?;
     let asked = Asked::catch()?;
@@ -131,13 +153,32 @@ fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()>
 }
 
 /// Of nodes that were revoked already what was not written is, so that a command that stopped half-way can be repeated.
-fn revoke(nodes: &[Identity], folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+fn revoke(nodes: &[String], folder: PathBuf, global: &Global) -> anyhow::Result<()> {
     let mut store = open(folder, global)?;
     let members = store.keys().members();
+    let nodes = nodes.iter().map(|node| member(members, node)).collect::<anyhow::Result<Vec<_>>>()?;
     let already = nodes.iter().all(|node| members.is_revoked(node));
-    let done = if already { Done::RevokedAlready(nodes) } else { Done::Revoked };
-    store.keys_mut().revoke(nodes).map_err(wrong)?;
+    let done = if already { Done::RevokedAlready(&nodes) } else { Done::Revoked };
+    store.keys_mut().revoke(&nodes).map_err(wrong)?;
     save(done, &store, global)
+}
+
+/// The node that is meant: by its full name, or by a name that only one node of the fleet has.
+fn member(members: &Members, meant: &str) -> anyhow::Result<Identity> {
+    let mut named: Vec<_> = members.nodes().iter().map(|member| &member.identity).collect();
+    named.retain(|node| node.name() == meant);
+    if named.is_empty() {
+        named.extend(members.revoked().iter().map(|revoked| &revoked.identity).filter(|node| node.name() == meant));
+    }
+    match (parse_node(meant), named.as_slice()) {
+        (Ok(identity), _) => Ok(identity),
+        (Err(_), [only]) => Ok((*only).clone()),
+        (Err(error), []) => Err(Ended::usage(format!("no node of the fleet is called `{meant}`: {error}"))),
+        (Err(_), several) => {
+            let names: Vec<_> = several.iter().map(|node| full_name(node)).collect();
+            Err(Ended::usage(format!("several nodes are called `{meant}`: write {}", names.join(" or "))))
+        }
+    }
 }
 
 /// A step of a change of keys.

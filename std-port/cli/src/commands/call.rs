@@ -15,6 +15,7 @@ use crate::text::{Mistake, Written, bind, read, show_call};
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::interrupt;
+use cara_tools::name_and_id::quoted;
 use cara_tools::output::{self, BAD};
 use cara_tools::units::{parse_time, show_micros};
 
@@ -271,8 +272,14 @@ fn show_end(expired: bool, global: &Global) -> std::io::Result<()> {
 /// The function as a node has published it.
 pub(super) fn of_node(operator: &mut Operator, node: &str, function: &str) -> anyhow::Result<FunctionInfo> {
     let functions = nodes::functions(operator, node)?;
-    let found = functions.iter().find(|info| info.name == function).cloned();
-    found.ok_or_else(|| nodes::no_such_function(node, function, &functions))
+    match functions.iter().find(|info| info.name == function) {
+        Some(stream) if nodes::is_stream(stream) => Err(Ended::usage(format!(
+            "`{function}` of {node} is a stream, which is read and not called: `cara stream {} {function}`",
+            quoted(nodes::without_role(node))
+        ))),
+        Some(found) => Ok(found.clone()),
+        None => Err(nodes::no_such_function(node, function, &functions)),
+    }
 }
 
 /// The function as the first of the nodes that offer it has published it.

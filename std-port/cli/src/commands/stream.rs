@@ -43,6 +43,12 @@ fn rate(text: &str) -> Result<f64, String> {
 pub(crate) fn run(Arguments { node, name, rate, span, count }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let mut operator = Operator::open(global, &Need::Node(&node))?;
     let node = nodes::connected(&mut operator, &node)?.selector;
+    if let Some(name) = &name {
+        let published = nodes::functions(&mut operator, &node)?;
+        if !published.iter().any(|function| function.name == *name && nodes::is_stream(function)) {
+            return Err(nodes::no_such_stream(&node, name, &published));
+        }
+    }
     let interval_ms = rate.map_or(0, |rate| (1000.0 / rate).ceil() as u64);
     let question = Question::Stream { node: node.clone(), name: name.clone(), interval_ms };
     let (mut left, mut any) = (count.unwrap_or(u64::MAX), false);

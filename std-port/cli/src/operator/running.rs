@@ -22,10 +22,9 @@ pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option
     if let Some(path) = &global.socket {
         return connect(path).map(Some).map_err(error);
     }
-    let wanted = global.unit.as_ref().map(NameAndId::to_string);
+    let wanted = global.unit.clone();
     let is_meant = |unit: &RunningUnit| {
-        global.fleet.is_none_or(|fleet| fleet == unit.fleet)
-            && wanted.as_ref().is_none_or(|wanted| *wanted == unit.unit)
+        global.fleet.is_none_or(|fleet| fleet == unit.fleet) && wanted.as_ref().is_none_or(|wanted| unit.is(wanted))
     };
     let all = first_of(&directories(), |directory| {
         let mut all = match &wanted {

@@ -126,7 +126,7 @@ fn wrong_usage_ends_with_2() {
         &["call", "--all", "agv-1", "fail"],
         &["call", "agv-1", "fail", "--best-effort"],
         &["call", "agv-1", "fail", "--timeout", "5"],
-        &["scan", "--unit", "manager"],
+        &["scan", "--as", "manager"],
     ];
     for usage in usages {
         assert!(!stage.ends(2, usage).err.is_empty(), "{usage:?}");

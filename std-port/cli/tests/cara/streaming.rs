@@ -96,3 +96,21 @@ fn one_connection_gets_the_streams_of_all_nodes_also_of_later_ones() {
     closer.close();
     assert_eq!(next(), None, "the connection was closed from elsewhere");
 }
+
+#[test]
+fn streams_and_functions_are_told_apart() {
+    let (stage, agv, _pose) = stage();
+    let halt = |_: &cara_std::Served, _: &mut cara_std::ParametersView| Ok(());
+    let options = cara_std::ServiceOptions::new();
+    agv.my_function_list().add_service(&"halt()".parse().unwrap(), options, halt).unwrap();
+    agv.publish_my_function_list().unwrap();
+    crate::support::until("halt is published", || stage.cara(&["functions", "agv-1"]).everything().contains("halt"));
+    let typo = stage.ends(2, &["stream", "agv-1", "pos"]);
+    typo.says("did you mean `pose`?").says("battery() -> (percent: float)");
+    assert!(!typo.err.contains("halt"), "{}", typo.err);
+    stage.ends(2, &["stream", "agv-1", "halt"]).says("`cara call agv-1/11 halt`");
+    for all in [&["call", "agv-1", "pose"][..], &["call", "--all", "pose"]] {
+        stage.ends(2, all).says("is a stream").says("`cara stream agv-1/11 pose`");
+    }
+    agv.stop();
+}

@@ -20,9 +20,9 @@ pub struct Global {
     /// Print JSON: one object, or one a line where several come; an error as an object on standard error.
     #[arg(long, global = true)]
     pub json: bool,
-    /// Ask this one of the units that run on this host.
-    #[arg(long, global = true, value_name = "NAME/ID")]
-    pub unit: Option<NameAndId>,
+    /// Ask this one of the units that run on this host; its name suffices where no other has it.
+    #[arg(long, global = true, value_name = "NAME[/ID]")]
+    pub unit: Option<String>,
     /// Ask the unit with this control socket.
     #[arg(long, global = true, value_name = "PATH")]
     pub socket: Option<PathBuf>,
