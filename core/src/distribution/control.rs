@@ -114,7 +114,7 @@ controls! {
         slot: u16,
         /// Its life.
         generation: u16,
-        /// Least time between two values in milliseconds; [`NO_SUBSCRIPTION`] ends it.
+        /// Least time between two values in milliseconds; [`NO_SUBSCRIPTION`](super::message::NO_SUBSCRIPTION) ends it.
         interval: u32,
     }
     /// The answer to `Subscribe`.
@@ -123,7 +123,7 @@ controls! {
         slot: u16,
         /// Its life.
         generation: u16,
-        /// Least time between two values in milliseconds, [`NO_SUBSCRIPTION`] where it was ended or refused.
+        /// Least time between two values in milliseconds, [`NO_SUBSCRIPTION`](super::message::NO_SUBSCRIPTION) where it was ended or refused.
         interval: u32,
         /// Bytes of values of all streams that the sender sends in a second.
         bytes: u32,

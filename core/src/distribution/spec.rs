@@ -34,7 +34,7 @@ pub(super) struct RawSpec<'a> {
     pub(super) inner: &'a [u8],
 }
 
-/// The arguments or the results of a [`Signature`], in its order.
+/// The arguments or the results of a [`Signature`](super::function::Signature), in its order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VariableSpecs<'a> {
     pub(super) left: u8,

@@ -58,7 +58,7 @@ entry!(node_polled, {
 
 entry!(node_hears, {
     node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes);
-    keep(node().take_duplicate());
+    keep((node().take_duplicate(), node().asked_by().map(|(who, from)| (who.id(), from))));
     node().set_claim(*unknown());
     node().take_over(*unknown());
     node().keep_obeyed(*unknown(), unknown(), *unknown());
