@@ -6,7 +6,7 @@ use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::{commands, node};
 use cara_tools::exit::{self, EXIT_CODES, Ended};
-use cara_tools::global::Global;
+use cara_tools::global::{Global, SHARED_OPTIONS};
 
 /// Shows and calls the nodes of a CARA fleet, through the m_unit that runs on this host or as an m_unit itself.
 #[derive(Parser)]
@@ -45,12 +45,48 @@ pub(crate) enum Verb {
     Man(commands::man::Arguments),
 }
 
-/// The command with the exit codes in the long help of each verb.
+/// The verbs as the help groups them.
+const GROUPS: [(&str, &[&str]); 5] = [
+    ("See", &["scan", "functions", "orders", "watch", "top", "stream", "counters", "ping", "doctor"]),
+    ("Command", &["call", "stop", "reset", "publish", "set", "retire"]),
+    ("Run", &["node", "web"]),
+    ("Set up", &["keys", "access", "provision", "forget-claim"]),
+    ("Shell and manual", &["completions", "man"]),
+];
+
+/// The options and exit codes that all verbs share are in the help of `cara` alone.
+const SHARED: &str = "Options of every verb and exit codes: cara --help";
+
+/// The command, with its verbs in groups in the help.
 pub(crate) fn command() -> Command {
-    CommandLine::command().after_long_help(EXIT_CODES).mut_subcommands(|verb| {
-        let own = verb.get_after_help().map(|text| format!("{text}\n\n"));
-        verb.after_long_help(own.unwrap_or_default() + EXIT_CODES)
-    })
+    let mut command = CommandLine::command();
+    let groups: Vec<_> = GROUPS.iter().map(|(title, verbs)| group(&command, title, verbs)).collect();
+    let template = format!(
+        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n\n{}\n\nOptions:\n{{options}}{{after-help}}",
+        groups.join("\n\n")
+    );
+    command = command.help_template(template).after_long_help(EXIT_CODES);
+    // From here on each verb has the options that all share, to be hidden.
+    command.build();
+    command.mut_subcommands(with_own_options)
+}
+
+/// A group of verbs as text, with the styles of the help.
+fn group(command: &Command, title: &'static str, verbs: &[&str]) -> String {
+    let found = command.get_subcommands().filter(|verb| verbs.contains(&verb.get_name())).cloned();
+    let mut group = Command::new("cara").max_term_width(100).disable_help_flag(true).disable_help_subcommand(true);
+    group = group.subcommand_help_heading(title).subcommands(found).help_template("{all-args}");
+    group.render_help().ansi().to_string().trim_end().to_owned()
+}
+
+/// The help of a verb, and of those below it, without what all share.
+fn with_own_options(verb: Command) -> Command {
+    let own = verb.get_after_help().map(|text| format!("{text}\n\n")).unwrap_or_default();
+    let verb = verb.after_help(own + SHARED).mut_args(|option| {
+        let is_shared = option.get_help_heading() == Some(SHARED_OPTIONS);
+        option.hide_short_help(is_shared).hide_long_help(is_shared)
+    });
+    verb.mut_subcommands(with_own_options)
 }
 
 /// What the user typed; or the exit code when that was a wish for help, or a mistake, which has been printed.
@@ -72,5 +108,16 @@ mod tests {
     #[test]
     fn the_command_line_is_sound() {
         super::command().debug_assert();
+    }
+
+    #[test]
+    fn every_verb_is_in_one_group() {
+        let command = super::command();
+        let mut verbs: Vec<_> = command.get_subcommands().map(clap::Command::get_name).collect();
+        verbs.retain(|verb| *verb != "help");
+        let mut grouped: Vec<_> = super::GROUPS.iter().flat_map(|(_, verbs)| *verbs).copied().collect();
+        verbs.sort_unstable();
+        grouped.sort_unstable();
+        assert_eq!(grouped, verbs);
     }
 }

@@ -12,7 +12,7 @@ const REFERENCE: &str = "../../docs/cara.md";
 /// Every verb of the command, as its help lists them.
 fn verbs(stage: &Stage) -> Vec<String> {
     let help = stage.ends(0, &["--help"]).out;
-    let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+    let listed = help.lines().skip_while(|line| *line != "See:").take_while(|line| *line != "Options:");
     // What goes on in the next line is indented further.
     let verb = |line: &str| Some(line.strip_prefix("  ")?.split(' ').next()?.to_owned());
     let verbs: Vec<_> = listed.filter_map(verb).filter(|verb| !verb.is_empty() && verb != "help").collect();
@@ -24,8 +24,16 @@ fn verbs(stage: &Stage) -> Vec<String> {
 fn every_verb_has_help() {
     let stage = Stage::empty();
     for verb in verbs(&stage) {
-        stage.ends(0, &[&verb, "--help"]).says("Usage: cara ").says("--json").says("Exit codes:");
+        let help = stage.ends(0, &[&verb, "--help"]);
+        help.says("Usage: cara ").says("Options of every verb and exit codes: cara --help");
+        assert!(!help.out.contains("--json") && !help.out.contains("130 "), "{}", help.out);
     }
+    stage.ends(0, &["--help"]).says("--json").says("Exit codes:");
+    let below = stage.ends(0, &["keys", "derive", "--help"]);
+    assert!(below.out.contains("--dir") && !below.out.contains("--json"), "{}", below.out);
+    // Options that the help leaves out are taken, and completed.
+    stage.ends(0, &["man", "--json"]);
+    stage.ends(0, &["completions", "fish"]).says("__fish_cara_using_subcommand scan\" -l json");
 }
 
 #[test]
@@ -126,13 +134,15 @@ fn the_reference_has_every_key_of_the_json() {
 fn the_reference_has_every_verb_option_and_exit_code() {
     let reference = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(REFERENCE)).unwrap();
     let stage = Stage::empty();
-    for verb in verbs(&stage) {
-        assert!(reference.contains(&format!("## `cara {verb}")), "no section for {verb}");
-        let help = stage.ends(0, &[&verb, "-h"]).out;
+    let verbs = verbs(&stage);
+    verbs.iter().for_each(|verb| assert!(reference.contains(&format!("## `cara {verb}")), "no section for {verb}"));
+    for verb in verbs.iter().map(Some).chain([None]) {
+        let words: Vec<_> = verb.map(String::as_str).into_iter().chain(["-h"]).collect();
+        let help = stage.ends(0, &words).out;
         let options =
             help.split(|c: char| !c.is_ascii_alphanumeric() && c != '-').filter(|word| word.starts_with("--"));
         for option in options.filter(|option| option.len() > 2) {
-            assert!(reference.contains(&format!("`{option}")), "no {option} of cara {verb}");
+            assert!(reference.contains(&format!("`{option}")), "no {option} of cara {verb:?}");
         }
     }
     let help = stage.ends(0, &["--help"]).out;

@@ -13,9 +13,12 @@ use crate::name_and_id::NameAndId;
 /// How long a command as a manager waits for nodes, unless told.
 const WAIT: Duration = Duration::from_secs(5);
 
+/// The heading of the options that all verbs share.
+pub const SHARED_OPTIONS: &str = "Options of every verb";
+
 /// Options of every verb.
 #[derive(Args, Clone, Debug)]
-#[command(next_help_heading = "Options of every verb")]
+#[command(next_help_heading = SHARED_OPTIONS)]
 pub struct Global {
     /// Print JSON: one object, or one a line where several come; an error as an object on standard error.
     #[arg(long, global = true)]
