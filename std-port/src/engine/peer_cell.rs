@@ -20,18 +20,18 @@ use crate::locks::lock;
 /// The counters of a link, or of many.
 pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 
-/// A node, connected or not.
+/// A node, connected or not. There may be thousands: what most never have is boxed.
 pub(crate) struct PeerCell {
     pub(crate) identity: Identity,
     link: Mutex<Option<Arc<LinkCell>>>,
     /// When it joined last.
     joined: Mutex<Option<std::time::Instant>>,
     /// When and why its last link ended.
-    left: Mutex<Option<(std::time::Instant, CloseReason)>>,
-    /// When and from where it asked for this unit last.
-    searched: Mutex<Option<(std::time::Instant, SocketAddr)>>,
+    left: Mutex<Option<Box<(std::time::Instant, CloseReason)>>>,
+    /// When and from where it asked for this unit last, since it was connected.
+    searched: Mutex<Option<Box<(std::time::Instant, SocketAddr)>>>,
     /// What differs for this node from the unit's constraints, whether it is connected or not.
-    own: Mutex<Option<OwnConstraints>>,
+    own: Mutex<Option<Box<OwnConstraints>>>,
     /// The newest call of each function that was to move something, and the link that it was made by.
     orders: Mutex<BTreeMap<String, (u32, CallId)>>,
     /// Its streams that are read here.
@@ -70,17 +70,18 @@ impl PeerCell {
 
     /// How long ago it left, and why, while it is not connected.
     pub(crate) fn left(&self) -> Option<(std::time::Duration, CloseReason)> {
-        let left = *lock(&self.left);
+        let left = lock(&self.left).as_deref().copied();
         left.filter(|_| !self.is_connected()).map(|(at, reason)| (at.elapsed(), reason))
     }
 
     pub(super) fn heard_searching(&self, from: SocketAddr) {
-        *lock(&self.searched) = Some((std::time::Instant::now(), from));
+        *lock(&self.searched) = Some(Box::new((std::time::Instant::now(), from)));
     }
 
     /// How long ago it was heard searching for this unit, and from where, while it is not connected and if that was after it left.
     pub(crate) fn searched(&self) -> Option<(std::time::Duration, SocketAddr)> {
-        let (searched, left) = (*lock(&self.searched), *lock(&self.left));
+        let searched = lock(&self.searched).as_deref().copied();
+        let left = lock(&self.left).as_deref().copied();
         let is_news = |at| left.is_none_or(|(left, _)| left < at);
         let heard = searched.filter(|(at, _)| !self.is_connected() && is_news(*at));
         heard.map(|(at, from)| (at.elapsed(), from))
@@ -97,7 +98,7 @@ impl PeerCell {
     }
 
     pub(super) fn own_constraints(&self, unit: Constraints) -> Option<Constraints> {
-        let own = (*lock(&self.own))?;
+        let own = lock(&self.own).as_deref().copied()?;
         let OwnConstraints { request_timeout, minimum_interval, calls_per_peer } = own;
         Some(Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit })
     }
@@ -108,7 +109,7 @@ impl PeerCell {
         if wanted != (Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit }) {
             return Err(Error::BadConstraint);
         }
-        *lock(&self.own) = Some(OwnConstraints { request_timeout, minimum_interval, calls_per_peer });
+        *lock(&self.own) = Some(Box::new(OwnConstraints { request_timeout, minimum_interval, calls_per_peer }));
         Ok(())
     }
 
@@ -174,13 +175,14 @@ impl PeerCell {
         let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
         self.retired.store(false, Ordering::Relaxed);
         *current = Some(link);
+        *lock(&self.searched) = None;
     }
 
     /// The link has ended; a newer one stays.
     pub(crate) fn leave(&self, link: &LinkCell, reason: CloseReason) {
         let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
         if current.as_ref().is_some_and(|current| current.serial == link.serial) {
-            *lock(&self.left) = Some((std::time::Instant::now(), reason));
+            *lock(&self.left) = Some(Box::new((std::time::Instant::now(), reason)));
             *current = None;
         }
     }

@@ -3,7 +3,7 @@
 //! However many handles of this process read a stream of a node, there is one subscription on the link: at the shortest
 //! interval that any of them wants. It is made again whenever the node tells its list, so also after a reconnection.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::task::Waker;
@@ -212,7 +212,7 @@ impl Watched {
 
 /// The streams of one node that are read here.
 #[derive(Default)]
-pub(crate) struct Streams(Mutex<HashMap<String, Arc<Watched>>>);
+pub(crate) struct Streams(Mutex<BTreeMap<String, Arc<Watched>>>);
 
 impl Streams {
     /// The stream of this name, if it is read here.
