@@ -1,7 +1,9 @@
 //! The nodes that this unit knows, in the order in which they first told what they offer: a node keeps its place when
 //! another one leaves, and finds it again when it comes back.
 
+use std::borrow::Borrow;
 use std::collections::HashMap;
+use std::hash::{Hash, Hasher};
 use std::net::SocketAddr;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, RwLock, RwLockReadGuard, RwLockWriteGuard};
@@ -20,9 +22,32 @@ use crate::locks::{Held, Rank};
 #[derive(Default)]
 pub(crate) struct Peers {
     list: Vec<Arc<PeerCell>>,
-    by_identity: HashMap<Identity, usize>,
+    by_identity: HashMap<Named, usize>,
     roster: Roster,
 }
+
+/// A node as it is found by its identity, which is not copied for that.
+struct Named(Arc<PeerCell>);
+
+impl Borrow<Identity> for Named {
+    fn borrow(&self) -> &Identity {
+        &self.0.identity
+    }
+}
+
+impl Hash for Named {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.0.identity.hash(state);
+    }
+}
+
+impl PartialEq for Named {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.identity == other.0.identity
+    }
+}
+
+impl Eq for Named {}
 
 impl Peers {
     /// The node of an identity is connected by `link`. A new one gets the next place, or that of the first node that is
@@ -51,7 +76,7 @@ impl Peers {
                 self.list.len() - 1
             }
         };
-        self.by_identity.insert(identity.clone(), index);
+        self.by_identity.insert(Named(peer.clone()), index);
         peer
     }
 
@@ -68,7 +93,7 @@ impl Peers {
         let Some(place) = self.list.iter().take(own).position(waits) else { return };
         self.list.swap(place, own);
         for index in [place, own] {
-            self.by_identity.extend(self.list.get(index).map(|peer| (peer.identity.clone(), index)));
+            self.by_identity.extend(self.list.get(index).map(|peer| (Named(peer.clone()), index)));
         }
     }
 

@@ -46,7 +46,7 @@ impl<P: Port> Session<P> {
         arguments: &mut ParametersView,
     ) -> Option<Result<Incoming, Error>> {
         let (functions, now, access, remote) = (cx.functions, cx.now, cx.table(), self.remote.as_ref());
-        if self.constraints.scheduling == Scheduling::EarliestDeadline && self.calls.put_next_first(now) {
+        if self.goes_by_deadline() && self.calls.put_next_first(now) {
             self.link.counters.count(LinkCounter::RequestsAhead);
         }
         let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
@@ -164,9 +164,13 @@ impl<P: Port> Session<P> {
         Ok(())
     }
 
+    fn goes_by_deadline(&self) -> bool {
+        P::SCHEDULES && self.constraints.scheduling == Scheduling::EarliestDeadline
+    }
+
     /// A call that waits is refused in favour of one with an earlier deadline that came later. Whether that can wait now.
     pub(super) fn displace(&mut self, cx: &mut Context<'_, P>, newcomer: &CallHead, length: usize) -> bool {
-        if self.constraints.scheduling == Scheduling::Fifo {
+        if !self.goes_by_deadline() {
             return false;
         }
         let displaced = self.calls.displace(cx.now, newcomer.priority, newcomer.deadline, length);
