@@ -100,9 +100,15 @@ fn requests(clock: &mut Clock) {
 
 #[inline(never)]
 fn nodes(clock: &mut Clock) {
-    static MEMORY: StaticCell<DiscoveryMemory<{ NODES + Discovery::SPARE }>> = StaticCell::new();
-    let mut manager = Discovery::new(MEMORY.init_with(DiscoveryMemory::new));
+    let mut manager = Discovery::new(memory_of_nodes());
     count_all(clock, Discovery::operations(NODES as u32), &mut manager);
+}
+
+/// What it is made of lies on the stack first, and is not to be there while a session is.
+#[inline(never)]
+fn memory_of_nodes() -> &'static mut DiscoveryMemory<{ NODES + Discovery::SPARE }> {
+    static MEMORY: StaticCell<DiscoveryMemory<{ NODES + Discovery::SPARE }>> = StaticCell::new();
+    MEMORY.init_with(DiscoveryMemory::new)
 }
 
 #[inline(never)]
