@@ -17,7 +17,7 @@ use cara_core::services::lease::Latch;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::session::{Publication, SessionStorage};
-use cara_core::services::{CallHead, Port};
+use cara_core::services::{Port, RunningCall};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;
 use embassy_net::Stack;
@@ -103,7 +103,7 @@ pub struct Resources<
 struct SessionMemory<const OWN: usize, const THEIR: usize, const CALLS: usize> {
     small: MaybeUninit<[u8; LINK_BUFFER_BYTES]>,
     pending: MaybeUninit<[Option<Pending>; CALLS]>,
-    running: MaybeUninit<[Option<CallHead>; CALLS]>,
+    running: MaybeUninit<[Option<RunningCall>; CALLS]>,
     publications: MaybeUninit<[Publication; OWN]>,
     their_functions: MaybeUninit<[Entry; THEIR]>,
     their_signatures: MaybeUninit<[[u8; SIGNATURE]; THEIR]>,

@@ -66,7 +66,7 @@ pub struct Ticket {
 
 /// Whether a call that runs has been given up by its caller.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Cancelled {
+pub(crate) enum Cancelled {
     /// It is wanted.
     #[default]
     No,
@@ -78,35 +78,48 @@ pub enum Cancelled {
 
 /// A call that was accepted, without its arguments.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct CallHead {
+pub(crate) struct CallHead {
     /// The caller's id of it.
-    pub id: u32,
+    pub(crate) id: u32,
     /// The function called.
-    pub slot: Slot,
+    pub(crate) slot: Slot,
     /// The life of the function.
-    pub generation: Generation,
+    pub(crate) generation: Generation,
     /// Its class.
-    pub priority: Priority,
+    pub(crate) priority: Priority,
     /// Whether the caller waits.
-    pub wants_reply: bool,
+    pub(crate) wants_reply: bool,
     /// Whether the caller wants to be told progress.
-    pub wants_progress: bool,
-    /// Whether the caller has given it up while it ran.
-    pub cancelled: Cancelled,
+    pub(crate) wants_progress: bool,
     /// Whether it takes over what another caller moves.
-    pub takes_over: bool,
+    pub(crate) takes_over: bool,
     /// Whether an operator of the caller's unit made it.
-    pub operator: bool,
-    /// Whether its results let what was stopped move again; known once it begins.
-    pub resets: bool,
+    pub(crate) operator: bool,
     /// Whether it moves, stops or resets something: no call overtakes it, and it overtakes none.
-    pub keeps_order: bool,
+    pub(crate) keeps_order: bool,
     /// After this the caller no longer waits, and the call is not begun.
-    pub deadline: Instant,
+    pub(crate) deadline: Instant,
     /// The earliest time at which the caller can have made the request: its age is counted from here.
-    pub sent_at: Instant,
+    pub(crate) sent_at: Instant,
     /// The caller's number of it: a call that it made later has a higher one.
-    pub number: u32,
+    pub(crate) number: u32,
+}
+
+/// A call that runs: what its answer needs. There is room for many on each link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RunningCall {
+    pub(crate) id: u32,
+    pub(crate) slot: Slot,
+    pub(crate) generation: Generation,
+    pub(crate) priority: Priority,
+    pub(crate) wants_reply: bool,
+    pub(crate) wants_progress: bool,
+    /// Whether the caller has given it up.
+    pub(crate) cancelled: Cancelled,
+    /// Whether its results let what was stopped move again.
+    pub(crate) resets: bool,
+    pub(crate) deadline: Instant,
+    pub(crate) sent_at: Instant,
 }
 
 /// So many requests that were given up before they arrived are remembered beside the windows.
@@ -125,7 +138,7 @@ pub(crate) struct Calls<S: Storage> {
     windows: [Window; 4],
     /// Requests that the caller gave up before they arrived here.
     unwanted: heapless::Vec<(u32, Priority), UNWANTED>,
-    running: S::Slice<Option<CallHead>>,
+    running: S::Slice<Option<RunningCall>>,
     queues: [Option<Queue<S>>; 3],
     /// Emergencies that wait: one of the longest, or several short ones.
     emergencies: ([u8; HEAD_BYTES + EMERGENCY_BYTES], Span),
@@ -162,7 +175,7 @@ pub const fn slots_for(running: usize) -> usize {
 
 impl<S: Storage> Calls<S> {
     /// `running` bounds the calls that run at the same time; one slot in four, at least one, is kept for emergencies.
-    pub(crate) fn new(running: S::Slice<Option<CallHead>>) -> Self {
+    pub(crate) fn new(running: S::Slice<Option<RunningCall>>) -> Self {
         Self {
             windows: [Window::default(); 4],
             unwanted: heapless::Vec::new(),
@@ -295,7 +308,7 @@ impl<S: Storage> Calls<S> {
     }
 
     fn emergencies_of(&self, slot: Slot) -> usize {
-        let same = |head: &&CallHead| head.slot == slot && head.priority == Priority::Emergency;
+        let same = |head: &&RunningCall| head.slot == slot && head.priority == Priority::Emergency;
         let running = self.running.iter().flatten().filter(same).count();
         let (bytes, span) = &self.emergencies;
         running.saturating_add(span.heads(bytes).filter(|(_, head, _)| head.slot == slot).count())
@@ -308,16 +321,29 @@ impl<S: Storage> Calls<S> {
     }
 
     /// Begins a call; one of an emergency service may take a slot that is kept for those.
-    pub(crate) fn begin(&mut self, head: CallHead, is_emergency: bool) -> Result<Ticket, Error> {
+    pub(crate) fn begin(&mut self, head: &CallHead, resets: bool, is_emergency: bool) -> Result<Ticket, Error> {
         let index = self.free_slot(is_emergency).ok_or(Error::Busy)?;
         let place = self.running.get_mut(index).ok_or(Error::Full(Limit::IncomingCalls))?;
-        *place = Some(head);
+        let CallHead { id, slot, generation, priority, wants_reply, wants_progress, deadline, sent_at, .. } = *head;
+        let cancelled = Cancelled::No;
+        *place = Some(RunningCall {
+            id,
+            slot,
+            generation,
+            priority,
+            wants_reply,
+            wants_progress,
+            cancelled,
+            resets,
+            deadline,
+            sent_at,
+        });
         self.held = self.held.saturating_add(1);
         Ok(Ticket { index: index as u16, id: head.id })
     }
 
     /// The call of a ticket, unless it was answered already.
-    pub(crate) fn call(&self, ticket: Ticket) -> Option<CallHead> {
+    pub(crate) fn call(&self, ticket: Ticket) -> Option<RunningCall> {
         self.running.get(usize::from(ticket.index)).copied().flatten().filter(|head| head.id == ticket.id)
     }
 
@@ -334,7 +360,7 @@ impl<S: Storage> Calls<S> {
 
     /// A call that was given up, of which the port does not know.
     pub(crate) fn take_cancelled(&mut self) -> Option<Ticket> {
-        let is_untold = |head: &CallHead| head.cancelled == Cancelled::Untold;
+        let is_untold = |head: &RunningCall| head.cancelled == Cancelled::Untold;
         let index = self.running.iter().position(|head| head.as_ref().is_some_and(is_untold))?;
         let head = self.running.get_mut(index)?.as_mut()?;
         head.cancelled = Cancelled::Report;
@@ -451,7 +477,7 @@ impl<S: Storage> Calls<S> {
     }
 
     /// Moves the running calls to more slots. Returns the slots that are not needed any more.
-    pub(crate) fn grow(&mut self, mut running: S::Slice<Option<CallHead>>) -> S::Slice<Option<CallHead>> {
+    pub(crate) fn grow(&mut self, mut running: S::Slice<Option<RunningCall>>) -> S::Slice<Option<RunningCall>> {
         if running.len() < self.running.len() {
             return running;
         }
@@ -467,7 +493,7 @@ impl<S: Storage> Calls<S> {
     }
 
     /// The slots, all empty.
-    pub(crate) fn into_slots(mut self) -> S::Slice<Option<CallHead>> {
+    pub(crate) fn into_slots(mut self) -> S::Slice<Option<RunningCall>> {
         self.running.iter_mut().for_each(|slot| *slot = None);
         self.running
     }
@@ -613,10 +639,8 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         priority,
         wants_reply: wants_reply & 1 != 0,
         wants_progress: wants_progress != 0,
-        cancelled: Cancelled::No,
         takes_over: takes_over != 0,
         operator: operator != 0,
-        resets: false,
         keeps_order: wants_reply & 2 != 0,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
         sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),

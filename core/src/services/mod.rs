@@ -198,7 +198,7 @@ pub mod stream;
 pub mod typed;
 
 pub use crate::host::port::Port;
-pub use calls::{CallHead, Ticket, slots_for};
+pub use calls::{RunningCall, Ticket, slots_for};
 
 use crate::distribution::function_list::{Function, FunctionList, Generation, Slot};
 use crate::distribution::hello::Hello;

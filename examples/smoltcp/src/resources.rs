@@ -7,7 +7,7 @@ use cara_core::config::{LINK_BUFFER_BYTES, PLAIN_PORT};
 use cara_core::distribution::connection_handler::{Finding, Known, NodeStorage, Order};
 use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::parameters::Parameters;
-use cara_core::services::CallHead;
+use cara_core::services::RunningCall;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
@@ -72,7 +72,7 @@ pub struct Resources {
     signatures: [u8; SIGNATURES],
     small: [u8; LINK_BUFFER_BYTES],
     pending: [Option<Pending>; CALLS],
-    running: [Option<CallHead>; CALLS + 1],
+    running: [Option<RunningCall>; CALLS + 1],
     publications: [Publication; FUNCTIONS],
     their_functions: [Entry; FUNCTIONS],
     their_signatures: [u8; SIGNATURES],

@@ -16,7 +16,7 @@ use cara_core::services::hub::Hub;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::session::{Event, Publication, Session, SessionConfig, SessionStorage};
-use cara_core::services::{CallHead, Context};
+use cara_core::services::{Context, RunningCall};
 use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};
 
@@ -41,7 +41,7 @@ pub struct DiscoveryMemory<const NODES: usize> {
     pool: [Option<Buffer<Lent>>; 1],
     small: [u8; LINK_BUFFER_BYTES],
     pending: [Option<Pending>; 1],
-    running: [Option<CallHead>; 2],
+    running: [Option<RunningCall>; 2],
     publications: [Publication; 1],
     their_functions: [Entry; 1],
     their_signatures: [u8; 8],

@@ -22,7 +22,7 @@ use cara_core::services::requests::{CallId, Pending};
 use cara_core::services::session::{
     Event, Incoming, Publication, RequestOptions, Session, SessionConfig, SessionStorage,
 };
-use cara_core::services::{CallHead, Context, Port};
+use cara_core::services::{Context, Port, RunningCall};
 use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};
 
@@ -50,7 +50,7 @@ pub struct PairMemory<const BUFFER: usize, const ARGUMENTS: usize> {
 struct SideMemory<const BUFFER: usize> {
     small: [u8; LINK_BUFFER_BYTES],
     pending: [Option<Pending>; CALLS],
-    running: [Option<CallHead>; CALLS],
+    running: [Option<RunningCall>; CALLS],
     publications: [Publication; FUNCTIONS],
     their_functions: [Entry; FUNCTIONS],
     their_signatures: [u8; SIGNATURES],

@@ -23,10 +23,8 @@ fn head(id: u32, priority: Priority) -> CallHead {
         priority,
         wants_reply: id.is_multiple_of(2),
         wants_progress: id.is_multiple_of(7),
-        cancelled: Cancelled::No,
         takes_over: id.is_multiple_of(3),
         operator: id.is_multiple_of(5),
-        resets: false,
         keeps_order: id.is_multiple_of(11),
         deadline: Instant::from_micros(u64::from(id) << 20),
         sent_at: Instant::from_micros(u64::from(id) << 10),
@@ -131,9 +129,9 @@ fn ids_far_ahead_forget_what_was_before() {
 #[test]
 fn a_ticket_is_good_once_and_for_its_call_only() {
     let mut calls = calls(2);
-    let first = calls.begin(head(1, Priority::Normal), false).unwrap();
+    let first = calls.begin(&head(1, Priority::Normal), false, false).unwrap();
     assert!(calls.end(first) && !calls.end(first));
-    let second = calls.begin(head(2, Priority::Normal), false).unwrap();
+    let second = calls.begin(&head(2, Priority::Normal), false, false).unwrap();
     assert_eq!((calls.call(first), calls.held()), (None, 1));
     assert!(!calls.end(first));
     assert_eq!(calls.call(second).unwrap().id, 2);
@@ -143,11 +141,15 @@ fn a_ticket_is_good_once_and_for_its_call_only() {
 fn an_emergency_finds_a_slot_when_all_others_are_taken() {
     let mut calls = calls(3);
     for id in 1..=2 {
-        calls.begin(head(id, Priority::Normal), false).unwrap();
+        calls.begin(&head(id, Priority::Normal), false, false).unwrap();
     }
-    assert_eq!(calls.begin(head(3, Priority::High), false), Err(Error::Busy));
-    assert_eq!(calls.begin(head(4, Priority::Emergency), false), Err(Error::Busy), "its class alone is not enough");
-    assert!(calls.begin(head(4, Priority::Emergency), true).is_ok());
+    assert_eq!(calls.begin(&head(3, Priority::High), false, false), Err(Error::Busy));
+    assert_eq!(
+        calls.begin(&head(4, Priority::Emergency), false, false),
+        Err(Error::Busy),
+        "its class alone is not enough"
+    );
+    assert!(calls.begin(&head(4, Priority::Emergency), false, true).is_ok());
     assert_eq!(calls.admit(Slot(9), false, 3), Err(Error::Busy));
     assert_eq!(calls.admit(Slot(9), true, 3), Ok(()));
 }
@@ -157,11 +159,11 @@ fn of_one_emergency_service_two_calls_run_and_leave_slots_for_those_of_others() 
     let mut calls = calls(slots_for(16));
     let same = |id| CallHead { slot: Slot(7), ..head(id, Priority::Emergency) };
     for id in 1..=16 {
-        calls.begin(head(id, Priority::Normal), false).unwrap();
+        calls.begin(&head(id, Priority::Normal), false, false).unwrap();
     }
     for id in 17..=18 {
         assert_eq!(calls.admit(Slot(7), true, 1), Ok(()));
-        calls.begin(same(id), true).unwrap();
+        calls.begin(&same(id), false, true).unwrap();
     }
     assert_eq!(calls.admit(Slot(7), true, 1), Err(Error::Busy));
     assert_eq!(calls.admit(Slot(8), true, 1), Ok(()));
@@ -179,12 +181,12 @@ fn the_slots_that_are_asked_for_are_those_that_other_calls_may_have() {
 #[test]
 fn a_running_call_keeps_its_ticket_when_there_are_more_slots() {
     let mut calls = calls(slots_for(1));
-    let first = calls.begin(head(1, Priority::Normal), false).unwrap();
+    let first = calls.begin(&head(1, Priority::Normal), false, false).unwrap();
     assert!(!calls.is_idle(Priority::Normal));
     assert_eq!(calls.grow(vec![None; 1].into()).len(), 1, "fewer are given back");
-    assert_eq!(calls.grow(vec![Some(head(9, Priority::Normal)); slots_for(3)].into()).len(), slots_for(1));
+    assert_eq!(calls.grow(vec![calls.call(first); slots_for(3)].into()).len(), slots_for(1));
     assert_eq!((calls.slots(), calls.running.iter().flatten().count()), (slots_for(3), 1));
-    let second = calls.begin(head(2, Priority::Normal), false).unwrap();
+    let second = calls.begin(&head(2, Priority::Normal), false, false).unwrap();
     assert!(calls.end(first) && calls.end(second) && !calls.end(first));
 }
 
@@ -192,9 +194,9 @@ fn a_running_call_keeps_its_ticket_when_there_are_more_slots() {
 fn a_call_begins_while_others_of_its_class_run_and_never_before_one_that_waits() {
     let (mut calls, mut pool) = (calls(slots_for(2)), pool(3, 100));
     assert!(calls.is_idle(Priority::Normal));
-    let first = calls.begin(head(1, Priority::Normal), false).unwrap();
+    let first = calls.begin(&head(1, Priority::Normal), false, false).unwrap();
     assert!(calls.is_idle(Priority::Normal), "one runs, and there is room for another");
-    calls.begin(head(2, Priority::Normal), false).unwrap();
+    calls.begin(&head(2, Priority::Normal), false, false).unwrap();
     assert!(!calls.is_idle(Priority::Normal));
     calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Normal), b"").unwrap();
     assert!(!calls.can_begin());
@@ -218,7 +220,7 @@ fn room_ends_with_the_calls_that_may_wait_or_with_the_bytes() {
 fn one_emergency_waits_without_a_buffer() {
     let (mut calls, mut pool) = (calls(3), pool(0, 0));
     for id in 11..=13 {
-        calls.begin(head(id, Priority::Emergency), true).unwrap();
+        calls.begin(&head(id, Priority::Emergency), false, true).unwrap();
     }
     calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Emergency), &[1; EMERGENCY_BYTES]).unwrap();
     assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Emergency), b""), Err(Error::Busy));
@@ -229,7 +231,7 @@ fn one_emergency_waits_without_a_buffer() {
 #[test]
 fn several_short_emergencies_wait_in_their_order() {
     let (mut calls, mut pool) = (calls(1), pool(0, 0));
-    let running = calls.begin(head(11, Priority::Emergency), true).unwrap();
+    let running = calls.begin(&head(11, Priority::Emergency), false, true).unwrap();
     let same = |id| CallHead { slot: Slot(7), ..head(id, Priority::Emergency) };
     for id in 2..=7 {
         calls.note(Priority::Emergency, id);
@@ -260,7 +262,7 @@ fn one_request_may_come_early_by_an_interval() {
 #[test]
 fn the_end_of_a_link_forgets_what_waits_and_keeps_what_runs() {
     let (mut calls, mut pool) = (calls(3), pool(4, 100));
-    let running = calls.begin(head(1, Priority::Normal), false).unwrap();
+    let running = calls.begin(&head(1, Priority::Normal), false, false).unwrap();
     calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Normal), b"").unwrap();
     calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::High), b"").unwrap();
     calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Emergency), b"").unwrap();

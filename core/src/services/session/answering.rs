@@ -13,7 +13,7 @@ use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
-use crate::services::calls::{CallHead, Ticket};
+use crate::services::calls::{CallHead, RunningCall, Ticket};
 use crate::services::{Context, Port};
 
 impl<P: Port> Session<P> {
@@ -93,7 +93,7 @@ impl<P: Port> Session<P> {
     pub(super) fn begin(
         &mut self,
         cx: &mut Context<'_, P>,
-        mut head: CallHead,
+        head: CallHead,
         attributes: &Attributes,
     ) -> Result<Incoming, Error> {
         let lease = attributes.lease;
@@ -101,9 +101,8 @@ impl<P: Port> Session<P> {
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
-        head.resets = attributes.reset;
         // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
-        let ticket = self.calls.begin(head, is_emergency(attributes, head.priority))?;
+        let ticket = self.calls.begin(&head, attributes.reset, is_emergency(attributes, head.priority))?;
         let order = match lease.map_or(Ok(None), |length| self.grant(cx, &head, length)) {
             Ok(order) => order,
             Err(error) => {
@@ -191,7 +190,7 @@ impl<P: Port> Session<P> {
     fn send_results(
         &mut self,
         cx: &mut Context<'_, P>,
-        head: &CallHead,
+        head: &RunningCall,
         results: &ParametersView,
     ) -> Result<(), Error> {
         let functions = cx.functions;

@@ -16,7 +16,7 @@ use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::{LinkCounter, Span};
 use crate::host::frame::Frame;
-use crate::services::calls::{CallHead, Cancelled, Ticket};
+use crate::services::calls::{Cancelled, RunningCall, Ticket};
 use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
 use crate::time::Instant;
@@ -107,7 +107,7 @@ impl<P: Port> Session<P> {
     pub(super) fn send_failure(
         &mut self,
         cx: &mut Context<'_, P>,
-        head: &CallHead,
+        head: &RunningCall,
         error: Error,
         failure: Option<&Failure>,
     ) -> Result<(), Error> {

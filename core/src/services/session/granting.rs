@@ -8,7 +8,7 @@ use crate::distribution::identity::Identity;
 use crate::distribution::message::{Control, Release, Renewal, RequestHeader};
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
-use crate::services::calls::{CallHead, Cancelled};
+use crate::services::calls::{CallHead, Cancelled, RunningCall};
 use crate::services::lease::{Claim, Granted, Latch, Lease, LeaseEnd, Order, Service};
 use crate::services::{Context, Port};
 use crate::storage::take_at;
@@ -179,7 +179,7 @@ impl<P: Port> Session<P> {
     /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
     /// call was made, which is [`Error::Inhibited`].
     #[inline(never)]
-    pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
+    pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &RunningCall) -> Result<(), Error> {
         // Its caller has been told that it failed, and may not know that anything may move again.
         if head.deadline <= cx.now || head.cancelled != Cancelled::No {
             return Err(Error::Expired);

@@ -18,7 +18,7 @@ use crate::host::connections::{Inbound, LinkCounter, Span};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
-use crate::services::calls::{CallHead, Cancelled, Seen};
+use crate::services::calls::{CallHead, Seen};
 use crate::services::lease::ActuatorState;
 use crate::services::lease::Service;
 use crate::services::requests::{CallId, Pending};
@@ -606,10 +606,8 @@ impl<P: Port> Session<P> {
             priority,
             wants_reply: header.wants_reply,
             wants_progress: header.wants_progress,
-            cancelled: Cancelled::No,
             takes_over: header.takes_over,
             operator: header.operator,
-            resets: false,
             keeps_order: function.attributes.lease.is_some() || function.attributes.stop || function.attributes.reset,
             deadline,
             sent_at,

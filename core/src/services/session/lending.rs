@@ -2,7 +2,7 @@
 //! its peer needs and no more.
 
 use super::publishing::Publication;
-use super::{CallHead, Pending, Session};
+use super::{Pending, RunningCall, Session};
 use crate::services::Port;
 use crate::storage::Storage;
 
@@ -30,8 +30,8 @@ impl<P: Port> Session<P> {
     /// they are fewer than before.
     pub fn lend_running(
         &mut self,
-        running: <P::Storage as Storage>::Slice<Option<CallHead>>,
-    ) -> <P::Storage as Storage>::Slice<Option<CallHead>> {
+        running: <P::Storage as Storage>::Slice<Option<RunningCall>>,
+    ) -> <P::Storage as Storage>::Slice<Option<RunningCall>> {
         self.calls.grow(running)
     }
 

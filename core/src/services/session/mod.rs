@@ -50,7 +50,7 @@ use crate::host::connections::{Link, LinkCounter, Liveness};
 use crate::host::frame::{Frame, HEADER_BYTES};
 use crate::host::mailman::LinkId;
 use crate::host::secure::Secure;
-use crate::services::calls::{CallHead, Calls, Ticket};
+use crate::services::calls::{Calls, RunningCall, Ticket};
 use crate::services::lease::{ActuatorState, Granted, Held, LeaseEnd, Order};
 use crate::services::requests::{CallId, Pending, Requests};
 use crate::services::{Context, Port};
@@ -92,7 +92,7 @@ pub struct SessionStorage<S: Storage> {
     /// One slot per call in flight to the peer.
     pub pending: S::Slice<Option<Pending>>,
     /// One slot per call of the peer that runs here, and one more for emergencies.
-    pub running: S::Slice<Option<CallHead>>,
+    pub running: S::Slice<Option<RunningCall>>,
     /// One slot per function of this unit's own list.
     pub publications: S::Slice<Publication>,
     /// One slot per function of the peer's list that is kept.
