@@ -46,23 +46,13 @@ pub struct Requests<S: Storage> {
     next_id: u32,
     /// How many calls have been made, those among them that wait until they can be sent.
     made: u32,
-    /// No call's deadline is earlier; a call that was closed may leave it too early until the next look.
-    earliest: Instant,
     last_request: Option<Instant>,
 }
 
 impl<S: Storage> Requests<S> {
     /// A table with as many slots as were lent.
     pub fn new(pending: S::Slice<Option<Pending>>) -> Self {
-        Self {
-            pending,
-            in_flight: 0,
-            urgent: [None; EMERGENCY_CALLS],
-            next_id: 1,
-            made: 0,
-            earliest: Instant::FAR_FUTURE,
-            last_request: None,
-        }
+        Self { pending, in_flight: 0, urgent: [None; EMERGENCY_CALLS], next_id: 1, made: 0, last_request: None }
     }
 
     /// [`Error::TooSoon`] when `interval` has not passed since the last request.
@@ -134,7 +124,6 @@ impl<S: Storage> Requests<S> {
             if place.is_none() {
                 *place = Some(pending(id));
                 self.in_flight = self.in_flight.saturating_add(1);
-                self.earliest = self.earliest.min(deadline);
                 return Ok(Some(id));
             }
         }
@@ -149,7 +138,6 @@ impl<S: Storage> Requests<S> {
         if let Some(place) = self.urgent.get_mut(free) {
             *place = Some(Pending { id, ..*pending });
         }
-        self.earliest = self.earliest.min(pending.deadline);
         Ok(Some(id))
     }
 
@@ -176,14 +164,7 @@ impl<S: Storage> Requests<S> {
 
     /// Ends one call whose deadline has passed.
     pub(crate) fn expire(&mut self, now: Instant) -> Option<Pending> {
-        if now < self.earliest {
-            return None;
-        }
         let due = self.waiting().find(|pending| pending.deadline <= now).map(|pending| pending.id);
-        if due.is_none() {
-            let earliest = self.waiting().map(|pending| pending.deadline).min();
-            self.earliest = earliest.unwrap_or(Instant::FAR_FUTURE);
-        }
         due.and_then(|id| self.close(id))
     }
 
@@ -265,8 +246,9 @@ impl<S: Storage> Requests<S> {
         self.in_flight.saturating_add(self.urgent.iter().flatten().count())
     }
 
-    pub(crate) const fn deadline(&self) -> Instant {
-        self.earliest
+    /// When the first call that waits times out.
+    pub(crate) fn deadline(&self) -> Instant {
+        self.waiting().map(|pending| pending.deadline).min().unwrap_or(Instant::FAR_FUTURE)
     }
 
     fn place(&mut self, id: CallId) -> Option<&mut Option<Pending>> {

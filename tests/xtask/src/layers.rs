@@ -32,7 +32,7 @@ struct Purpose {
 }
 
 /// A layer talks to its neighbour. These are the exceptions of services; everything else of host goes through distribution.
-const HOST_FOR_SERVICES: [Purpose; 20] = [
+const HOST_FOR_SERVICES: [Purpose; 21] = [
     Purpose {
         what: "the cipher's trait, over which all of a session is generic",
         places: &["services"],
@@ -46,7 +46,7 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
     Purpose { what: "what a port is made of, for all layers", places: &["services/mod.rs"], items: &["port::Port"] },
     Purpose {
         what: "the peer's host, and where on it its datagrams go",
-        places: &["services/session/inbound.rs", "services/session/proving.rs", "services/session/timing.rs"],
+        places: &["services/session/inbound.rs", "services/session/proving.rs", "services/session/wire.rs"],
         items: &["endpoint::Endpoint"],
     },
     Purpose {
@@ -54,27 +54,28 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
         places: &["services/mod.rs"],
         items: &["mailman::Mailman"],
     },
+    Purpose { what: "the port's name of a link", places: &["services/session/mod.rs"], items: &["mailman::LinkId"] },
     Purpose {
-        what: "the link that a session owns, and the port's name of it",
-        places: &["services/session/mod.rs"],
-        items: &["connections::Link", "mailman::LinkId"],
+        what: "the link, which a session lends to its parts",
+        places: &["services/session/mod.rs", "services/session/wire.rs"],
+        items: &["connections::Link"],
     },
     Purpose {
         what: "whether the peer is still there decides how long a session lasts",
-        places: &["services/session/mod.rs", "services/session/proving.rs"],
+        places: &["services/session/mod.rs", "services/session/proving.rs", "services/session/wire.rs"],
         items: &["connections::Liveness"],
     },
     Purpose {
         what: "what each end tells of the other one's stream and datagrams",
-        places: &["services/session/timing.rs"],
+        places: &["services/session/timing.rs", "services/session/wire.rs"],
         items: &["connections::Report"],
     },
     Purpose {
-        what: "where the details of a failure and progress lie, and their frames",
+        what: "where the details of a failure and progress lie",
         places: &["services/session/details.rs"],
-        items: &["connections::Span", "frame::Frame"],
+        items: &["connections::Span"],
     },
-    Purpose { what: "hello and farewell", places: &["services/session/mod.rs"], items: &["frame::Frame"] },
+    Purpose { what: "farewells", places: &["services/session/wire.rs"], items: &["frame::Frame"] },
     Purpose { what: "a ping", places: &["services/session/pinging.rs"], items: &["frame::Frame"] },
     Purpose {
         what: "session bodies: leases, and what else fits a datagram",
@@ -82,7 +83,7 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
         items: &["frame::Frame"],
     },
     Purpose {
-        what: "proof and renewal of keys: their frames, and where they lie",
+        what: "hello, proof and renewal of keys: their frames, and where they lie",
         places: &["services/session/proving.rs", "services/session/renewing.rs"],
         items: &["connections::Span", "frame::Frame"],
     },
@@ -113,12 +114,12 @@ const HOST_FOR_SERVICES: [Purpose; 20] = [
     },
     Purpose {
         what: "how large a buffer is that a session datagram fits",
-        places: &["services/session/timing.rs"],
+        places: &["services/session/wire.rs"],
         items: &["secure::DATAGRAM_OVERHEAD"],
     },
     Purpose {
         what: "requests and replies are encoded in place",
-        places: &["services/session/answering.rs", "services/session/outbound.rs"],
+        places: &["services/session/outbound.rs", "services/session/wire.rs"],
         items: &["frame::ChunkWriter"],
     },
 ];

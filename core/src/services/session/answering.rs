@@ -1,5 +1,7 @@
 //! Calls of the peer: which one begins, and how it is answered or refused.
 
+use super::details::DetailsPart;
+use super::granting::Granting;
 use super::permitting::{decide_call, log_refusal};
 use super::{Incoming, Phase, Session};
 use crate::ability::DETAILS;
@@ -8,12 +10,11 @@ use crate::distribution::block;
 use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::function_list::Slot;
-use crate::distribution::message::{REPLY_BYTES, encode_failure, encode_reply};
+use crate::distribution::message::{REPLY_BYTES, encode_reply};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
-use crate::host::frame::ChunkWriter;
-use crate::services::calls::{CallHead, RunningCall, Ticket};
+use crate::services::calls::{CallHead, Cancelled, RunningCall, Ticket};
 use crate::services::{Context, Port};
 
 impl<P: Port> Session<P> {
@@ -21,7 +22,7 @@ impl<P: Port> Session<P> {
     /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`, and
     /// [`poll`](Self::poll) before it: what was stopped has its safe hook first.
     pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Incoming> {
-        while self.phase == Phase::Live && !self.obedience.waits {
+        while self.wire.phase == Phase::Live && !self.granting.obedience.waits {
             if let Ok(call) = self.begin_next(cx, arguments)? {
                 return Some(call);
             }
@@ -45,9 +46,9 @@ impl<P: Port> Session<P> {
         cx: &mut Context<'_, P>,
         arguments: &mut ParametersView,
     ) -> Option<Result<Incoming, Error>> {
-        let (functions, now, access, remote) = (cx.functions, cx.now, cx.table(), self.remote.as_ref());
+        let (functions, now, access, remote) = (cx.functions, cx.now, cx.table(), self.wire.remote.as_ref());
         if self.goes_by_deadline() && self.calls.put_next_first(now) {
-            self.link.counters.count(LinkCounter::RequestsAhead);
+            self.wire.link.counters.count(LinkCounter::RequestsAhead);
         }
         let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
             if head.deadline <= now {
@@ -69,24 +70,24 @@ impl<P: Port> Session<P> {
 
     /// Whether [`next_call`](Self::next_call) would look at a call.
     pub fn has_next_call(&self) -> bool {
-        self.phase == Phase::Live && !self.obedience.waits && self.calls.can_begin()
+        self.wire.phase == Phase::Live && !self.granting.obedience.waits && self.calls.can_begin()
     }
 
     /// Whether a moving call waits until the claim that it is made under is stored: a port that does not poll the session in turn
     /// with its calls looks at those when this has changed.
     pub const fn awaits_claim(&self) -> bool {
-        self.obedience.waits
+        self.granting.obedience.waits
     }
 
     /// Whether [`next_emergency`](Self::next_emergency) would look at a call.
     pub fn has_next_emergency(&self) -> bool {
-        self.phase == Phase::Live && self.calls.has_next_emergency()
+        self.wire.phase == Phase::Live && self.calls.has_next_emergency()
     }
 
     /// Whether a request that comes now would be kept if it cannot run at once. A port that stops looking at what it has
     /// read while there is no room lets a peer that sends faster than its calls run feel it, in place of refusing.
     pub fn has_call_room(&self) -> bool {
-        self.calls.has_room(self.constraints.calls_per_peer, self.constraints.message_size as usize)
+        self.calls.has_room(self.wire.constraints.calls_per_peer, self.wire.constraints.message_size as usize)
     }
 
     /// Begins a call of a function that has these attributes.
@@ -98,19 +99,19 @@ impl<P: Port> Session<P> {
     ) -> Result<Incoming, Error> {
         let lease = attributes.lease;
         // A command that waited for its turn is no longer wanted once its lease has been given up.
-        if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
+        if lease.is_some() && self.wire.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
         // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
         let ticket = self.calls.begin(&head, attributes.reset, is_emergency(attributes, head.priority))?;
-        let order = match lease.map_or(Ok(None), |length| self.grant(cx, &head, length)) {
+        let order = match lease.map_or(Ok(None), |length| self.granting.grant(&mut self.wire, cx, &head, length)) {
             Ok(order) => order,
             Err(error) => {
                 self.calls.end(ticket);
                 return Err(error);
             }
         };
-        self.link.counters.count(LinkCounter::RequestsRun);
+        self.wire.link.counters.count(LinkCounter::RequestsRun);
         let CallHead { slot, priority, wants_reply, deadline, .. } = head;
         Ok(Incoming { ticket, slot, priority, wants_reply, deadline, order })
     }
@@ -137,19 +138,19 @@ impl<P: Port> Session<P> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
         // Before the answer leaves: one that says it was reset is true.
         let result = if head.resets {
-            result.and_then(|results| self.reset_orders(cx, &head).map(|()| results))
+            result.and_then(|results| Granting::reset_orders(&mut self.wire, cx, &head).map(|()| results))
         } else {
             result
         };
         // A call that failed wants nothing any more, so what it started stops now: also where its answer has no room yet.
         if result.is_err() {
-            self.cut_call(cx, head.id);
+            self.granting.cut_call(&mut self.wire, cx, head.id);
         }
-        if self.phase == Phase::Live {
+        if self.wire.phase == Phase::Live {
             let sent = match result {
                 Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
                 Ok(_) => Ok(()),
-                Err(error) => self.send_failure(cx, &head, error, failure.filter(|_| DETAILS)),
+                Err(error) => DetailsPart::send_failure(&mut self.wire, cx, &head, error, failure.filter(|_| DETAILS)),
             };
             // Returned before the call is closed: the port tries again, and the lease goes on meanwhile.
             if let Err(error @ Error::Full(_)) = sent {
@@ -163,8 +164,29 @@ impl<P: Port> Session<P> {
         Ok(())
     }
 
+    /// As [`answer`](Self::answer) with [`ServiceError::Failed`], and tells the caller text and values as well: as much of it
+    /// as fits and as the signature declares.
+    pub fn answer_failed(&mut self, cx: &mut Context<'_, P>, ticket: Ticket, failure: &Failure) -> Result<(), Error> {
+        self.answer_with(cx, ticket, Err(failure.error().into()), Some(failure))
+    }
+
+    /// Tells the caller of a running call how far it is. Nothing is sent, and nothing is wrong, where it does not want to know or
+    /// the call has ended.
+    ///
+    /// [`Error::Full`] where the stream has no room now or the last progress was just sent: the port keeps the newest values, and
+    /// tries again after the next [`poll`](Self::poll), or with newer ones. Other errors say that the values do not fit the
+    /// signature, or the peer.
+    pub fn progress(&mut self, cx: &mut Context<'_, P>, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
+        self.details.progress(&mut self.wire, &self.calls, cx, ticket, values)
+    }
+
+    /// Whether the caller of a running call has given it up; also where the call has ended.
+    pub fn is_cancelled(&self, ticket: Ticket) -> bool {
+        self.calls.call(ticket).is_none_or(|head| head.cancelled != Cancelled::No)
+    }
+
     fn goes_by_deadline(&self) -> bool {
-        P::SCHEDULES && self.constraints.scheduling == Scheduling::EarliestDeadline
+        P::SCHEDULES && self.wire.constraints.scheduling == Scheduling::EarliestDeadline
     }
 
     /// A call that waits is refused in favour of one with an earlier deadline that came later. Whether that can wait now.
@@ -174,7 +196,7 @@ impl<P: Port> Session<P> {
         }
         let displaced = self.calls.displace(cx.now, newcomer.priority, newcomer.deadline, length);
         if let Some(CallHead { id, slot, priority, wants_reply, .. }) = displaced {
-            self.link.counters.count(LinkCounter::RequestsDisplaced);
+            self.wire.link.counters.count(LinkCounter::RequestsDisplaced);
             self.refuse_request(cx, id, slot, priority, wants_reply, Error::Busy);
         }
         displaced.is_some()
@@ -183,7 +205,7 @@ impl<P: Port> Session<P> {
     /// Gives up on answering a call whose answer could not be kept.
     pub fn drop_answer(&mut self, ticket: Ticket) {
         if self.calls.end(ticket) {
-            self.link.counters.count(LinkCounter::RepliesDropped);
+            self.wire.link.counters.count(LinkCounter::RepliesDropped);
         }
     }
 
@@ -197,58 +219,27 @@ impl<P: Port> Session<P> {
         let specs = match functions.lookup(head.slot, head.generation) {
             Ok(function) => function.signature.results(),
             // The function was replaced while it ran. Its results have the layout of the old signature, which the caller cannot read.
-            Err(_) => return self.send_error(cx, head.id, head.priority, true, Error::ResultLost),
+            Err(_) => return self.wire.send_error(cx, head.id, head.priority, true, Error::ResultLost),
         };
         let Ok(length) = block::measure(specs, results) else {
-            return self.send_error(cx, head.id, head.priority, true, ServiceError::BadResults.into());
+            return self.wire.send_error(cx, head.id, head.priority, true, ServiceError::BadResults.into());
         };
-        let limit = self.peer_message_size();
+        let limit = self.wire.peer_message_size();
         if length > limit as usize {
-            return self.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit });
+            return self.wire.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit });
         }
         let header = encode_reply(head.id, Ok(()));
         let total = REPLY_BYTES.saturating_add(length);
-        let sent = self.send(cx, head.priority, total, &mut |writer| {
+        let sent = self.wire.send(cx, head.priority, total, &mut |writer| {
             writer.put(&header);
             block::write(specs, results, writer);
         });
         match sent {
             Err(Error::TooLarge { limit }) => {
-                self.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit })
+                self.wire.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit })
             }
             sent => sent,
         }
-    }
-
-    pub(super) fn send_error(
-        &mut self,
-        cx: &mut Context<'_, P>,
-        id: u32,
-        priority: Priority,
-        wants_reply: bool,
-        error: Error,
-    ) -> Result<(), Error> {
-        let header = if wants_reply { encode_reply(id, Err(error)) } else { encode_failure(id, error) };
-        let write: &mut dyn FnMut(&mut ChunkWriter<'_>) = &mut |writer| writer.put(&header);
-        match self.send(cx, priority, REPLY_BYTES, write) {
-            Err(Error::Full(_)) if self.link.send_short(priority, REPLY_BYTES, write) => {
-                self.flush(cx);
-                Ok(())
-            }
-            sent => sent,
-        }
-    }
-
-    /// One piece of code whatever is written, which is a third of what it would be for each kind.
-    pub(super) fn send(
-        &mut self,
-        cx: &mut Context<'_, P>,
-        priority: Priority,
-        total: usize,
-        write: &mut dyn FnMut(&mut ChunkWriter<'_>),
-    ) -> Result<(), Error> {
-        let sent = self.link.send_message(cx.mailman, cx.buffers, priority, total, false, write);
-        self.after_sending(cx, false, sent)
     }
 
     pub(super) fn refuse_request(
@@ -268,24 +259,24 @@ impl<P: Port> Session<P> {
             Error::NotAllowed => LinkCounter::RequestsForbidden,
             _ => LinkCounter::RequestsRejected,
         };
-        self.link.counters.count(counter);
+        self.wire.link.counters.count(counter);
         if error == Error::NotAllowed
             && let Some(function) = cx.functions.function(slot)
         {
-            log_refusal(cx, self.remote.as_ref(), &mut self.publishing.refusals, function.name(), "call");
+            log_refusal(cx, self.wire.remote.as_ref(), &mut self.wire.publishing.refusals, function.name(), "call");
         }
         let error = match error {
             Error::Full(Limit::ParametersBytes | Limit::Variables) => {
-                Error::TooLarge { limit: self.constraints.message_size }
+                Error::TooLarge { limit: self.wire.constraints.message_size }
             }
             Error::Full(_) => Error::Busy,
             error => error,
         };
-        if self.send_error(cx, id, priority, wants_reply, error).is_err() {
-            self.link.counters.count(LinkCounter::RepliesDropped);
+        if self.wire.send_error(cx, id, priority, wants_reply, error).is_err() {
+            self.wire.link.counters.count(LinkCounter::RepliesDropped);
         }
         if error == Error::StaleFunction {
-            self.publishing.notify_again(slot);
+            self.wire.publishing.notify_again(slot);
             self.pump(cx);
         }
     }

@@ -3,21 +3,21 @@
 //! Nothing of it is in the way of anything else. A failure loses its values and then its text where they do not fit, and never its
 //! code; progress is sent when nothing waits to be sent, or not at all; a cancellation is heard once and answered by nothing.
 
-use super::{Event, Phase, ReplyBlock, Results, Session};
-use crate::ability::{Ability, Begins, DETAILS, Details};
+use super::wire::{Phase, Wire};
+use super::{Event, Results, due};
+use crate::ability::{Ability, Begins, DETAILS, Details, State};
 use crate::config::{PROGRESS_INTERVAL, Priority};
 use crate::distribution::block;
 use crate::distribution::failure::Failure;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::{
-    FailureDetails, PROGRESS_BYTES, REPLY_BYTES, Release, SessionBody, encode_failure, encode_progress, encode_reply,
+    FailureDetails, PROGRESS_BYTES, REPLY_BYTES, Release, encode_failure, encode_progress, encode_reply,
 };
 use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::{LinkCounter, Span};
-use crate::host::frame::Frame;
-use crate::services::calls::{Cancelled, RunningCall, Ticket};
-use crate::services::requests::{CallId, Pending};
+use crate::services::calls::{Calls, Cancelled, RunningCall, Ticket};
+use crate::services::requests::{CallId, Pending, Requests};
 use crate::services::{Context, Port};
 use crate::time::Instant;
 
@@ -59,62 +59,71 @@ impl OfCalls {
     }
 }
 
-impl<P: Port> Session<P> {
-    // --- failures
+/// The part, which a build may leave out.
+pub(super) type DetailsPart = State<OfCalls, { DETAILS as usize }>;
 
-    /// As [`answer`](Self::answer) with [`ServiceError::Failed`], and tells the caller text and values as well: as much of it
-    /// as fits and as the signature declares.
-    pub fn answer_failed(&mut self, cx: &mut Context<'_, P>, ticket: Ticket, failure: &Failure) -> Result<(), Error> {
-        self.answer_with(cx, ticket, Err(failure.error().into()), Some(failure))
+impl DetailsPart {
+    /// Changes the details of the link, and with them what is due.
+    fn put<P: Port>(&mut self, wire: &mut Wire<P>, change: impl FnOnce(&mut OfCalls)) {
+        self.change(change);
+        if DETAILS {
+            wire.due.set(due::Part::Details, self.deadline());
+        }
     }
 
-    /// Text and values of the failure that an [`Event::Reply`] or [`Event::Failed`] has just told; `None` where it has none.
-    /// Values come with replies alone. `lent` is what was lent to the [`receive`](Self::receive) that returned the event.
-    pub fn failure(&mut self, lent: &[u8]) -> Option<Failure> {
+    /// Text and values of the failure that came last.
+    pub(super) fn failure<P: Port>(&mut self, wire: &mut Wire<P>, lent: &[u8]) -> Option<Failure> {
         let Recorded { message, code, function, .. } =
-            self.details.get_mut()?.failure.take().filter(|recorded| recorded.step == self.step)?;
-        let FailureDetails { text, values } = FailureDetails::of(self.link.view(message, lent))?;
+            self.get_mut()?.failure.take().filter(|recorded| recorded.step == wire.step)?;
+        let FailureDetails { text, values } = FailureDetails::of(wire.link.view(message, lent))?;
         let mut failure = Failure::new(code, text);
         let mut is_whole = !failure.is_cut();
         let function = function.and_then(|(slot, generation)| {
-            self.theirs.function(slot).filter(|function| function.generation == generation)
+            wire.theirs.function(slot).filter(|function| function.generation == generation)
         });
         if let Some(function) = function.filter(|_| !values.is_empty()) {
             is_whole &= block::read(function.signature.failure(), values, failure.values_mut()).is_ok();
         }
         if !is_whole {
-            self.link.counters.count(LinkCounter::DetailsDropped);
+            wire.link.counters.count(LinkCounter::DetailsDropped);
         }
         Some(failure)
     }
 
     /// Before the message is dealt with, since the call is forgotten then.
-    pub(super) fn note_failure(&mut self, message: Span, lent: &[u8]) {
-        self.details.change(|details| details.failure = None);
-        let bytes = self.link.view(message, lent);
+    pub(super) fn note_failure<P: Port>(
+        &mut self,
+        wire: &Wire<P>,
+        requests: &Requests<P::Storage>,
+        message: Span,
+        lent: &[u8],
+    ) {
+        self.change(|details| details.failure = None);
+        let bytes = wire.link.view(message, lent);
         if FailureDetails::of(bytes).is_none() {
             return;
         }
         let Some(&[_, _, _, _, a, b, c, d, low, high]) = bytes.first_chunk() else { return };
-        let pending = self.requests.waiting_for(CallId(u32::from_le_bytes([a, b, c, d])));
+        let pending = requests.waiting_for(CallId(u32::from_le_bytes([a, b, c, d])));
         let function = pending.map(|pending| (pending.slot, pending.generation));
         let code = u16::from_le_bytes([low, high]);
-        self.details.change(|details| details.failure = Some(Recorded { message, step: self.step, code, function }));
+        self.change(|details| details.failure = Some(Recorded { message, step: wire.step, code, function }));
     }
 
     /// Answers with an error. What exceeds a limit is left out, the values first; so is all but the code where there is no
     /// room in the stream.
-    pub(super) fn send_failure(
-        &mut self,
+    pub(super) fn send_failure<P: Port>(
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         head: &RunningCall,
         error: Error,
         failure: Option<&Failure>,
     ) -> Result<(), Error> {
         let functions = cx.functions;
-        let plain = |this: &mut Self, cx: &mut _| this.send_error(cx, head.id, head.priority, head.wants_reply, error);
+        let plain =
+            |wire: &mut Wire<P>, cx: &mut _| wire.send_error(cx, head.id, head.priority, head.wants_reply, error);
         let failure = failure.filter(|failure| error == Error::Service(failure.error()));
-        let Some(failure) = failure else { return plain(self, cx) };
+        let Some(failure) = failure else { return plain(wire, cx) };
         let function = functions.lookup(head.slot, head.generation).ok();
         let specs = function.map(|function| function.signature.failure());
         let values = failure.values();
@@ -128,11 +137,11 @@ impl<P: Port> Session<P> {
         let mut sent = Err(Error::TooLarge { limit: 0 });
         for length in [measured.unwrap_or(0), 0] {
             let details = text_bytes.saturating_add(length);
-            if details > self.peer_message_size() as usize {
+            if details > wire.peer_message_size() as usize {
                 is_whole = false;
                 continue;
             }
-            sent = self.send(cx, head.priority, REPLY_BYTES.saturating_add(details), &mut |writer| {
+            sent = wire.send(cx, head.priority, REPLY_BYTES.saturating_add(details), &mut |writer| {
                 writer.put(&header);
                 FailureDetails::put_text(failure.text(), writer);
                 if let Some(specs) = specs.filter(|_| length > 0) {
@@ -146,125 +155,110 @@ impl<P: Port> Session<P> {
         }
         if let Err(Error::TooLarge { .. } | Error::Full(_)) = sent {
             is_whole = false;
-            sent = plain(self, cx);
+            sent = plain(wire, cx);
         }
         if !is_whole {
-            self.link.counters.count(LinkCounter::DetailsDropped);
+            wire.link.counters.count(LinkCounter::DetailsDropped);
         }
         sent
     }
 
-    // --- progress
-
-    /// Tells the caller of a running call how far it is. Nothing is sent, and nothing is wrong, where it does not want to know or
-    /// the call has ended.
-    ///
-    /// [`Error::Full`] where the stream has no room now or the last progress was just sent: the port keeps the newest values, and
-    /// tries again after the next [`poll`](Self::poll), or with newer ones. Other errors say that the values do not fit the
-    /// signature, or the peer.
-    pub fn progress(&mut self, cx: &mut Context<'_, P>, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
-        let Some(head) = self.calls.call(ticket).filter(|head| head.wants_progress && head.cancelled == Cancelled::No)
+    /// Tells the caller of a running call how far it is.
+    pub(super) fn progress<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        calls: &Calls<P::Storage>,
+        cx: &mut Context<'_, P>,
+        ticket: Ticket,
+        values: &ParametersView,
+    ) -> Result<(), Error> {
+        let Some(head) = calls.call(ticket).filter(|head| head.wants_progress && head.cancelled == Cancelled::No)
         else {
             return Ok(());
         };
-        if self.phase != Phase::Live {
+        if wire.phase != Phase::Live {
             return Ok(());
         }
         let specs = cx.functions.lookup(head.slot, head.generation)?.signature.progress();
         let length = block::measure(specs, values)?;
-        let limit = self.peer_message_size();
+        let limit = wire.peer_message_size();
         if length > limit as usize {
             return Err(Error::TooLarge { limit });
         }
-        if cx.now >= self.details.progress_due && self.link.queued() > 0 {
+        if cx.now >= self.progress_due && wire.link.queued() > 0 {
             // What gathers goes first, and nothing is to wait behind what this sends.
-            self.flush(cx);
-            if self.link.queued() > 0 {
-                self.details.change(|details| details.progress_due = cx.now + PROGRESS_INTERVAL);
+            wire.flush(cx);
+            if wire.link.queued() > 0 {
+                self.put(wire, |details| details.progress_due = cx.now + PROGRESS_INTERVAL);
             }
         }
-        if cx.now < self.details.progress_due {
-            self.details.change(|details| details.progress_waits = true);
+        if cx.now < self.progress_due {
+            self.put(wire, |details| details.progress_waits = true);
             return Err(Error::Full(Limit::SendQueue));
         }
-        self.send(cx, Priority::Low, PROGRESS_BYTES.saturating_add(length), &mut |writer| {
+        wire.send(cx, Priority::Low, PROGRESS_BYTES.saturating_add(length), &mut |writer| {
             writer.put(&encode_progress(head.id));
             block::write(specs, values, writer);
         })?;
-        self.link.counters.count(LinkCounter::ProgressSent);
-        self.details.change(|details| details.progress_due = cx.now + PROGRESS_INTERVAL);
+        wire.link.counters.count(LinkCounter::ProgressSent);
+        self.put(wire, |details| details.progress_due = cx.now + PROGRESS_INTERVAL);
         Ok(())
     }
 
-    /// What an [`Event::Progress`] tells, as [`results`](Self::results) shows the results of a call.
-    pub fn progress_values<'b>(&'b self, values: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
-        let block = self.results(values, lent)?;
-        Ok(ReplyBlock { specs: block.signature.progress(), ..block })
-    }
-
-    pub(super) fn progress_arrived(&mut self, id: CallId, block: Span, lent: &[u8]) -> Option<Event> {
-        let pending = self.requests.waiting_for(id);
+    pub(super) fn progress_arrived<P: Port>(
+        wire: &mut Wire<P>,
+        requests: &Requests<P::Storage>,
+        id: CallId,
+        block: Span,
+        lent: &[u8],
+    ) -> Option<Event> {
+        let pending = requests.waiting_for(id);
         let reported = pending.map(|Pending { slot, generation, .. }| Results {
             slot: *slot,
             generation: *generation,
             block,
-            step: self.step,
+            step: wire.step,
         });
         let is_known =
-            reported.as_ref().and_then(|reported| self.progress_values(reported, lent).ok()).is_some_and(|values| {
+            reported.as_ref().and_then(|reported| wire.progress(reported, lent).ok()).is_some_and(|values| {
                 let declares = values.specs.clone().next().is_some();
                 declares && block::check(values.specs, values.bytes).is_ok()
             });
-        self.link.counters.count(if is_known { LinkCounter::ProgressReceived } else { LinkCounter::ProgressDropped });
+        wire.link.counters.count(if is_known { LinkCounter::ProgressReceived } else { LinkCounter::ProgressDropped });
         reported.filter(|_| is_known).and_then(Details::of).map(|reported| Event::Progress(id, reported))
-    }
-
-    // --- cancellation
-
-    /// The peer is told that a call has no caller any more. In the stream alone, and at most once: what such a call moves is
-    /// released as well, which is not lost.
-    pub(super) fn send_cancel(&mut self, cx: &mut Context<'_, P>, pending: &Pending) {
-        // A stop is not taken back: its handler runs, however late it comes.
-        let stops = self.theirs.function(pending.slot).is_some_and(|function| function.attributes.stop);
-        if DETAILS && self.phase == Phase::Live && !stops {
-            let body = SessionBody::cancel(&Release { call: pending.id.0, class: pending.class });
-            self.link.send_frame(&Frame::Session(&body));
-            self.flush(cx);
-        }
     }
 
     /// The peer has given a call up. What it moves ends as if it were released; if it runs, its handler is told; if it has not
     /// begun, it does not.
-    pub(super) fn cancel_arrived(&mut self, cx: &mut Context<'_, P>, cancel: Release) -> Option<Event> {
+    pub(super) fn cancelled<P: Port>(&mut self, wire: &mut Wire<P>, calls: &mut Calls<P::Storage>, cancel: Release) {
         let Release { call, class } = cancel;
-        match self.calls.cancel(class, call) {
+        match calls.cancel(class, call) {
             Ok(false) => {}
             Ok(true) => {
-                self.link.counters.count(LinkCounter::RunningCancelled);
-                self.details.change(|details| details.cancelled = true);
+                wire.link.counters.count(LinkCounter::RunningCancelled);
+                self.put(wire, |details| details.cancelled = true);
             }
-            Err(_) if self.calls.has_arrived(class, call) && !self.calls.is_waiting(class, call) => {
-                self.link.counters.count(LinkCounter::CancelsIgnored);
+            Err(_) if calls.has_arrived(class, call) && !calls.is_waiting(class, call) => {
+                wire.link.counters.count(LinkCounter::CancelsIgnored);
             }
             Err(_) => {}
         }
-        self.released(cx, cancel)
     }
 
-    /// What the port is to be told, from [`poll`](Self::poll).
-    pub(super) fn poll_details(&mut self, now: Instant) -> Option<Event> {
-        self.details.change(|details| details.progress_waits &= now < details.progress_due);
-        if !self.details.cancelled {
+    /// What the port is to be told, from `Session::poll`.
+    pub(super) fn poll<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        calls: &mut Calls<P::Storage>,
+        now: Instant,
+    ) -> Option<Event> {
+        self.put(wire, |details| details.progress_waits &= now < details.progress_due);
+        if !self.cancelled {
             return None;
         }
-        let ticket = self.calls.take_cancelled();
-        self.details.change(|details| details.cancelled = ticket.is_some());
+        let ticket = calls.take_cancelled();
+        self.put(wire, |details| details.cancelled = ticket.is_some());
         ticket.and_then(Details::of).map(Event::Cancelled)
-    }
-
-    /// Whether the caller of a running call has given it up; also where the call has ended.
-    pub fn is_cancelled(&self, ticket: Ticket) -> bool {
-        self.calls.call(ticket).is_none_or(|head| head.cancelled != Cancelled::No)
     }
 }
 

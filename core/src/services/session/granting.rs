@@ -1,27 +1,49 @@
 //! Leases that the peer's calls hold on functions of this unit.
 
+use super::Event;
+use super::due::Part;
+use super::obeying::Obedience;
+use super::permitting::may;
 use super::timing::sent_at_earliest;
-use super::{Event, Session};
+use super::wire::Wire;
 use crate::config::LEASES;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::identity::Identity;
 use crate::distribution::message::{Control, Release, Renewal, RequestHeader};
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
-use crate::services::calls::{CallHead, Cancelled, RunningCall};
-use crate::services::lease::{Claim, Granted, Latch, Lease, LeaseEnd, Order, Service};
+use crate::services::access::Verb;
+use crate::services::calls::{CallHead, Calls, Cancelled, RunningCall};
+use crate::services::lease::{Claim, Granted, Latch, Lease, LeaseEnd, Order, Service, Stage};
 use crate::services::{Context, Port};
 use crate::storage::take_at;
 use crate::time::{Duration, Instant};
 
 /// Ends of leases that the peer is still to be told. One that finds no place is told when the peer renews it.
-pub(super) type Ends = heapless::Vec<(u32, LeaseEnd), LEASES>;
+type Ends = heapless::Vec<(u32, LeaseEnd), LEASES>;
 
-impl<P: Port> Session<P> {
+/// What calls of the peer move here, and under which claim.
+pub(super) struct Granting {
+    pub(super) granted: heapless::Vec<Granted, LEASES>,
+    ends: Ends,
+    pub(super) obedience: Obedience,
+}
+
+impl Granting {
+    pub(super) const fn new() -> Self {
+        Self { granted: heapless::Vec::new(), ends: Ends::new(), obedience: Obedience::new() }
+    }
+
+    /// Whether something waits for room.
+    pub(super) fn has_news(&self) -> bool {
+        !self.ends.is_empty() || self.obedience.has_news
+    }
+
     /// A call begins the lease of its function, as of when it was made. It takes the place of an earlier call's at once,
     /// but not that of a lease that is dead: its hook comes first.
-    pub(super) fn grant(
+    pub(super) fn grant<P: Port>(
         &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         head: &CallHead,
         length: Duration,
@@ -33,7 +55,7 @@ impl<P: Port> Session<P> {
         if self.obedience.gives_way() {
             return Err(Error::Busy);
         }
-        let under = self.may_move(cx).ok_or(Error::Busy)?;
+        let under = self.obedience.may_move(wire, cx).ok_or(Error::Busy)?;
         let service = service_of(cx, head.slot, head.generation);
         let is_same = |known: &Granted| {
             known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))
@@ -43,7 +65,7 @@ impl<P: Port> Session<P> {
             let function = cx.functions.function(slot);
             slot == head.slot || function.is_some_and(|function| share_a_lease(service, Some(function.handler)))
         };
-        if self.publishing.ordered_after(head.number).any(moves_it) {
+        if wire.publishing.ordered_after(head.number).any(moves_it) {
             return Err(Error::Replaced);
         }
         let known = self.granted.iter().position(is_same);
@@ -57,11 +79,11 @@ impl<P: Port> Session<P> {
             return Err(Error::Full(Limit::Leases));
         }
         let claim = Claim {
-            holder: self.identity().map_or(0, Identity::id),
+            holder: wire.identity().map_or(0, Identity::id),
             replaces: earlier.and_then(|earlier| earlier.order),
             takes_over: head.takes_over,
             operator: head.operator,
-            link: self.hello().map_or(0, |hello| hello.nonce as u32),
+            link: wire.hello().map_or(0, |hello| hello.nonce as u32),
             call: head.id,
             under,
             made: head.sent_at,
@@ -72,19 +94,19 @@ impl<P: Port> Session<P> {
             Err(error) => {
                 // A reader has looked later than at `cx.now`, and has stopped the motion.
                 if let Some(index) = known.filter(|_| error == Error::Busy) {
-                    self.cut_lease(cx, index);
+                    self.cut_lease(wire, cx, index);
                 }
                 return Err(error);
             }
         };
         let (slot, generation) = (head.slot, head.generation);
         let granted = Granted { call: head.id, slot, generation, order, length, end };
-        self.timers.lease = self.timers.lease.min(end);
-        self.publishing.note_order(slot, head.number);
+        wire.due.hasten(Part::Leases, end);
+        wire.publishing.note_order(slot, head.number);
         match known.and_then(|index| self.granted.get_mut(index)) {
             Some(known) => {
                 let replaced = core::mem::replace(known, granted).call;
-                self.notify_end(cx, replaced, LeaseEnd::Replaced);
+                self.notify_end(wire, cx, replaced, LeaseEnd::Replaced);
             }
             None => self.granted.push(granted).map_err(|_| Error::Full(Limit::Leases))?,
         }
@@ -92,20 +114,26 @@ impl<P: Port> Session<P> {
     }
 
     /// The caller still wants a call: its lease goes on, as of when the renewal was made.
-    pub(super) fn renewed(&mut self, cx: &mut Context<'_, P>, renewal: &Renewal) {
+    pub(super) fn renewed<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        calls: &Calls<P::Storage>,
+        cx: &mut Context<'_, P>,
+        renewal: &Renewal,
+    ) {
         let Some(index) = self.granted.iter().position(|granted| granted.call == renewal.call) else {
-            self.link.counters.count(LinkCounter::RenewalsIgnored);
+            wire.link.counters.count(LinkCounter::RenewalsIgnored);
             // A call that is on its way or waits for its turn has no lease yet.
             let Renewal { call, class, .. } = *renewal;
-            if self.calls.has_arrived(class, call) && !self.calls.is_waiting(class, call) {
-                self.notify_end(cx, call, LeaseEnd::Expired);
+            if calls.has_arrived(class, call) && !calls.is_waiting(class, call) {
+                self.notify_end(wire, cx, call, LeaseEnd::Expired);
             }
             return;
         };
         let Some(granted) = self.granted.get(index).copied() else { return };
         // A function that has been replaced since started it, and nothing of it is prolonged.
         if cx.functions.lookup(granted.slot, granted.generation).is_err() {
-            self.link.counters.count(LinkCounter::RenewalsIgnored);
+            wire.link.counters.count(LinkCounter::RenewalsIgnored);
             return;
         }
         let Some(sent_at) = sent_at_earliest(cx.now, renewal.stamp, renewal.since) else { return };
@@ -113,11 +141,11 @@ impl<P: Port> Session<P> {
         let end = Lease::seen_end(wanted_at + granted.length);
         // What was late on its way takes nothing away from what came before it, and revives nothing.
         if end > granted.end && granted.end > cx.now {
-            self.prolong(cx, index, end);
+            self.prolong(wire, cx, index, end);
         }
     }
 
-    fn prolong(&mut self, cx: &mut Context<'_, P>, index: usize, end: Instant) {
+    fn prolong<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, index: usize, end: Instant) {
         let Some(granted) = self.granted.get_mut(index) else { return };
         let service = service_of(cx, granted.slot, granted.generation);
         if service.is_some_and(|service| granted.order.is_none_or(|order| service.renew_lease(order, end))) {
@@ -125,13 +153,18 @@ impl<P: Port> Session<P> {
         } else {
             // A reader has looked later than at `cx.now`, a call of another peer has taken the lease over, or the service is
             // gone.
-            self.cut_lease(cx, index);
+            self.cut_lease(wire, cx, index);
         }
     }
 
-    /// The application has finished what an order of this lease started: no renewal keeps it alive, no hook runs. `false` where
-    /// no call of this peer has that order, or it has ended before: that one was not finished, and its hook runs.
-    pub fn end_order(&mut self, cx: &mut Context<'_, P>, lease: &Lease, order: Order) -> bool {
+    /// The application has finished what an order of this lease started. `false` where no call of this peer has that order.
+    pub(super) fn end_order<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        lease: &Lease,
+        order: Order,
+    ) -> bool {
         // Not the function's newest one: it may have begun after the application saw that this one is done.
         let is_meant = |granted: &Granted| {
             granted.order == Some(order) && lease_of(cx, granted).is_some_and(|word| core::ptr::eq(word, lease))
@@ -141,57 +174,61 @@ impl<P: Port> Session<P> {
         let service = granted.and_then(|granted| service_of(cx, granted.slot, granted.generation));
         let is_finished = service.is_some_and(|service| service.finish_lease(cx.now, order));
         if is_finished && let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
-            self.notify_end(cx, granted.call, LeaseEnd::Finished);
+            self.notify_end(wire, cx, granted.call, LeaseEnd::Finished);
         }
         is_finished
     }
 
     /// A call has failed here: the lease that it holds, if it does, expires at once.
-    pub(super) fn cut_call(&mut self, cx: &mut Context<'_, P>, call: u32) {
+    pub(super) fn cut_call<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, call: u32) {
         if let Some(index) = self.granted.iter().position(|granted| granted.call == call) {
-            self.cut_lease(cx, index);
+            self.cut_lease(wire, cx, index);
         }
     }
 
     /// A function that stops was called: what it stops is dead before its handler runs, and calls that were made before it
     /// begin no more, on any link.
     #[inline(never)]
-    pub(super) fn stop_orders(&mut self, cx: &mut Context<'_, P>, header: &RequestHeader) {
-        let latch = Latch { by: self.identity().map_or(0, Identity::id), reason: 0 };
+    pub(super) fn stop_orders<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, header: &RequestHeader) {
+        let latch = Latch { by: wire.identity().map_or(0, Identity::id), reason: 0 };
         let charge = service_of(cx, header.slot, header.generation).and_then(Service::lease);
         // Before the services, which may be locked: another thread may add one now.
         if charge.is_none() {
             cx.functions.stopped().inhibit(cx.now, latch);
         }
         // The words of all first: a port may wait for one of its locks, behind which what stops is dead already.
-        self.each_moved_by(cx, charge, &mut |service| {
+        Self::each_moved_by(cx, charge, &mut |service| {
             if let Some(lease) = service.lease() {
                 lease.inhibit(cx.now, latch);
             }
         });
-        self.each_moved_by(cx, charge, &mut |service| service.inhibit(cx.now, latch));
+        Self::each_moved_by(cx, charge, &mut |service| service.inhibit(cx.now, latch));
         if self.was_stopped(cx) {
-            self.timers.lease = cx.now;
+            wire.due.set(Part::Leases, cx.now);
         }
-        self.publishing.actuators_due = true;
+        wire.publishing.actuators_due = true;
     }
 
     /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
     /// call was made, which is [`Error::Inhibited`].
     #[inline(never)]
-    pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &RunningCall) -> Result<(), Error> {
+    pub(super) fn reset_orders<P: Port>(
+        wire: &mut Wire<P>,
+        cx: &Context<'_, P>,
+        head: &RunningCall,
+    ) -> Result<(), Error> {
         // Its caller has been told that it failed, and may not know that anything may move again.
         if head.deadline <= cx.now || head.cancelled != Cancelled::No {
             return Err(Error::Expired);
         }
         let charge = service_of(cx, head.slot, head.generation).and_then(Service::lease);
         let (mut latched, mut any) = (None, false);
-        self.publishing.actuators_due = true;
-        self.each_moved_by(cx, charge, &mut |service| {
+        wire.publishing.actuators_due = true;
+        Self::each_moved_by(cx, charge, &mut |service| {
             service.reset(cx.now, head.sent_at);
             latched = latched.or_else(|| service.lease().and_then(Lease::latch));
         });
-        self.each_moved_by(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
+        Self::each_moved_by(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
         // A stop of all has ended as well once each that it has stopped is reset.
         if charge.is_none() || !any {
             cx.functions.stopped().reset(cx.now, head.sent_at);
@@ -202,7 +239,7 @@ impl<P: Port> Session<P> {
     /// The leased services that move what a function has in its charge: its own actuator, or all. One piece of code whatever
     /// is done with them.
     #[inline(never)]
-    fn each_moved_by(&self, cx: &Context<'_, P>, charge: Option<&Lease>, act: &mut dyn FnMut(&dyn Service)) {
+    fn each_moved_by<P: Port>(cx: &Context<'_, P>, charge: Option<&Lease>, act: &mut dyn FnMut(&dyn Service)) {
         // Also what this peer has not been shown.
         for function in (0..cx.functions.places()).filter_map(|place| cx.functions.function(Slot(place))) {
             let lease = function.handler.lease();
@@ -214,31 +251,41 @@ impl<P: Port> Session<P> {
     }
 
     /// The number that the functions of this unit which move the same thing have in common; 0 for one that shares nothing.
-    pub(super) fn actuator_of(&self, cx: &Context<'_, P>, service: &dyn Service) -> u8 {
+    pub(super) fn actuator_of<P: Port>(wire: &Wire<P>, cx: &Context<'_, P>, service: &dyn Service) -> u8 {
         let shares = |slot: &Slot| {
             let function = cx.functions.function(*slot);
             function.is_some_and(|function| share_a_lease(Some(function.handler), Some(service)))
         };
-        let mut sharing = self.publishing.all_slots().filter(shares);
+        let mut sharing = wire.publishing.all_slots().filter(shares);
         let first = sharing.next().filter(|_| sharing.next().is_some());
         first.and_then(|first| u8::try_from(first.0.saturating_add(1)).ok()).unwrap_or(0)
     }
 
     /// Ends the leases of services that are gone: their callers are told.
-    pub(super) fn cut_gone(&mut self, cx: &mut Context<'_, P>) {
+    pub(super) fn cut_gone<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         for index in 0..self.granted.len() {
             let granted = self.granted.get(index);
             if granted.is_some_and(|granted| service_of(cx, granted.slot, granted.generation).is_none()) {
-                self.cut_lease(cx, index);
+                self.cut_lease(wire, cx, index);
+            }
+        }
+    }
+
+    /// Ends the leases that the peer may not hold any more.
+    pub(super) fn cut_forbidden<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
+        for index in 0..self.granted.len() {
+            let Some(slot) = self.granted.get(index).map(|granted| granted.slot) else { return };
+            if !may(wire, cx, slot, Verb::Call) {
+                self.cut_lease(wire, cx, index);
             }
         }
     }
 
     /// Lets a lease expire at once.
-    pub(super) fn cut_lease(&mut self, cx: &mut Context<'_, P>, index: usize) {
+    pub(super) fn cut_lease<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, index: usize) {
         let Some(granted) = self.granted.get_mut(index) else { return };
         granted.end = cx.now;
-        self.timers.lease = cx.now;
+        wire.due.set(Part::Leases, cx.now);
         let service = service_of(cx, granted.slot, granted.generation);
         if let Some((service, order)) = service.zip(granted.order) {
             service.cut_lease(order);
@@ -247,19 +294,35 @@ impl<P: Port> Session<P> {
 
     /// The caller gave up a call: its lease ends now, and its hook runs as if it had expired. If it waits for its turn, or is still on its
     /// way, it does not begin.
-    pub(super) fn released(&mut self, cx: &mut Context<'_, P>, release: Release) -> Option<Event> {
+    pub(super) fn released<P: Port>(
+        &mut self,
+        calls: &mut Calls<P::Storage>,
+        cx: &mut Context<'_, P>,
+        release: Release,
+    ) -> Option<Event> {
         let Release { call, class } = release;
-        self.calls.give_up(class, call);
+        calls.give_up(class, call);
         self.end_released(cx, |granted| granted.call == call)
     }
 
     /// The same for all calls of a function up to `id`.
-    pub(super) fn released_all(&mut self, cx: &mut Context<'_, P>, slot: Slot, id: u32) -> Option<Event> {
-        self.publishing.release(slot, id);
+    pub(super) fn released_all<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        slot: Slot,
+        id: u32,
+    ) -> Option<Event> {
+        wire.publishing.release(slot, id);
         self.end_released(cx, |granted| granted.slot == slot && granted.call <= id)
     }
 
-    fn end_released(&mut self, cx: &mut Context<'_, P>, is_released: impl Fn(&Granted) -> bool) -> Option<Event> {
+    fn end_released<P: Port>(
+        &mut self,
+
+        cx: &mut Context<'_, P>,
+        is_released: impl Fn(&Granted) -> bool,
+    ) -> Option<Event> {
         let index = self.granted.iter().position(is_released);
         let granted = index.and_then(|index| take_at(&mut self.granted, index))?;
         // What was dead before is not told as given up.
@@ -269,50 +332,58 @@ impl<P: Port> Session<P> {
 
     /// Whether a function stops what is dead and not yet safe, whichever link moved it: its handler waits for the hook.
     #[inline(never)]
-    pub(super) fn awaits_hook(&self, cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
+    pub(super) fn awaits_hook<P: Port>(cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
         let mut awaits = false;
         let charge = service_of(cx, slot, generation).and_then(Service::lease);
-        self.each_moved_by(cx, charge, &mut |service| {
+        Self::each_moved_by(cx, charge, &mut |service| {
             awaits |= service.lease().is_some_and(Lease::awaits_hook);
         });
         awaits
     }
 
+    /// No order of the peer is live, nothing is stopping, and no hook is due.
+    pub(super) fn is_quiet<P: Port>(&self, wire: &Wire<P>, cx: &Context<'_, P>) -> bool {
+        let is_busy = |lease: &Lease| lease.awaits_hook() || lease.stage(cx.now) == Stage::Stopping;
+        let functions = wire.publishing.all_slots().filter_map(|slot| cx.functions.function(slot));
+        self.granted.is_empty() && !functions.filter_map(|function| function.handler.lease()).any(is_busy)
+    }
+
     /// Whether what a call of the peer moves was stopped: by the vehicle itself, or through another link.
-    pub(super) fn was_stopped(&self, cx: &Context<'_, P>) -> bool {
+    pub(super) fn was_stopped<P: Port>(&self, cx: &Context<'_, P>) -> bool {
         self.granted.iter().any(|granted| is_dead(cx, granted))
     }
 
     /// Ends a lease that is due; its function, whose hook is to run.
-    pub(super) fn expire_lease(&mut self, cx: &mut Context<'_, P>) -> Option<Slot> {
+    pub(super) fn expire_lease<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<Slot> {
         loop {
             let due = |granted: &Granted| granted.end <= cx.now || is_dead(cx, granted);
             let index = self.granted.iter().position(due);
             let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { break };
             let why = how_it_died(cx, &granted);
             if expire_granted(cx, &granted, why) {
-                self.publishing.actuators_due |= why == LeaseEnd::Stopped;
-                self.link.counters.count(LinkCounter::LeasesExpired);
-                self.notify_end(cx, granted.call, why);
+                wire.publishing.actuators_due |= why == LeaseEnd::Stopped;
+                wire.link.counters.count(LinkCounter::LeasesExpired);
+                self.notify_end(wire, cx, granted.call, why);
                 return Some(granted.slot);
             }
             let is_gone = service_of(cx, granted.slot, granted.generation).is_none();
-            self.notify_end(cx, granted.call, if is_gone { LeaseEnd::Expired } else { LeaseEnd::Replaced });
+            self.notify_end(wire, cx, granted.call, if is_gone { LeaseEnd::Expired } else { LeaseEnd::Replaced });
         }
-        self.timers.lease = self.granted.iter().map(|granted| granted.end).min().unwrap_or(Instant::FAR_FUTURE);
+        let next = self.granted.iter().map(|granted| granted.end).min();
+        wire.due.set(Part::Leases, next.unwrap_or(Instant::FAR_FUTURE));
         None
     }
 
-    fn notify_end(&mut self, cx: &mut Context<'_, P>, call: u32, why: LeaseEnd) {
-        if !self.send_control(cx, &Control::LeaseEnded { call, why }) {
+    fn notify_end<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, call: u32, why: LeaseEnd) {
+        if !wire.send_control(cx, &Control::LeaseEnded { call, why }) {
             let _ = self.ends.push((call, why));
         }
     }
 
     /// Tells the peer of ends that there was no room for.
-    pub(super) fn send_ends(&mut self, cx: &mut Context<'_, P>) {
+    pub(super) fn send_ends<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         while let Some(&(call, why)) = self.ends.last()
-            && self.send_control(cx, &Control::LeaseEnded { call, why })
+            && wire.send_control(cx, &Control::LeaseEnded { call, why })
         {
             self.ends.pop();
         }

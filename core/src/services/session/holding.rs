@@ -3,7 +3,10 @@
 //! A call *holds* a lease as long as this unit renews it. It is *released* when the peer is told that the call is not
 //! wanted, wherever it is: when it has failed, and when its caller *cancels* it.
 
-use super::{Event, Phase, RequestOptions, Session};
+use super::due::Part;
+use super::wire::{Phase, Wire};
+use super::{Event, RequestOptions};
+use crate::ability::DETAILS;
 use crate::config::{LEASES, Priority};
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Release, Renewal, RequestHeader, SessionBody};
@@ -12,7 +15,7 @@ use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
 use crate::services::heart::{Beats, Renew};
 use crate::services::lease::{Held, LeaseEnd};
-use crate::services::requests::{CallId, Pending};
+use crate::services::requests::{CallId, Pending, Requests};
 use crate::services::{Context, Port};
 use crate::storage::take_at;
 use crate::time::{Duration, Instant};
@@ -28,13 +31,13 @@ const SHORTEST_INTERVAL: Duration = Duration::from_millis(5);
 const RETRY: Duration = Duration::from_millis(20);
 
 /// Releases of whole functions that are still to be sent in the stream: the function, and the newest call.
-pub(super) type Releases = heapless::Vec<(Slot, CallId), LEASES>;
+type Releases = heapless::Vec<(Slot, CallId), LEASES>;
 
 /// Calls of leased functions that the peer has answered and not ended: by this they are released, renewed or not.
-pub(super) type Answered = heapless::Vec<AnsweredCall, LEASES>;
+type Answered = heapless::Vec<AnsweredCall, LEASES>;
 
 #[derive(Clone, Copy)]
-pub(super) struct AnsweredCall {
+struct AnsweredCall {
     call: CallId,
     slot: Slot,
     class: Priority,
@@ -44,29 +47,50 @@ fn between_renewals(lease: Duration) -> Duration {
     lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_INTERVAL)
 }
 
-impl<P: Port> Session<P> {
+/// Calls of this unit to the peer: those that wait for a reply, and the leases that they hold there.
+pub(super) struct Calling<P: Port> {
+    pub(super) requests: Requests<P::Storage>,
+    pub(super) held: heapless::Vec<Held, LEASES>,
+    answered: Answered,
+    releases: Releases,
+    /// The newest call that was to move something.
+    pub(super) last_order: Option<(Slot, CallId)>,
+}
+
+impl<P: Port> Calling<P> {
+    pub(super) const fn new(requests: Requests<P::Storage>) -> Self {
+        Self {
+            requests,
+            held: heapless::Vec::new(),
+            answered: Answered::new(),
+            releases: Releases::new(),
+            last_order: None,
+        }
+    }
+
+    /// Ends one call whose deadline has passed.
+    pub(super) fn expire_call(&mut self, wire: &mut Wire<P>, now: Instant) -> Option<Pending> {
+        let expired = self.requests.expire(now);
+        if expired.is_none() {
+            wire.due.set(Part::Calls, self.requests.deadline());
+        }
+        expired
+    }
+
     /// Whether this unit renews the lease of a call.
-    pub fn holds(&self, call: CallId) -> bool {
+    pub(super) fn holds(&self, call: CallId) -> bool {
         self.held.iter().any(|held| held.call == call && held.is_renewed())
     }
 
-    /// How long the leases that calls of a function hold last, counted from when the last answer to a renewal came; `None` where
-    /// none is renewed. An answer names its call and not its renewal, of which several may be on their way: one that was held up
-    /// makes this too long by as much.
-    pub fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
+    /// How long the leases that calls of a function hold last; `None` where none is renewed.
+    pub(super) fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
         let of_slot = self.held.iter().filter(|held| held.slot == slot && held.is_renewed());
         of_slot.map(|held| (held.answered + held.length()).since(now)).max()
     }
 
     /// Whether a call of a function could be renewed. [`Error::Full`] when there is no room, and no earlier call of the same
     /// function and of the same origin that would give way; [`Error::SlowHeart`] for one that would let the lease end between two beats.
-    pub(super) fn check_held(
-        &self,
-        lease: Option<Duration>,
-        options: &RequestOptions,
-        slot: Slot,
-    ) -> Result<(), Error> {
-        let Some(lease) = lease else { return Ok(()) };
+    pub(super) fn check_held(&self, lease: Duration, options: &RequestOptions, slot: Slot) -> Result<(), Error> {
         let slowest = lease.divided_by(BEATS_PER_LEASE);
         if let Renew::Heart(beats) = options.renew
             && beats.period() > slowest
@@ -88,6 +112,7 @@ impl<P: Port> Session<P> {
     /// Renews the lease that a call has begun, or will begin, from here on.
     pub(super) fn hold_lease(
         &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         header: &RequestHeader,
         class: Priority,
@@ -99,19 +124,19 @@ impl<P: Port> Session<P> {
             && let Some(oldest) = self.oldest_held(header.slot, header.operator)
         {
             take_at(&mut self.held, oldest);
-            self.link.counters.count(LinkCounter::RenewalsStopped);
+            wire.link.counters.count(LinkCounter::RenewalsStopped);
         }
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + between_renewals(lease));
         let (answered, operator) = (cx.now, header.operator);
         let lease = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
         let _ = self.held.push(Held { call, slot, operator, class, lease, renew, next, answered });
-        self.timers.renewal = self.timers.renewal.min(next);
+        wire.due.hasten(Part::Renewals, next);
     }
 
     /// Renews what is due. What the peer has not answered for the length of a lease is not renewed blindly: it is released,
     /// and returned, one at a time.
-    pub(super) fn renew_leases(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        let (stamp, since) = self.clock.stamp(cx.now);
+    pub(super) fn renew_leases(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<Event> {
+        let (stamp, since) = wire.clock.stamp(cx.now);
         let now = cx.now;
         for index in 0..self.held.len() {
             let due = self.held.get_mut(index).filter(|held| held.next <= now);
@@ -119,8 +144,8 @@ impl<P: Port> Session<P> {
             let length = held.length();
             if held.answered + length <= now {
                 let Held { call, slot, .. } = *held;
-                self.link.counters.count(LinkCounter::RenewalsUnanswered);
-                self.release_call(cx, call, None);
+                wire.link.counters.count(LinkCounter::RenewalsUnanswered);
+                self.release_call(wire, cx, call, None);
                 return Some(Event::LeaseEnded { call, slot, why: LeaseEnd::Unanswered });
             }
             held.next = now + between_renewals(length);
@@ -129,11 +154,12 @@ impl<P: Port> Session<P> {
             let renewal = Renewal { call: held.call.0, class: held.class, stamp, since, age };
             let body = SessionBody::renewal(&renewal);
             // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
-            self.send_datagram(cx, &body, &[]);
-            self.link.send_frame(&Frame::Session(&body));
+            wire.send_datagram(cx, &body, &[]);
+            wire.link.send_frame(&Frame::Session(&body));
         }
-        self.timers.renewal = self.held.iter().map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
-        self.flush(cx);
+        let next = self.held.iter().map(|held| held.next).min();
+        wire.due.set(Part::Renewals, next.unwrap_or(Instant::FAR_FUTURE));
+        wire.flush(cx);
         None
     }
 
@@ -145,10 +171,10 @@ impl<P: Port> Session<P> {
     }
 
     /// A heart has stopped: what names it is released.
-    pub fn release_beats(&mut self, cx: &mut Context<'_, P>, beats: Beats) {
+    pub(super) fn release_beats(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, beats: Beats) {
         let of_it = |held: &&Held| held.renew == Renew::Heart(beats) && held.is_renewed();
         while let Some(call) = self.held.iter().find(of_it).map(|held| held.call) {
-            self.release_call(cx, call, None);
+            self.release_call(wire, cx, call, None);
         }
     }
 
@@ -176,30 +202,46 @@ impl<P: Port> Session<P> {
         take_at(&mut self.held, index)
     }
 
-    /// The caller does not want a call any more: its reply, should it still come, counts as late, and the lease that it
-    /// holds, or would begin, is released. Other calls are untouched. Also for a call that has been answered and holds a
-    /// lease.
-    pub fn cancel(&mut self, cx: &mut Context<'_, P>, id: CallId) {
+    /// The caller does not want a call any more.
+    pub(super) fn cancel(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId) {
         let pending = self.requests.close(id);
         if let Some(pending) = &pending {
             // Its caller may have noticed the time-out before this session was polled.
             let is_late = pending.deadline <= cx.now;
             let counter = if is_late { LinkCounter::CallsTimedOut } else { LinkCounter::CallsCancelled };
-            self.link.counters.count(counter);
-            self.send_cancel(cx, pending);
+            wire.link.counters.count(counter);
+            Self::send_cancel(wire, cx, pending);
         }
-        self.release_call(cx, id, pending);
+        self.release_call(wire, cx, id, pending);
+    }
+
+    /// The peer is told that a call has no caller any more. In the stream alone, and at most once: what such a call moves is
+    /// released as well, which is not lost.
+    pub(super) fn send_cancel(wire: &mut Wire<P>, cx: &mut Context<'_, P>, pending: &Pending) {
+        // A stop is not taken back: its handler runs, however late it comes.
+        let stops = wire.theirs.function(pending.slot).is_some_and(|function| function.attributes.stop);
+        if DETAILS && wire.phase == Phase::Live && !stops {
+            let body = SessionBody::cancel(&Release { call: pending.id.0, class: pending.class });
+            wire.link.send_frame(&Frame::Session(&body));
+            wire.flush(cx);
+        }
     }
 
     /// Releases a call that has failed or was cancelled. `pending` is what was known of it while it waited for its reply.
-    pub(super) fn release_call(&mut self, cx: &mut Context<'_, P>, id: CallId, pending: Option<Pending>) {
+    pub(super) fn release_call(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        id: CallId,
+        pending: Option<Pending>,
+    ) {
         let answered = self.take_answered(id);
         let held = self.stop_renewing(id);
         let waited = pending.and_then(|pending| pending.leased);
         let class = held.map(|held| held.class).or(waited).or(answered.map(|known| known.class));
         let Some(class) = class else { return };
         // A link that is not live needs no release: the callee ends all leases of the link by itself.
-        if self.phase != Phase::Live || self.send_release(cx, id, class) {
+        if wire.phase != Phase::Live || Self::send_release(wire, cx, id, class) {
             return;
         }
         // Kept in the place that the call had: a release that is lost would let the vehicle drive on to the end of its lease.
@@ -208,23 +250,21 @@ impl<P: Port> Session<P> {
             (None, Some(held)) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
             (None, None) => drop(answered.map(|known| self.keep_release(known.slot, id))),
         }
-        self.timers.release = cx.now + RETRY;
+        wire.due.set(Part::Releases, cx.now + RETRY);
     }
 
-    /// Releases all calls of a function of the peer, those that are on their way as well: what they started stops.
-    ///
-    /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.
-    pub fn release(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> Result<(), Error> {
-        if self.phase != Phase::Live {
+    /// Releases all calls of a function of the peer.
+    pub(super) fn release(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, slot: Slot) -> Result<(), Error> {
+        if wire.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
         // Renewals stop first, whether or not the peer can be told: at the latest the lease's end stops what runs.
         self.held.retain(|held| held.slot != slot || !held.is_renewed());
         let newest = self.requests.newest();
-        if self.send_release_all(cx, slot, newest) {
+        if Self::send_release_all(wire, cx, slot, newest) {
             return Ok(());
         }
-        self.timers.release = cx.now + RETRY;
+        wire.due.set(Part::Releases, cx.now + RETRY);
         self.keep_release(slot, newest)
     }
 
@@ -238,45 +278,45 @@ impl<P: Port> Session<P> {
     }
 
     /// Sends the releases that there was no room for, as far as there is now.
-    pub(super) fn send_releases(&mut self, cx: &mut Context<'_, P>) {
-        if self.timers.release == Instant::FAR_FUTURE {
+    pub(super) fn send_releases(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
+        if wire.due.at(Part::Releases) == Instant::FAR_FUTURE {
             return;
         }
-        self.timers.release = cx.now + RETRY;
+        wire.due.set(Part::Releases, cx.now + RETRY);
         while let Some(&(slot, id)) = self.releases.last() {
-            if !self.send_release_all(cx, slot, id) {
+            if !Self::send_release_all(wire, cx, slot, id) {
                 return;
             }
             self.releases.pop();
         }
         while let Some(Held { call, class, .. }) = self.held.iter().find(|held| !held.is_renewed()).copied() {
-            if !self.send_release(cx, call, class) {
+            if !Self::send_release(wire, cx, call, class) {
                 return;
             }
             self.held.retain(|held| held.call != call);
         }
         while let Some((id, class)) = self.requests.unsent_release() {
-            if !self.send_release(cx, id, class) {
+            if !Self::send_release(wire, cx, id, class) {
                 return;
             }
             self.requests.release_sent(id);
         }
-        self.timers.release = Instant::FAR_FUTURE;
+        wire.due.set(Part::Releases, Instant::FAR_FUTURE);
     }
 
-    fn send_release(&mut self, cx: &mut Context<'_, P>, id: CallId, class: Priority) -> bool {
-        self.send_both_ways(cx, &SessionBody::release(&Release { call: id.0, class }))
+    fn send_release(wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId, class: Priority) -> bool {
+        Self::send_both_ways(wire, cx, &SessionBody::release(&Release { call: id.0, class }))
     }
 
-    fn send_release_all(&mut self, cx: &mut Context<'_, P>, slot: Slot, id: CallId) -> bool {
-        self.send_both_ways(cx, &SessionBody::release_all(slot, id.0))
+    fn send_release_all(wire: &mut Wire<P>, cx: &mut Context<'_, P>, slot: Slot, id: CallId) -> bool {
+        Self::send_both_ways(wire, cx, &SessionBody::release_all(slot, id.0))
     }
 
     /// As a datagram and in the stream; `false` when the stream has no room.
-    fn send_both_ways(&mut self, cx: &mut Context<'_, P>, body: &[u8]) -> bool {
-        self.send_datagram(cx, body, &[]);
-        let kept = self.link.send_frame(&Frame::Session(body));
-        self.flush(cx);
+    fn send_both_ways(wire: &mut Wire<P>, cx: &mut Context<'_, P>, body: &[u8]) -> bool {
+        wire.send_datagram(cx, body, &[]);
+        let kept = wire.link.send_frame(&Frame::Session(body));
+        wire.flush(cx);
         kept
     }
 }

@@ -1,12 +1,17 @@
 //! The way up: bytes become frames, frames messages, messages events.
 
 use super::answering::{is_emergency, read_arguments};
-use super::permitting::may_publish;
+use super::details::DetailsPart;
+use super::due::Part;
+use super::granting::Granting;
+use super::permitting::{may_publish, permit_call};
 use super::publishing::Advertised;
+use super::streaming::StreamsPart;
 use super::timing::sent_at_earliest;
-use super::{Event, Phase, Session, close_reason};
+use super::{Event, Phase, Session, close_reason, proving};
 use crate::ability::{DETAILS, STREAMS};
 use crate::config::{EMERGENCY_BYTES, Mode, Priority};
+use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature, VariableSpecs};
 use crate::distribution::function_list::{Function, Generation, Slot};
 use crate::distribution::items::{Items, Malformed};
@@ -108,8 +113,8 @@ impl<P: Port> Session<P> {
         lent: &mut [u8],
         arguments: Option<&mut ParametersView>,
     ) -> Receipt {
-        self.step = self.step.wrapping_add(1);
-        match self.phase {
+        self.wire.step = self.wire.step.wrapping_add(1);
+        match self.wire.phase {
             Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
             // What follows the hello is not looked at before the hub has decided: a request of a peer that is refused must not run.
             Phase::Deciding => {
@@ -117,24 +122,24 @@ impl<P: Port> Session<P> {
             }
             Phase::AwaitingHello { .. } | Phase::Proving { .. } | Phase::Live => {}
         }
-        let received = match self.link.receive(cx.buffers, lent) {
+        let received = match self.wire.link.receive(cx.buffers, lent) {
             Ok(received) => received,
             Err(reason) => {
-                match self.phase {
+                match self.wire.phase {
                     // All that can go wrong before the proof looks the same from outside, so that nothing is learned from the reason.
-                    Phase::Proving { .. } => self.fail(cx),
-                    _ => self.close(cx, reason),
+                    Phase::Proving { .. } => self.wire.fail(cx),
+                    _ => self.wire.close(cx, reason),
                 }
                 return Receipt { consumed: lent.len(), event: None, paused: false };
             }
         };
-        self.holds = received.paused;
+        self.wire.holds = received.paused;
         let Some(inbound) = received.inbound else {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
         // What a later version says shows no life that this one understands; of a session body it is known once it is read.
         if !matches!(inbound, Inbound::Skipped | Inbound::Session(_)) {
-            self.liveness.heard(cx.now);
+            self.wire.heard(cx.now);
         }
         let is_emergency = matches!(inbound, Inbound::Message(Priority::Emergency, _));
         // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
@@ -154,32 +159,29 @@ impl<P: Port> Session<P> {
         body: &mut [u8],
     ) -> Option<Event> {
         // Under a seal the nonce and the seal tell whose it is, and its source may be another address of the host, or a NAT's.
-        let is_of_peer = self.mode() == Mode::Secured || from.is_of_host(&self.peer_address);
-        if self.phase != Phase::Live || nonce != self.nonce || !is_of_peer {
-            self.link.counters.count(LinkCounter::DatagramsDropped);
+        let is_of_peer = self.wire.mode() == Mode::Secured || from.is_of_host(&self.wire.peer_address);
+        if self.wire.phase != Phase::Live || nonce != self.wire.nonce || !is_of_peer {
+            self.wire.link.counters.count(LinkCounter::DatagramsDropped);
             return None;
         }
-        let version = self.remote.as_ref()?.version;
-        let header = datagram::session_header(self.mode(), version, self.fleet, self.link.id().0, nonce);
-        let body = match self.link.cipher().open_datagram(&header, body) {
+        let version = self.wire.remote.as_ref()?.version;
+        let header = datagram::session_header(self.wire.mode(), version, self.wire.fleet, self.wire.link.id().0, nonce);
+        let body = match self.wire.link.cipher().open_datagram(&header, body) {
             Ok(body) => &*body,
             Err(error) => {
-                self.link.counters.count(counter_of(error));
+                self.wire.link.counters.count(counter_of(error));
                 return None;
             }
         };
-        self.link.counters.count(LinkCounter::DatagramsReceived);
-        self.datagram_opened(cx.now);
+        self.wire.link.counters.count(LinkCounter::DatagramsReceived);
+        self.renewal.datagram_opened(&mut self.wire, cx.now);
         self.session_body(cx, Span::lent(body.len()), body, Way::Datagram)
     }
 
     /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
     /// [`Error::ResultLost`] when the peer has replaced the function, or the session has received since then.
     pub fn results<'b>(&'b self, results: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
-        if results.step != self.step {
-            return Err(Error::ResultLost);
-        }
-        self.kept_results(results.slot, results.generation, self.link.view(results.block, lent))
+        self.wire.results(results, lent)
     }
 
     /// Results that were copied from a [`ReplyBlock`] for a caller that reads them later; [`Error::ResultLost`] where the function
@@ -190,9 +192,18 @@ impl<P: Port> Session<P> {
         generation: Generation,
         bytes: &'b [u8],
     ) -> Result<ReplyBlock<'b>, Error> {
-        let function = self.theirs.function(slot).filter(|function| function.generation == generation);
-        let signature = function.ok_or(Error::ResultLost)?.signature;
-        Ok(ReplyBlock { signature, specs: signature.results(), bytes })
+        self.wire.kept_results(slot, generation, bytes)
+    }
+
+    /// What an [`Event::Progress`] tells, as [`results`](Self::results) shows the results of a call.
+    pub fn progress_values<'b>(&'b self, values: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
+        self.wire.progress(values, lent)
+    }
+
+    /// Text and values of the failure that an [`Event::Reply`] or [`Event::Failed`] has just told; `None` where it has none.
+    /// Values come with replies alone. `lent` is what was lent to the [`receive`](Self::receive) that returned the event.
+    pub fn failure(&mut self, lent: &[u8]) -> Option<Failure> {
+        self.details.failure(&mut self.wire, lent)
     }
 
     fn digest(
@@ -202,48 +213,67 @@ impl<P: Port> Session<P> {
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
-        match (inbound, self.phase) {
+        match (inbound, self.wire.phase) {
             // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
-            (Inbound::Refuse(_), _) if !self.link.cipher().is_sealing() => {
-                self.ended_in_clear(None);
+            (Inbound::Refuse(_), _) if !self.wire.link.cipher().is_sealing() => {
+                proving::ended_in_clear(&mut self.wire, None);
                 None
             }
-            (Inbound::Close(code), _) if !self.link.cipher().is_sealing() => {
-                self.ended_in_clear(Some(close_reason(code)));
+            (Inbound::Close(code), _) if !self.wire.link.cipher().is_sealing() => {
+                proving::ended_in_clear(&mut self.wire, Some(close_reason(code)));
                 None
             }
             (Inbound::Refuse(code), _) => {
-                self.end(CloseReason::Refused(Refusal::from_wire(code)));
+                self.wire.end(CloseReason::Refused(Refusal::from_wire(code)));
                 None
             }
             (Inbound::Close(code), _) => {
-                self.end(close_reason(code));
+                self.wire.end(close_reason(code));
                 None
             }
-            (Inbound::Hello(span), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, span, lent),
-            (Inbound::Proof(span), Phase::Proving { .. }) => self.proof_arrived(cx, span, lent),
-            (Inbound::Confirm(span), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
-                self.confirmation_arrived(cx, span, lent)
+            (Inbound::Hello(span), Phase::AwaitingHello { until }) => {
+                if proving::hello_arrived(&mut self.wire, cx, until, span, lent) { self.consult(cx) } else { None }
             }
-            (Inbound::Proof(span), Phase::Live) if P::RENEWS_KEYS => self.proof_on_live(cx, span, lent),
-            (Inbound::Confirm(span), Phase::Live) if P::RENEWS_KEYS => self.confirmation_on_live(cx, span, lent),
+            (Inbound::Proof(span), Phase::Proving { .. }) => {
+                // The peer reads the list once it has decided to take this unit.
+                if proving::proof_arrived(&mut self.wire, cx, span, lent) {
+                    self.publish(cx);
+                }
+                None
+            }
+            (Inbound::Confirm(span), Phase::Proving { .. }) if self.wire.link.cipher().is_sealing() => {
+                if proving::confirmation_arrived(&mut self.wire, cx, span, lent) {
+                    self.consult(cx)
+                } else {
+                    None
+                }
+            }
+            (Inbound::Proof(span), Phase::Live) if P::RENEWS_KEYS => {
+                self.renewal.proof_arrived(&mut self.wire, cx, span, lent)
+            }
+            (Inbound::Confirm(span), Phase::Live) if P::RENEWS_KEYS => {
+                self.renewal.confirmation_arrived(&mut self.wire, cx, span, lent)
+            }
             // Answered in the stream as well: only a reply that has passed the same queue shows that the stream moves.
             (Inbound::Ping, Phase::Live) => {
-                self.link.send_frame(&Frame::Pong);
-                self.flush(cx);
+                self.wire.link.send_frame(&Frame::Pong);
+                self.wire.flush(cx);
                 None
             }
-            (Inbound::Pong, Phase::Live) => self.pong_arrived(cx),
+            (Inbound::Pong, Phase::Live) => {
+                self.show_life(cx);
+                self.pings.answered(cx.now).then_some(Event::Answered)
+            }
             (Inbound::Session(span), Phase::Live) => self.session_body(cx, span, lent, Way::Stream),
             (Inbound::Message(priority, span), Phase::Live) => {
                 self.message_arrived(cx, priority, span, lent, arguments)
             }
             (Inbound::Skipped, Phase::Live) => {
-                self.link.counters.count(LinkCounter::ItemsSkipped);
+                self.wire.link.counters.count(LinkCounter::ItemsSkipped);
                 None
             }
             _ => {
-                self.close(cx, CloseReason::Protocol);
+                self.wire.close(cx, CloseReason::Protocol);
                 None
             }
         }
@@ -251,42 +281,46 @@ impl<P: Port> Session<P> {
 
     /// Does what a session body says, which shows life if it can be read.
     fn session_body(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8], way: Way) -> Option<Event> {
-        let body = SessionBody::decode(self.link.view(span, lent));
+        let body = SessionBody::decode(self.wire.link.view(span, lent));
         if body.is_some() {
             match way {
-                Way::Stream => self.liveness.heard(cx.now),
-                Way::Datagram if self.liveness.heard_datagram(cx.now) => {
+                Way::Stream => self.wire.liveness.heard(cx.now),
+                Way::Datagram if self.wire.liveness.heard_datagram(cx.now) => {
                     // The peer is told at once that its datagrams come.
-                    self.timers.keep_alive = cx.now;
+                    self.wire.due.set(Part::KeepAlive, cx.now);
                 }
                 Way::Datagram => {}
             }
+            self.wire.due.set(Part::Liveness, self.wire.liveness.deadline());
         }
         match body {
             Some(SessionBody::KeepAlive { stamp, report }) => {
-                self.clock.hear(cx.now, stamp);
+                self.wire.clock.hear(cx.now, stamp);
                 self.reported(cx, report);
                 None
             }
             Some(SessionBody::Renew(renewal)) => {
-                self.renewed(cx, &renewal);
+                self.granting.renewed(&mut self.wire, &self.calls, cx, &renewal);
                 let answer = SessionBody::renewed(renewal.call);
                 match way {
-                    Way::Datagram => drop(self.send_datagram(cx, &answer, &[])),
+                    Way::Datagram => drop(self.wire.send_datagram(cx, &answer, &[])),
                     Way::Stream => {
-                        self.link.send_frame(&Frame::Session(&answer));
-                        self.flush(cx);
+                        self.wire.link.send_frame(&Frame::Session(&answer));
+                        self.wire.flush(cx);
                     }
                 }
                 None
             }
             Some(SessionBody::Renewed(call)) if P::CALLS => {
-                self.was_renewed(cx.now, CallId(call));
+                self.calling.was_renewed(cx.now, CallId(call));
                 None
             }
-            Some(SessionBody::Release(release)) => self.released(cx, release),
-            Some(SessionBody::Cancel(release)) if DETAILS => self.cancel_arrived(cx, release),
-            Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
+            Some(SessionBody::Release(release)) => self.granting.released(&mut self.calls, cx, release),
+            Some(SessionBody::Cancel(release)) if DETAILS => {
+                self.details.cancelled(&mut self.wire, &mut self.calls, release);
+                self.granting.released(&mut self.calls, cx, release)
+            }
+            Some(SessionBody::ReleaseAll(slot, id)) => self.granting.released_all(&mut self.wire, cx, slot, id),
             Some(SessionBody::Message(priority, message)) if P::TAKES_DATAGRAM_REQUESTS => {
                 match (Priority::from_wire(priority), Message::decode(message)) {
                     (Some(priority), Some(Message::Request(header, block))) => {
@@ -297,8 +331,8 @@ impl<P: Port> Session<P> {
                 }
             }
             Some(SessionBody::Ping) => {
-                let report = self.report();
-                self.send_datagram(cx, &SessionBody::pong(report), &[]);
+                let report = self.wire.report();
+                self.wire.send_datagram(cx, &SessionBody::pong(report), &[]);
                 None
             }
             Some(SessionBody::Pong(report)) => {
@@ -308,8 +342,8 @@ impl<P: Port> Session<P> {
             }
             Some(SessionBody::Close(code)) => {
                 if let (Way::Datagram, reason @ CloseReason::StreamDead { .. }) = (way, close_reason(code)) {
-                    self.link.counters.count(LinkCounter::StreamsDied);
-                    self.end(reason);
+                    self.wire.link.counters.count(LinkCounter::StreamsDied);
+                    self.wire.end(reason);
                 }
                 None
             }
@@ -321,7 +355,7 @@ impl<P: Port> Session<P> {
     }
 
     fn unreadable_datagram(&mut self) -> Option<Event> {
-        self.link.counters.count(LinkCounter::DatagramsDropped);
+        self.wire.link.counters.count(LinkCounter::DatagramsDropped);
         None
     }
 
@@ -334,9 +368,9 @@ impl<P: Port> Session<P> {
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
         if DETAILS && P::CALLS {
-            self.note_failure(span, lent);
+            self.details.note_failure(&self.wire, &self.calling.requests, span, lent);
         }
-        match Message::decode(self.link.view(span, lent)) {
+        match Message::decode(self.wire.link.view(span, lent)) {
             Some(Message::Request(header, block)) => {
                 let block = span.last(block.len());
                 self.request_arrived(cx, priority, &header, block, lent, arguments)
@@ -346,23 +380,23 @@ impl<P: Port> Session<P> {
                 self.reply_arrived(cx, CallId(id), block)
             }
             Some(Message::Failure(id, error)) if P::CALLS => {
-                self.release_call(cx, CallId(id), None);
+                self.calling.release_call(&mut self.wire, cx, CallId(id), None);
                 Some(Event::Failed(CallId(id), error))
             }
             Some(Message::Sample(header, block)) if STREAMS && P::CALLS => {
                 let block = span.last(block.len());
-                self.sample_arrived(cx.now, &header, block, lent)
+                StreamsPart::sample_arrived(&mut self.wire, cx.now, &header, block, lent)
             }
             Some(Message::Progress(id, block)) if DETAILS && P::CALLS => {
                 let block = span.last(block.len());
-                self.progress_arrived(CallId(id), block, lent)
+                DetailsPart::progress_arrived(&mut self.wire, &self.calling.requests, CallId(id), block, lent)
             }
             Some(Message::Control(items)) => {
                 let items = span.last(items.len());
                 self.controls_arrived(cx, items, lent)
             }
             Some(Message::Reply(..) | Message::Failure(..) | Message::Sample(..) | Message::Progress(..)) | None => {
-                self.close(cx, CloseReason::Protocol);
+                self.wire.close(cx, CloseReason::Protocol);
                 None
             }
         }
@@ -370,39 +404,39 @@ impl<P: Port> Session<P> {
 
     /// Does what the items of a control message say, in their order. One of which a program is told is the last.
     fn controls_arrived(&mut self, cx: &mut Context<'_, P>, items: Span, lent: &[u8]) -> Option<Event> {
-        let (mut left, mut event) = (self.link.view(items, lent).len(), None);
-        while left > 0 && event.is_none() && self.phase == Phase::Live {
+        let (mut left, mut event) = (self.wire.link.view(items, lent).len(), None);
+        while left > 0 && event.is_none() && self.wire.phase == Phase::Live {
             (left, event) = self.control_arrived(cx, items.last(left), lent);
         }
-        if event.is_some() && Items::new(self.link.view(items.last(left), lent)).next().is_some() {
-            self.close(cx, CloseReason::Protocol);
+        if event.is_some() && Items::new(self.wire.link.view(items.last(left), lent)).next().is_some() {
+            self.wire.close(cx, CloseReason::Protocol);
         }
         event
     }
 
     fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Span, Error>) -> Option<Event> {
-        let Some(pending) = self.requests.close(id) else {
+        let Some(pending) = self.calling.requests.close(id) else {
             // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
-            self.link.counters.count(LinkCounter::RepliesLate);
+            self.wire.link.counters.count(LinkCounter::RepliesLate);
             return None;
         };
         match result {
             Err(error) => {
                 // The call failed at the peer, but a lease may have begun there before it did: it is not renewed any more.
-                self.release_call(cx, id, Some(pending));
+                self.calling.release_call(&mut self.wire, cx, id, Some(pending));
                 Some(Event::Reply(id, Err(error)))
             }
             Ok(block) => {
-                self.note_answered(&pending);
+                self.calling.note_answered(&pending);
                 let Pending { slot, generation, .. } = pending;
-                Some(Event::Reply(id, Ok(Results { slot, generation, block, step: self.step })))
+                Some(Event::Reply(id, Ok(Results { slot, generation, block, step: self.wire.step })))
             }
         }
     }
 
     /// Does what the first item says; returns how many bytes of items are left.
     fn control_arrived(&mut self, cx: &mut Context<'_, P>, items: Span, lent: &[u8]) -> (usize, Option<Event>) {
-        let mut items = Items::new(self.link.view(items, lent));
+        let mut items = Items::new(self.wire.link.view(items, lent));
         let Some(item) = items.next() else { return (0, None) };
         let left = items.rest().len();
         let mut skipped = 0;
@@ -413,52 +447,53 @@ impl<P: Port> Session<P> {
         let control = match control {
             Ok(Some(control)) => control,
             Ok(None) => {
-                self.link.counters.add(LinkCounter::ItemsSkipped, skipped.into());
+                self.wire.link.counters.add(LinkCounter::ItemsSkipped, skipped.into());
                 return (left, None);
             }
             Err(Malformed) => {
-                self.close(cx, CloseReason::Protocol);
+                self.wire.close(cx, CloseReason::Protocol);
                 return (0, None);
             }
         };
         let event = match control {
             Control::Publish { .. } if !P::CALLS => {
-                self.theirs.skip();
-                self.link.counters.count(LinkCounter::FunctionsSkipped);
+                self.wire.theirs.skip();
+                self.wire.link.counters.count(LinkCounter::FunctionsSkipped);
                 None
             }
             Control::Publish { slot, generation, attributes, signature } => {
-                let kept = Attributes::decode(attributes)
-                    .map(|attributes| self.theirs.insert(Slot(slot), Generation(generation), attributes, signature));
-                let allowed = may_publish(cx, self.remote.as_ref(), &mut self.publishing.refusals, signature);
+                let kept = Attributes::decode(attributes).map(|attributes| {
+                    self.wire.theirs.insert(Slot(slot), Generation(generation), attributes, signature)
+                });
+                let allowed = may_publish(cx, self.wire.remote.as_ref(), &mut self.wire.publishing.refusals, signature);
                 match kept {
                     Ok(Ok(())) if allowed => {}
                     Ok(Ok(())) => {
-                        self.theirs.hide(Slot(slot));
-                        self.link.counters.count(LinkCounter::FunctionsForbidden);
+                        self.wire.theirs.hide(Slot(slot));
+                        self.wire.link.counters.count(LinkCounter::FunctionsForbidden);
                     }
-                    Ok(Err(_)) => self.link.counters.count(LinkCounter::FunctionsSkipped),
-                    Err(_) => self.close(cx, CloseReason::Protocol),
+                    Ok(Err(_)) => self.wire.link.counters.count(LinkCounter::FunctionsSkipped),
+                    Err(_) => self.wire.close(cx, CloseReason::Protocol),
                 }
                 None
             }
             Control::Withdraw { slot } => {
                 if P::CALLS {
-                    self.theirs.remove(Slot(slot));
+                    self.wire.theirs.remove(Slot(slot));
                 }
                 None
             }
             Control::ListEnd { serial } => {
-                self.publishing.acknowledge(serial);
+                self.wire.publishing.acknowledge(serial);
                 self.pump(cx);
                 Some(Event::ListChanged)
             }
             Control::ListAck { serial, skipped } => {
-                self.publishing.was_acknowledged(serial);
+                self.wire.publishing.was_acknowledged(serial);
                 Some(Event::Acknowledged { serial, skipped })
             }
             Control::Limits { message_size, minimum_interval, calls } => {
-                if let Some(remote) = &mut self.remote {
+                if let Some(remote) = &mut self.wire.remote {
                     remote.hello.limits.message_size = message_size;
                     remote.hello.limits.minimum_interval = minimum_interval;
                     remote.hello.limits.calls = calls;
@@ -469,21 +504,22 @@ impl<P: Port> Session<P> {
                 Some(Event::Actuator { slot: Slot(slot), state: ActuatorState { latch, last } })
             }
             Control::Subscribe { slot, generation, interval } if STREAMS => {
-                self.subscription_arrived(cx, Slot(slot), Generation(generation), interval);
+                self.streaming.subscription_arrived(&mut self.wire, cx, Slot(slot), Generation(generation), interval);
                 None
             }
             Control::Subscribed { slot, generation, interval, bytes, refusal } if STREAMS && P::CALLS => {
                 let granted =
                     super::GrantedStream { interval: crate::time::Duration::from_millis(interval.into()), bytes };
-                self.subscription_answered(Slot(slot), Generation(generation), granted, refusal)
+                StreamsPart::subscription_answered(&mut self.wire, Slot(slot), Generation(generation), granted, refusal)
             }
             Control::Claimed { report } => {
-                self.claim_arrived(cx, &report);
+                self.granting.obedience.claim_arrived(&mut self.wire, cx, &report);
                 None
             }
-            Control::LeaseEnded { call, why } if P::CALLS => {
-                self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })
-            }
+            Control::LeaseEnded { call, why } if P::CALLS => self
+                .calling
+                .stop_renewing(CallId(call))
+                .map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why }),
             Control::Subscribe { .. }
             | Control::Subscribed { .. }
             | Control::Actuator { .. }
@@ -501,23 +537,24 @@ impl<P: Port> Session<P> {
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
-        self.link.counters.count(LinkCounter::RequestsReceived);
+        self.wire.link.counters.count(LinkCounter::RequestsReceived);
         // First of all: a copy of a request must not even be refused, or its refusal could overtake the answer of the original.
         let seen = self.calls.note(priority, header.id);
         if seen == Seen::Before {
-            self.link.counters.count(LinkCounter::RequestsRepeated);
+            self.wire.link.counters.count(LinkCounter::RequestsRepeated);
             return None;
         }
         // Once for all that a request needs of it.
         let function = cx.functions.lookup(header.slot, header.generation);
-        let length = self.link.view(block, lent).len();
+        let length = self.wire.link.view(block, lent).len();
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
             // The handler of a function that stops waits where a safe hook is to run first: `poll` comes before `next_call`.
             // A moving call waits until the claim that it is made under is stored.
-            let waits = function.attributes.stop && self.awaits_hook(cx, header.slot, header.generation)
-                || function.attributes.lease.is_some() && self.may_move(cx).is_none();
+            let waits = function.attributes.stop && Granting::awaits_hook(cx, header.slot, header.generation)
+                || function.attributes.lease.is_some()
+                    && self.granting.obedience.may_move(&mut self.wire, cx).is_none();
             let arguments = arguments.filter(|_| !waits);
-            let bytes = self.link.view(block, lent);
+            let bytes = self.wire.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 // The arguments are checked before the call begins: a lease must not start for a request that is refused.
                 Some(arguments) => {
@@ -531,7 +568,7 @@ impl<P: Port> Session<P> {
                     if waits.is_ok() || !self.displace(cx, &head, length) {
                         return waits.map(|()| None);
                     }
-                    self.calls.wait(cx.buffers, left, head, self.link.view(block, lent)).map(|()| None)
+                    self.calls.wait(cx.buffers, left, head, self.wire.link.view(block, lent)).map(|()| None)
                 }
             }
         });
@@ -558,10 +595,10 @@ impl<P: Port> Session<P> {
         // First of all what a stop stops, however late it is and whatever its handler has to wait for, or is refused for.
         let stops = function.as_ref().ok().filter(|function| function.attributes.stop);
         if let Some(function) =
-            stops.filter(|_| self.publishing.advertised(header.slot, header.generation) == Advertised::Now)
-            && self.permit_call(cx, function, priority, false).is_ok()
+            stops.filter(|_| self.wire.publishing.advertised(header.slot, header.generation) == Advertised::Now)
+            && permit_call(&mut self.wire, cx, function, priority, false).is_ok()
         {
-            self.stop_orders(cx, header);
+            self.granting.stop_orders(&mut self.wire, cx, header);
         }
         if seen == Seen::TooOld {
             return Err(Error::Stale);
@@ -571,8 +608,8 @@ impl<P: Port> Session<P> {
         }
         // The limit may have become lower while the request was on its way.
         let limit = match priority {
-            Priority::Emergency => self.constraints.message_size.min(EMERGENCY_BLOCK_BYTES),
-            _ => self.constraints.message_size,
+            Priority::Emergency => self.wire.constraints.message_size.min(EMERGENCY_BLOCK_BYTES),
+            _ => self.wire.constraints.message_size,
         };
         if length > limit as usize {
             return Err(Error::TooLarge { limit });
@@ -585,7 +622,7 @@ impl<P: Port> Session<P> {
             return Err(Error::Expired);
         }
         // By what this peer was told, not by what the unit offers: a function that was shown to another node stays unknown here.
-        let function = match self.publishing.advertised(header.slot, header.generation) {
+        let function = match self.wire.publishing.advertised(header.slot, header.generation) {
             Advertised::Never => return Err(Error::UnknownFunction),
             Advertised::Earlier => return Err(Error::StaleFunction),
             Advertised::Now => function?,
@@ -594,10 +631,10 @@ impl<P: Port> Session<P> {
             return Err(Error::UnknownFunction);
         }
         if cx.table().is_some() {
-            self.permit_call(cx, &function, priority, header.takes_over)?;
+            permit_call(&mut self.wire, cx, &function, priority, header.takes_over)?;
         }
         if priority != Priority::Emergency && !function.attributes.stop {
-            self.calls.interval(cx.now, self.constraints.minimum_interval)?;
+            self.calls.interval(cx.now, self.wire.constraints.minimum_interval)?;
         }
         let head = CallHead {
             id: header.id,
@@ -614,7 +651,7 @@ impl<P: Port> Session<P> {
             number: header.number,
         };
         let is_emergency = is_emergency(function.attributes, priority);
-        let admitted = self.calls.admit(header.slot, is_emergency, self.constraints.calls_per_peer);
+        let admitted = self.calls.admit(header.slot, is_emergency, self.wire.constraints.calls_per_peer);
         if admitted.is_err() && !self.displace(cx, &head, length) {
             return admitted.map(|()| (head, function));
         }

@@ -16,12 +16,11 @@
 //!   [left](crate::distribution::connection_handler::Node::left).
 
 mod answering;
-mod consulting;
 mod details;
+mod due;
 mod granting;
 mod holding;
 mod inbound;
-mod lending;
 mod obeying;
 mod outbound;
 mod permitting;
@@ -31,35 +30,43 @@ mod publishing;
 mod renewing;
 mod streaming;
 mod timing;
+mod wire;
 
 pub use inbound::{Receipt, ReplyBlock, Results};
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
 pub use streaming::{Granted as GrantedStream, Sample};
 
-use crate::ability::{Ability, DETAILS, Details, STREAMS, State, Streams};
-use crate::config::{Constraints, HELLO_TIMEOUT, LEASES, LINK_BUFFER_BYTES, Mode, Priority};
+use crate::ability::{Ability, Details, STREAMS, State, Streams};
+use crate::config::{Constraints, HELLO_TIMEOUT, LINK_BUFFER_BYTES, Priority};
 use crate::counters::Counters;
+use crate::distribution::connection_handler::{Admission, Directive};
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::Hello;
 use crate::distribution::identity::{Epoch, Fleet, Identity};
-use crate::distribution::message::LONGEST_HEADER_BYTES;
-use crate::distribution::message::SessionBody;
+use crate::distribution::message::{LONGEST_HEADER_BYTES, SessionBody};
+use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Link, LinkCounter, Liveness};
-use crate::host::frame::{Frame, HEADER_BYTES};
+use crate::host::frame::HEADER_BYTES;
 use crate::host::mailman::LinkId;
 use crate::host::secure::Secure;
+use crate::services::access::Verb;
+use crate::services::call::Callee;
 use crate::services::calls::{Calls, RunningCall, Ticket};
-use crate::services::lease::{ActuatorState, Granted, Held, LeaseEnd, Order};
-use crate::services::requests::{CallId, Pending, Requests};
+use crate::services::heart::Beats;
+use crate::services::lease::{ActuatorState, Lease, LeaseEnd, Order};
+use crate::services::requests::{CallId, Made, Pending, Requests};
 use crate::services::{Context, Port};
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
-use timing::{PeerClock, Timers};
+use granting::Granting;
+use holding::Calling;
+use permitting::decide;
+use proving::{reply_to_hello, send_hello};
+use timing::PeerClock;
+use wire::{Phase, Wire, close_code, close_reason};
 
-/// Longest hello frame.
-const HELLO_BYTES: usize = 320;
 /// Longest frame body of a peer that has proven nothing: with its header too short to need a buffer of the pool.
 const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - HEADER_BYTES - 1;
 /// A challenge goes in the stream and in so many datagrams: one lost segment or datagram must not make a live peer look
@@ -173,73 +180,16 @@ pub struct Incoming {
     pub order: Option<Order>,
 }
 
-/// Where the link stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Phase {
-    /// The port is opening the connection, or waits for the peer's hello.
-    AwaitingHello { until: Instant },
-    /// The peer is to prove that it has the key: with a message, then with a sealed frame.
-    Proving { until: Instant },
-    /// The hub decides about the peer.
-    Deciding,
-    /// Both have accepted.
-    Live,
-    /// The link has ended; what was in flight is being reported.
-    Ending(CloseReason),
-    /// Everything has been reported.
-    Ended,
-}
-
-/// What is known of the peer since its hello.
-struct Remote<E> {
-    hello: Hello,
-    /// The highest version that both ends speak.
-    version: u8,
-    /// When its hello came.
-    heard: Instant,
-    /// Where its session datagrams go.
-    datagrams: E,
-}
-
 /// One link to one peer.
 pub struct Session<P: Port> {
-    link: Link<P::Storage, P::Cipher>,
-    phase: Phase,
-    dialed: bool,
-    /// The hub has taken the peer.
-    joined: bool,
-    nonce: u64,
-    fleet: Fleet,
-    /// The pause between keep-alives, in milliseconds, that this unit's hello has named.
-    reported_keep_alive: u32,
-    constraints: Constraints,
-    remote: Option<Remote<P::Endpoint>>,
-    peer_address: P::Endpoint,
-    liveness: Liveness,
-    /// The hub waits for a sign of life.
-    challenged: bool,
-    /// More of the stream is there and is not read for now.
-    holds: bool,
+    wire: Wire<P>,
     pings: pinging::Pings,
-    clock: PeerClock,
-    timers: Timers,
     renewal: renewing::Renewal,
-    requests: Requests<P::Storage>,
+    calling: Calling<P>,
     calls: Calls<P::Storage>,
-    obedience: obeying::Obedience,
-    publishing: publishing::Publishing<P::Storage>,
-    theirs: TheirFunctionList<P::Storage>,
-    granted: heapless::Vec<Granted, LEASES>,
-    ends: granting::Ends,
-    held: heapless::Vec<Held, LEASES>,
-    answered: holding::Answered,
-    releases: holding::Releases,
-    streaming: State<streaming::Streaming, { STREAMS as usize }>,
-    details: State<details::OfCalls, { DETAILS as usize }>,
-    /// The newest call that was to move something.
-    last_order: Option<(Slot, CallId)>,
-    /// How often something was received, by which [`Results`] are known to be the last ones.
-    step: u32,
+    granting: Granting,
+    streaming: streaming::StreamsPart,
+    details: details::DetailsPart,
 }
 
 impl<P: Port> Session<P> {
@@ -259,11 +209,10 @@ impl<P: Port> Session<P> {
             // Whoever has proven nothing gets no more than the link's own bytes.
             link.set_chunk_limit(UNPROVEN_BYTES);
         }
-        Self {
+        let mut wire = Wire {
             link,
             phase: Phase::AwaitingHello { until: now + HELLO_TIMEOUT },
             dialed,
-            joined: false,
             nonce,
             fleet: Fleet(0),
             reported_keep_alive: 0,
@@ -271,40 +220,42 @@ impl<P: Port> Session<P> {
             remote: None,
             peer_address: address,
             liveness: Liveness::new(now, constraints.keep_alive),
-            challenged: false,
             holds: false,
-            pings: pinging::Pings::new(),
+            joined: false,
+            challenged: false,
             clock: PeerClock::new(),
-            timers: Timers::new(now),
-            renewal: renewing::Renewal::new(),
-            requests: Requests::new(storage.pending),
-            calls: Calls::new(storage.running),
-            obedience: obeying::Obedience::new(),
+            due: due::Due::new(),
+            pace: State::NEW,
+            last_write: Instant::START,
             publishing: publishing::Publishing::new(storage.publications),
             theirs: TheirFunctionList::new(storage.their_functions, storage.their_signatures),
-            granted: heapless::Vec::new(),
-            ends: granting::Ends::new(),
-            held: heapless::Vec::new(),
-            answered: holding::Answered::new(),
-            releases: holding::Releases::new(),
+            step: 0,
+        };
+        wire.due.set(due::Part::KeepAlive, now);
+        wire.note_liveness();
+        Self {
+            wire,
+            pings: pinging::Pings::new(),
+            renewal: renewing::Renewal::new(),
+            calling: Calling::new(Requests::new(storage.pending)),
+            calls: Calls::new(storage.running),
+            granting: Granting::new(),
             streaming: State::NEW,
             details: State::NEW,
-            last_order: None,
-            step: 0,
         }
     }
 
     /// The slices that the session lived in, for the next one: so a port without an allocator opens link after link.
     /// For a session that has ended; of one that has not, what is in flight is forgotten without a word.
     pub fn into_storage(mut self, buffers: &mut dyn Buffers<P::Storage>) -> SessionStorage<P::Storage> {
-        self.link.release(buffers);
+        self.wire.link.release(buffers);
         self.calls.release(buffers);
-        let (their_functions, their_signatures) = self.theirs.into_slices();
+        let (their_functions, their_signatures) = self.wire.theirs.into_slices();
         SessionStorage {
-            small: self.link.into_small(),
-            pending: self.requests.into_slots(),
+            small: self.wire.link.into_small(),
+            pending: self.calling.requests.into_slots(),
             running: self.calls.into_slots(),
-            publications: self.publishing.into_table(),
+            publications: self.wire.publishing.into_table(),
             their_functions,
             their_signatures,
         }
@@ -312,88 +263,88 @@ impl<P: Port> Session<P> {
 
     /// This unit opened the connection.
     pub const fn dialed(&self) -> bool {
-        !P::MANAGES || self.dialed
+        self.wire.dialed()
     }
 
     /// Both ends have accepted each other.
     pub fn is_live(&self) -> bool {
-        self.phase == Phase::Live
+        self.wire.phase == Phase::Live
     }
 
     /// The link has ended and everything about it has been reported.
     pub fn is_ended(&self) -> bool {
-        self.phase == Phase::Ended
+        self.wire.phase == Phase::Ended
     }
 
     /// The peer has proven who it is, or has said it where nobody has to prove it. Of links that have not come so far, the
     /// oldest gives way to a new one.
     pub const fn is_proven(&self) -> bool {
-        self.remote.is_some() && !matches!(self.phase, Phase::Proving { .. })
+        self.wire.remote.is_some() && !matches!(self.wire.phase, Phase::Proving { .. })
     }
 
     /// The peer's hello, once it has come. It may be anybody's as long as the peer [is not proven](Self::is_proven).
     pub fn hello(&self) -> Option<&Hello> {
-        self.remote.as_ref().map(|remote| &remote.hello)
+        self.wire.hello()
     }
 
     /// The version of the protocol that the link uses, once the peer's hello has come.
     pub fn version(&self) -> Option<u8> {
-        self.remote.as_ref().map(|remote| remote.version)
+        self.wire.remote.as_ref().map(|remote| remote.version)
     }
 
     /// The peer's identity, once it has told it. It may be anybody's as long as the peer [is not proven](Self::is_proven).
     pub fn identity(&self) -> Option<&Identity> {
-        self.hello().map(|hello| &hello.identity)
+        self.wire.identity()
     }
 
     /// The peer, from joining on.
     pub fn peer(&self) -> Option<&Identity> {
-        self.identity().filter(|_| self.joined)
+        self.wire.identity().filter(|_| self.wire.joined)
     }
 
     /// The peer's boot epoch, once it has told it.
     pub fn epoch(&self) -> Option<Epoch> {
-        self.hello().map(|hello| hello.epoch)
+        self.wire.hello().map(|hello| hello.epoch)
     }
 
     /// The other end of the stream.
     pub const fn address(&self) -> P::Endpoint {
-        self.peer_address
+        self.wire.peer_address
     }
 
     /// This unit's constraints, as this link keeps them.
     pub const fn constraints(&self) -> &Constraints {
-        &self.constraints
+        &self.wire.constraints
     }
 
     /// The nonce that the peer's session datagrams carry.
     pub const fn nonce(&self) -> u64 {
-        self.nonce
+        self.wire.nonce
     }
 
     /// What the peer has published to this unit.
     pub const fn their_function_list(&self) -> &TheirFunctionList<P::Storage> {
-        &self.theirs
+        &self.wire.theirs
     }
 
     /// What happened on this link.
     pub const fn counters(&self) -> &Counters<LinkCounter, { LinkCounter::COUNT }> {
-        &self.link.counters
+        &self.wire.link.counters
     }
 
     /// The newest call of a leased function of the peer.
     pub const fn last_order(&self) -> Option<(Slot, CallId)> {
-        self.last_order
+        self.calling.last_order
     }
 
     /// Calls of this unit that wait for a reply.
     pub fn calls_in_flight(&self) -> usize {
-        self.requests.in_flight()
+        self.calling.requests.in_flight()
     }
 
     /// Whether a call of the peer moves something here.
     pub fn moves(&self) -> bool {
-        !self.granted.is_empty()
+        !self.granting.granted.is_empty()
     }
 
     /// Calls of the peer that run or wait here.
@@ -403,17 +354,17 @@ impl<P: Port> Session<P> {
 
     /// How long ago the peer was last heard.
     pub fn silent_for(&self, now: Instant) -> Duration {
-        self.liveness.silent_for(now)
+        self.wire.liveness.silent_for(now)
     }
 
     /// How long ago something came in the stream: what it told is as old at least.
     pub fn stream_silent_for(&self, now: Instant) -> Duration {
-        self.liveness.stream_silent_for(now)
+        self.wire.liveness.stream_silent_for(now)
     }
 
     /// Whether session datagrams of the peer come; `None` while that is not known.
     pub const fn hears_datagrams(&self) -> Option<bool> {
-        match (self.liveness.hears(), self.liveness.is_deaf()) {
+        match (self.wire.liveness.hears(), self.wire.liveness.is_deaf()) {
             (false, false) => None,
             (hears, _) => Some(hears),
         }
@@ -421,179 +372,382 @@ impl<P: Port> Session<P> {
 
     /// Whether those of this unit come to the peer, as it told last.
     pub const fn is_heard(&self) -> bool {
-        self.liveness.is_heard()
+        self.wire.liveness.is_heard()
     }
 
     /// More bytes of the stream are there, and the port does not read them for now: the peer is told, which otherwise takes the
     /// stream for dead. Until the next [`receive`](Self::receive).
     pub const fn hold_back(&mut self) {
-        self.holds = true;
+        self.wire.holds = true;
     }
 
     /// Bytes of messages and frames that the network has not taken yet.
     pub fn bytes_queued(&self) -> usize {
-        self.link.queued()
+        self.wire.link.queued()
     }
 
     /// Bytes wait for the stream to become writable. Those that gather do not: they have a deadline.
     pub fn wants_to_write(&self) -> bool {
-        self.link.wants_to_write()
+        self.wire.link.wants_to_write()
     }
 
     /// Whether anything is kept of the bytes that came. Otherwise [`receive`](Self::receive) has nothing more to say after
     /// it has taken all of them, and need not be called with nothing.
     pub fn holds_received(&self) -> bool {
-        self.link.holds_received()
+        self.wire.link.holds_received()
     }
 
     /// The connection is open: the one who dialed introduces itself first.
     pub fn connected(&mut self, cx: &mut Context<'_, P>) {
-        self.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
-        if self.dialed() {
-            self.send_hello(cx);
+        self.wire.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
+        if self.wire.dialed() {
+            send_hello(&mut self.wire, cx);
         }
     }
 
     /// The hub takes the peer. The link is live from here on, unless it ends here.
     fn accept(&mut self, cx: &mut Context<'_, P>) {
-        if !self.dialed() {
-            self.reply_to_hello(cx);
+        if !self.wire.dialed() {
+            reply_to_hello(&mut self.wire, cx);
         }
-        if self.phase != Phase::Deciding {
+        if self.wire.phase != Phase::Deciding {
             return;
         }
-        self.phase = Phase::Live;
-        self.timers.keep_alive = cx.now;
-        self.rest_until_renewal(cx.now);
-        debug!("link {} is live", self.link.id().0);
+        self.wire.phase = Phase::Live;
+        self.wire.due.set(due::Part::KeepAlive, cx.now);
+        self.renewal.rest(&mut self.wire, cx.now);
+        debug!("link {} is live", self.wire.link.id().0);
     }
 
-    /// The peer is not taken, and told why.
-    fn refuse(&mut self, cx: &mut Context<'_, P>, refusal: Refusal) {
-        match refusal {
-            Refusal::NoKey => {
-                // The code of a proof that failed: the peer need not know which of the two it was.
-                self.link.counters.count(LinkCounter::KeysMissing);
-                self.farewell(cx, &Frame::Close(close_code(CloseReason::BadProof)));
-            }
-            _ => self.farewell(cx, &Frame::Refuse(refusal.to_wire())),
+    /// The peer has said who it is, or has proven it: what becomes of the link?
+    pub(super) fn consult(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
+        let Some(remote) = &self.wire.remote else { return None };
+        let (now, link, from, hello) = (cx.now, self.wire.link.id(), self.wire.peer_address, &remote.hello);
+        let mut admission = Admission::Wait;
+        cx.hub.enter(&mut |hub| admission = hub.node.admit(now, link, from, hello));
+        match admission {
+            Admission::Accept => return self.admitted(cx),
+            Admission::Refuse(refusal) => self.wire.refuse(cx, refusal),
+            Admission::Wait => {}
         }
-        self.end(CloseReason::Refused(refusal));
+        None
+    }
+
+    /// The peer is alive, for which the hub may have asked.
+    pub(super) fn show_life(&mut self, cx: &mut Context<'_, P>) {
+        if core::mem::take(&mut self.wire.challenged) && !self.has_given_way(cx) {
+            let (now, link) = (cx.now, self.wire.link.id());
+            cx.hub.enter(&mut |hub| hub.node.challenge_answered(now, link));
+        }
+    }
+
+    /// Does what the hub wants of this link because of another one. What it comes too late for, it passes over.
+    pub fn direct(&mut self, cx: &mut Context<'_, P>, directive: Directive) -> Option<Event> {
+        match directive {
+            Directive::Challenge => self.challenge(cx),
+            Directive::Yield => {
+                if self.granting.obedience.give_way(&mut self.wire, cx.now) {
+                    self.challenge(cx);
+                }
+            }
+            Directive::Admit => return self.admitted(cx),
+            Directive::Refuse(refusal) => self.wire.refuse(cx, refusal),
+            Directive::Close(reason) => self.wire.close(cx, reason),
+        }
+        None
+    }
+
+    /// The hub has taken the peer, which is told what is published to it.
+    fn admitted(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
+        if self.wire.phase != Phase::Deciding {
+            return None;
+        }
+        self.accept(cx);
+        if self.wire.phase != Phase::Live {
+            return None;
+        }
+        self.wire.joined = true;
+        if self.is_advertised(cx) {
+            self.pump(cx);
+        } else {
+            self.publish(cx);
+        }
+        Some(Event::Joined)
+    }
+
+    /// Makes what the hub has published to the peer visible to it, as it is now and as far as the access table lets it be
+    /// seen. Returns the serial that comes back with [`Event::Acknowledged`].
+    pub fn publish(&mut self, cx: &mut Context<'_, P>) -> u32 {
+        let Some(remote) = &self.wire.remote else { return 0 };
+        let (functions, publishing, identity) = (cx.functions, &mut self.wire.publishing, &remote.hello.identity);
+        cx.hub.enter(&mut |hub| {
+            // What was hidden since the last time is withdrawn: a change that comes before the link is live reaches it only here.
+            for slot in publishing.all_slots() {
+                let is_visible = hub.publications.is_visible(identity, slot);
+                publishing.want(slot, functions.generation(slot).filter(|_| is_visible));
+            }
+            publishing.version = hub.publications.version();
+        });
+        self.end_of_changes(cx)
+    }
+
+    /// Whether anything was published since the last [`publish`](Self::publish) here: where others publish meanwhile, a port
+    /// looks once more when they find the link.
+    pub fn is_behind(&self, cx: &mut Context<'_, P>) -> bool {
+        let mut newest = self.wire.publishing.version;
+        cx.hub.enter(&mut |hub| newest = hub.publications.version());
+        newest != self.wire.publishing.version
     }
 
     /// Ends the link because the key of its pair is no longer valid.
     pub fn revoke(&mut self, cx: &mut Context<'_, P>) {
-        self.refuse(cx, Refusal::NoKey);
+        self.wire.refuse(cx, Refusal::NoKey);
     }
 
     /// Ends the link in an orderly way; [`poll`](Self::poll) reports what was in flight.
     pub fn close(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) {
-        if matches!(reason, CloseReason::Protocol | CloseReason::Oversize) {
-            self.link.counters.count(LinkCounter::FramesRefused);
-        }
-        self.farewell(cx, &Frame::Close(close_code(reason)));
-        self.end(reason);
+        self.wire.close(cx, reason);
     }
 
     /// The connection below has ended.
     pub fn disconnected(&mut self, reason: CloseReason) {
-        self.end(reason);
+        self.wire.end(reason);
     }
 
     /// Asks the peer of a live link for a sign of life.
     fn challenge(&mut self, cx: &mut Context<'_, P>) {
-        if self.phase == Phase::Live {
-            self.challenged = true;
-            self.send_ping(cx.now);
-            self.flush(cx);
+        if self.wire.phase == Phase::Live {
+            self.wire.challenged = true;
+            self.pings.send(&mut self.wire, cx.now);
+            self.wire.flush(cx);
             for _ in 0..CHALLENGE_DATAGRAMS {
-                self.send_datagram(cx, &SessionBody::PING, &[]);
+                self.wire.send_datagram(cx, &SessionBody::PING, &[]);
             }
         }
     }
 
     /// The stream takes bytes again.
     pub fn writable(&mut self, cx: &mut Context<'_, P>) {
-        self.flush(cx);
-        self.pump_renewal(cx);
+        self.wire.flush(cx);
+        self.renewal.pump(&mut self.wire, cx);
         if P::CALLS {
-            self.send_releases(cx);
+            self.calling.send_releases(&mut self.wire, cx);
         }
         self.pump(cx);
         if STREAMS {
-            self.send_samples(cx);
+            self.streaming.send_samples(&mut self.wire, cx);
         }
+    }
+
+    /// Asks the peer for a sign of life and measures how long it takes: [`Event::Answered`] comes with it, and
+    /// [`round_trip`](Self::round_trip) tells. A ping before it that has not been answered is given up.
+    ///
+    /// [`Error::NotConnected`] on a link that is not live, [`Error::Full`] where the stream has no room.
+    pub fn ping(&mut self, cx: &mut Context<'_, P>) -> Result<(), Error> {
+        self.pings.ping(&mut self.wire, cx)
+    }
+
+    /// How long the answer to the last [`ping`](Self::ping) took, once it has come.
+    pub fn round_trip(&self) -> Option<Duration> {
+        self.pings.round_trip()
+    }
+
+    /// Makes the keys of a secured link anew each time they are as old as `span`, or up to an eighth younger, instead of
+    /// [`HANDSHAKE_LIFE`](crate::config::HANDSHAKE_LIFE); at least
+    /// [`SHORTEST_HANDSHAKE_LIFE`](crate::config::SHORTEST_HANDSHAKE_LIFE). Holds from the next handshake on, for the end that
+    /// dialled: the other one follows.
+    pub fn renew_every(&mut self, span: Duration) {
+        self.renewal.renew_every(span);
+    }
+
+    /// This unit's claim is another one: the peer is told.
+    pub fn announce_claim(&mut self, cx: &mut Context<'_, P>) {
+        self.granting.obedience.has_news = true;
+        self.pump(cx);
+    }
+
+    /// Wants values of a stream of the peer, at least `interval` apart; the peer may grant a longer one, which comes as
+    /// [`Event::Subscribed`]. Of several calls for one stream the last one counts. The subscription ends with the link, and when
+    /// the peer publishes another stream in its place: a port subscribes again with [`Event::ListChanged`], which changes nothing
+    /// where nothing has changed. [`Error::UnknownFunction`] where the peer has no such stream, [`Error::NotConnected`].
+    pub fn subscribe(&mut self, cx: &mut Context<'_, P>, stream: &str, interval: Duration) -> Result<Slot, Error> {
+        self.streaming.wish(&mut self.wire, cx, stream, Some(interval))
+    }
+
+    /// Wants no more values of a stream of the peer.
+    pub fn unsubscribe(&mut self, cx: &mut Context<'_, P>, stream: &str) {
+        // Where there is no such stream, none comes.
+        let _ = self.streaming.wish(&mut self.wire, cx, stream, None);
+    }
+
+    /// A stream of this unit has a new value: [`poll`](Self::poll) then sends it where it is due. Whether the peer has any
+    /// subscription.
+    pub fn stream_changed(&mut self, now: Instant) -> bool {
+        self.streaming.changed(&mut self.wire, now)
+    }
+
+    /// Streams of this unit that the peer is subscribed to.
+    pub fn subscriptions(&self) -> u16 {
+        self.streaming.active()
+    }
+
+    /// Requests a function of the peer. With `wants_reply`, its end comes as [`Event::Reply`]
+    /// under the returned id; without, only a failure comes back.
+    ///
+    /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::Mismatch`], [`Error::MissingArgument`], [`Error::WrongType`],
+    /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
+    /// [`Error::SlowHeart`], [`Error::NotConnected`].
+    pub fn request(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        callee: Callee<'_>,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wants_reply: bool,
+    ) -> Result<CallId, Error> {
+        let result = self.calling.request(&mut self.wire, cx, callee, parameters, options, wants_reply);
+        match result {
+            Ok(_) => self.wire.link.counters.count(LinkCounter::RequestsSent),
+            Err(_) => self.wire.link.counters.count(LinkCounter::RequestsWithheld),
+        }
+        result
+    }
+
+    /// A call is made that may have to wait for room: in [`RequestOptions::made`] it keeps its place among those that move the
+    /// same thing, and is refused as [`Error::Replaced`] behind a later one.
+    pub fn make(&mut self) -> Made {
+        self.calling.requests.make()
+    }
+
+    /// Whether this unit renews the lease of a call.
+    pub fn holds(&self, call: CallId) -> bool {
+        self.calling.holds(call)
+    }
+
+    /// How long the leases that calls of a function hold last, counted from when the last answer to a renewal came; `None` where
+    /// none is renewed. An answer names its call and not its renewal, of which several may be on their way: one that was held up
+    /// makes this too long by as much.
+    pub fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
+        self.calling.lease_left(now, slot)
+    }
+
+    /// A heart has stopped: what names it is released.
+    pub fn release_beats(&mut self, cx: &mut Context<'_, P>, beats: Beats) {
+        self.calling.release_beats(&mut self.wire, cx, beats);
+    }
+
+    /// The caller does not want a call any more: its reply, should it still come, counts as late, and the lease that it
+    /// holds, or would begin, is released. Other calls are untouched. Also for a call that has been answered and holds a
+    /// lease.
+    pub fn cancel(&mut self, cx: &mut Context<'_, P>, id: CallId) {
+        self.calling.cancel(&mut self.wire, cx, id);
+    }
+
+    /// Releases all calls of a function of the peer, those that are on their way as well: what they started stops.
+    ///
+    /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.
+    pub fn release(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> Result<(), Error> {
+        self.calling.release(&mut self.wire, cx, slot)
+    }
+
+    /// Writes what has gathered now.
+    pub fn flush_gathered(&mut self, cx: &mut Context<'_, P>) {
+        self.wire.flush(cx);
+    }
+
+    /// How many calls of this unit may be in flight.
+    pub fn call_slots(&self) -> usize {
+        self.calling.requests.slots()
+    }
+
+    /// Lends more slots for calls of this unit, a multiple of those before. Returns the slots that are not needed any
+    /// more: the new ones if they are no such multiple.
+    pub fn lend_calls(
+        &mut self,
+        pending: <P::Storage as Storage>::Slice<Option<Pending>>,
+    ) -> <P::Storage as Storage>::Slice<Option<Pending>> {
+        self.calling.requests.grow(pending)
+    }
+
+    /// Slots for calls of the peer that run here, and how many calls of it run or wait.
+    pub fn running_slots(&self) -> (usize, u16) {
+        (self.calls.slots(), self.calls.held())
+    }
+
+    /// Lends more slots for calls of the peer that run here. Returns the slots that are not needed any more: the new ones if
+    /// they are fewer than before.
+    pub fn lend_running(
+        &mut self,
+        running: <P::Storage as Storage>::Slice<Option<RunningCall>>,
+    ) -> <P::Storage as Storage>::Slice<Option<RunningCall>> {
+        self.calls.grow(running)
+    }
+
+    /// Lets the peer's list grow to so many functions, and so many bytes of signatures, where the storage has an allocator.
+    pub const fn let_list_grow(&mut self, functions: usize, bytes: usize) {
+        self.wire.theirs.let_grow(functions, bytes);
+    }
+
+    /// Functions of this unit's own list that the peer can be told of.
+    pub fn publication_slots(&self) -> usize {
+        self.wire.publishing.slots()
+    }
+
+    /// Lends more slots for functions of this unit's own list. Returns the slots that are not needed any more: the new
+    /// ones if they are fewer.
+    pub fn lend_publications(
+        &mut self,
+        publications: <P::Storage as Storage>::Slice<Publication>,
+    ) -> <P::Storage as Storage>::Slice<Publication> {
+        self.wire.publishing.grow(publications)
+    }
+
+    /// The application has finished what an order of this lease started: no renewal keeps it alive, no hook runs. `false` where
+    /// no call of this peer has that order, or it has ended before: that one was not finished, and its hook runs.
+    pub fn end_order(&mut self, cx: &mut Context<'_, P>, lease: &Lease, order: Order) -> bool {
+        self.granting.end_order(&mut self.wire, cx, lease, order)
+    }
+
+    /// Whether the peer has read this unit's list up to `serial`.
+    pub fn is_acknowledged(&self, serial: u32) -> bool {
+        self.wire.publishing.is_acknowledged(serial)
+    }
+
+    /// Hides a function from the peer.
+    pub fn withdraw(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> u32 {
+        self.wire.publishing.want(slot, None);
+        self.end_of_changes(cx)
+    }
+
+    /// The access table of the context is another one than before: the peer is told what it may see from here on,
+    /// leases end that it may not hold any more, and of what it has published this unit sees what it may. For a live link; before that, what is published is under the new table anyway.
+    /// Returns the serial that comes back with [`Event::Acknowledged`].
+    pub fn access_changed(&mut self, cx: &mut Context<'_, P>) -> u32 {
+        self.wire.publishing.fill_buckets();
+        self.granting.cut_forbidden(&mut self.wire, cx);
+        let remote = self.wire.remote.as_ref();
+        self.wire.theirs.show_only(|name| decide(cx.table(), remote, name, Verb::Publish).is_allowed());
+        self.end_of_changes(cx)
+    }
+
+    pub(super) fn end_of_changes(&mut self, cx: &mut Context<'_, P>) -> u32 {
+        let serial = self.wire.publishing.end_changes();
+        self.granting.cut_gone(&mut self.wire, cx);
+        self.pump(cx);
+        serial
+    }
+
+    /// Whether the peer was told of everything up to the unit's newest publication, or will be as soon as there is room.
+    pub(super) fn is_advertised(&self, cx: &mut Context<'_, P>) -> bool {
+        self.wire.publishing.has_begun() && !self.is_behind(cx)
     }
 
     /// Changes the limits of this unit; the peer is told.
     pub fn set_constraints(&mut self, cx: &mut Context<'_, P>, constraints: Constraints) {
-        self.constraints = constraints;
-        self.link.set_message_limit(message_limit(&constraints));
-        self.publishing.notify_limits();
+        self.wire.constraints = constraints;
+        self.wire.link.set_message_limit(message_limit(&constraints));
+        self.wire.publishing.notify_limits();
         self.pump(cx);
-    }
-
-    fn send_hello(&mut self, cx: &mut Context<'_, P>) {
-        let (mut bytes, mut length) = ([0; HELLO_BYTES], 0);
-        let (now, mode, link) = (cx.now, self.mode(), self.link.id());
-        let (nonce, remote, fleet, reported) =
-            (self.nonce, &self.remote, &mut self.fleet, &mut self.reported_keep_alive);
-        cx.hub.enter(&mut |hub| {
-            let mut hello = hub.node.hello(now, link, nonce);
-            if let Some(remote) = remote {
-                hello.obeyed = hub.node.obeyed_report(now, &remote.hello.identity);
-            }
-            (*fleet, *reported) = (hello.fleet, hello.keep_alive);
-            length = hello.encode(mode, &mut bytes).unwrap_or(0);
-        });
-        let bytes = bytes.get(..length).unwrap_or(&[]);
-        self.link.cipher().introduce(bytes);
-        self.send_frame(&Frame::Hello(bytes));
-        self.flush(cx);
-    }
-
-    /// Puts a frame into the stream, sealed if frames are.
-    fn send_frame(&mut self, frame: &Frame<'_>) -> bool {
-        if self.link.cipher().is_sealing() { self.link.send_frame(frame) } else { self.link.send_clear(frame) }
-    }
-
-    fn mode(&mut self) -> Mode {
-        self.link.cipher().mode()
-    }
-
-    /// A last frame, behind what is being written, as far as the network takes it now.
-    fn farewell(&mut self, cx: &mut Context<'_, P>, frame: &Frame<'_>) {
-        if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
-            // What was accepted goes first: a frame would overtake it.
-            let _ = self.link.flush(cx.mailman, cx.buffers);
-            self.send_frame(frame);
-            let _ = self.link.flush(cx.mailman, cx.buffers);
-        }
-    }
-
-    fn flush(&mut self, cx: &mut Context<'_, P>) {
-        self.timers.gathered = Instant::FAR_FUTURE;
-        if let Err(reason) = self.link.flush(cx.mailman, cx.buffers) {
-            self.end(reason);
-        }
-    }
-
-    fn end(&mut self, reason: CloseReason) {
-        if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
-            debug!("link {} ends: {}", self.link.id().0, reason);
-            self.phase = Phase::Ending(reason);
-        }
-    }
-
-    /// Longest block that the peer takes.
-    fn peer_message_size(&self) -> u32 {
-        self.hello().map_or(0, |hello| hello.limits.message_size)
-    }
-
-    /// Our own minimum interval or the peer's, whichever is longer.
-    fn interval(&self) -> Duration {
-        let theirs = self.hello().map_or(0, |hello| hello.limits.minimum_interval);
-        self.constraints.minimum_interval.max(Duration::from_micros(u64::from(theirs)))
     }
 }
 
@@ -611,41 +765,6 @@ pub const fn buffer_bytes(message_size: u32, overhead: usize) -> usize {
         None => 2,
     };
     total.saturating_add(frames.saturating_mul(FRAME_BYTES.saturating_add(overhead)))
-}
-
-const fn close_code(reason: CloseReason) -> u8 {
-    match reason {
-        CloseReason::Stopped | CloseReason::StoppedHere => 1,
-        CloseReason::Reset => 2,
-        CloseReason::Silent => 3,
-        CloseReason::PeerRestarted => 4,
-        CloseReason::Protocol => 5,
-        CloseReason::Oversize => 6,
-        CloseReason::HelloTimeout => 7,
-        CloseReason::Refused(_) => 8,
-        CloseReason::DialFailed => 9,
-        CloseReason::Exhausted => 10,
-        CloseReason::Unproven => 11,
-        CloseReason::BadProof => 12,
-        CloseReason::StreamDead { long: false } => 13,
-        CloseReason::StreamDead { long: true } => 14,
-    }
-}
-
-const fn close_reason(code: u8) -> CloseReason {
-    match code {
-        1 => CloseReason::Stopped,
-        3 => CloseReason::Silent,
-        4 => CloseReason::PeerRestarted,
-        5 => CloseReason::Protocol,
-        6 => CloseReason::Oversize,
-        7 => CloseReason::HelloTimeout,
-        10 => CloseReason::Exhausted,
-        12 => CloseReason::BadProof,
-        13 => CloseReason::StreamDead { long: false },
-        14 => CloseReason::StreamDead { long: true },
-        _ => CloseReason::Reset,
-    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,8 @@
 //! The way down: a request becomes a message, checked against what the peer published and the limits that it told.
 
-use super::{Phase, Session};
+use super::due::Part;
+use super::holding::Calling;
+use super::wire::{Phase, Wire};
 use crate::ability::DETAILS;
 use crate::config::{DATAGRAM_BYTES, EMERGENCY_BYTES, Priority};
 use crate::distribution::block::{self, Put, SliceWriter};
@@ -8,16 +10,12 @@ use crate::distribution::function::Signature;
 use crate::distribution::message::{REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
-use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
 use crate::services::call::Callee;
 use crate::services::heart::Renew;
 use crate::services::requests::{CallId, Made};
 use crate::services::{Context, Port};
-use crate::time::{Duration, Instant};
-
-/// Gathered one-way messages go out when there are this many bytes of them.
-const GATHERED_BYTES: usize = 8 * 1024;
+use crate::time::Duration;
 
 /// How a request travels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -45,7 +43,7 @@ pub struct RequestOptions {
     pub take_over: bool,
     /// An operator makes it, and not the unit's program: each of them holds for itself what it moves.
     pub operator: bool,
-    /// Its place among the calls of its link, where it was [made](Session::make) before it is sent; now if none.
+    /// Its place among the calls of its link, where it was [made](super::Session::make) before it is sent; now if none.
     pub made: Option<Made>,
     /// Tell what the call tells while it runs, if its function declares that.
     pub progress: bool,
@@ -88,37 +86,11 @@ struct Checked {
     is_urgent: bool,
 }
 
-impl<P: Port> Session<P> {
-    /// Requests a function of the peer. With `wants_reply`, its end comes as [`Event::Reply`](super::Event::Reply)
-    /// under the returned id; without, only a failure comes back.
-    ///
-    /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::Mismatch`], [`Error::MissingArgument`], [`Error::WrongType`],
-    /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
-    /// [`Error::SlowHeart`], [`Error::NotConnected`].
-    pub fn request(
+impl<P: Port> Calling<P> {
+    /// Sends a request, or nothing of it.
+    pub(super) fn request(
         &mut self,
-        cx: &mut Context<'_, P>,
-        callee: Callee<'_>,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-        wants_reply: bool,
-    ) -> Result<CallId, Error> {
-        let result = self.try_request(cx, callee, parameters, options, wants_reply);
-        match result {
-            Ok(_) => self.link.counters.count(LinkCounter::RequestsSent),
-            Err(_) => self.link.counters.count(LinkCounter::RequestsWithheld),
-        }
-        result
-    }
-
-    /// A call is made that may have to wait for room: in [`RequestOptions::made`] it keeps its place among those that move the
-    /// same thing, and is refused as [`Error::Replaced`] behind a later one.
-    pub fn make(&mut self) -> Made {
-        self.requests.make()
-    }
-
-    fn try_request(
-        &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         callee: Callee<'_>,
         parameters: &ParametersView,
@@ -126,16 +98,30 @@ impl<P: Port> Session<P> {
         wants_reply: bool,
     ) -> Result<CallId, Error> {
         // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
-        let mut checked = self.check(cx, callee, parameters, options, wants_reply)?;
+        let mut checked = self.check(wire, cx, callee, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
         let held = checked.lease.filter(|_| options.renew != Renew::Never);
-        self.check_held(held, options, slot)?;
-        let id = self.take_id(cx, &checked, wants_reply)?;
+        if let Some(lease) = held {
+            self.check_held(lease, options, slot)?;
+        }
+        let Checked { header: RequestHeader { generation, remaining, .. }, priority, is_urgent, .. } = checked;
+        let id = if wants_reply {
+            let leased = checked.lease.is_some();
+            let id = self.requests.open(slot, generation, cx.now + remaining, priority, leased, is_urgent)?;
+            wire.due.hasten(Part::Calls, cx.now + remaining);
+            id
+        } else {
+            self.requests.next_id()
+        };
+        let Some(id) = id else {
+            wire.close(cx, CloseReason::Exhausted);
+            return Err(Error::Closed(CloseReason::Exhausted));
+        };
         checked.header.id = id.0;
         checked.header.number = self.requests.made(options.made).number();
         let sent = match options.delivery {
-            Delivery::BestEffort if self.liveness.is_heard() => self.send_best_effort(cx, &checked, parameters),
-            _ => self.send_reliable(cx, &checked, parameters),
+            Delivery::BestEffort if wire.liveness.is_heard() => Self::send_best_effort(wire, cx, &checked, parameters),
+            _ => Self::send_reliable(wire, cx, &checked, parameters),
         };
         // Nothing of the message has left, since a message that does not fit is refused before its first byte.
         if let Err(error) = sent {
@@ -147,23 +133,24 @@ impl<P: Port> Session<P> {
             self.last_order = Some((slot, id));
         }
         if let Some(lease) = held {
-            self.hold_lease(cx, &checked.header, checked.priority, lease, options.renew);
+            self.hold_lease(wire, cx, &checked.header, priority, lease, options.renew);
         }
         Ok(id)
     }
 
     fn check(
         &self,
+        wire: &Wire<P>,
         cx: &Context<'_, P>,
         callee: Callee<'_>,
         parameters: &ParametersView,
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<Checked, Error> {
-        if self.phase != Phase::Live {
+        if wire.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        let function = self.theirs.named(callee.name()).ok_or(Error::UnknownFunction)?;
+        let function = wire.theirs.named(callee.name()).ok_or(Error::UnknownFunction)?;
         callee.check(function.signature).map_err(|found| Error::Mismatch(found.part))?;
         if function.attributes.is_stream() {
             return Err(Error::UnknownFunction);
@@ -171,7 +158,7 @@ impl<P: Port> Session<P> {
         let priority = options.priority.unwrap_or(function.attributes.priority);
         let is_urgent = function.attributes.is_urgent(priority);
         let length = block::measure(function.signature.arguments(), parameters)?;
-        self.check_length(priority, options.delivery, length)?;
+        Self::check_length(wire, priority, options.delivery, length)?;
         if wants_reply {
             // Known before anything runs at the peer: a call whose results could not be kept must not move a vehicle.
             block::check_results_fit(function.signature.results(), parameters)?;
@@ -180,10 +167,10 @@ impl<P: Port> Session<P> {
             }
         }
         if priority != Priority::Emergency && !is_urgent {
-            self.requests.gate(cx.now, self.interval())?;
+            self.requests.gate(cx.now, wire.interval())?;
         }
-        let (stamp, since) = self.clock.stamp(cx.now);
-        let remaining = options.timeout.unwrap_or(self.constraints.request_timeout);
+        let (stamp, since) = wire.clock.stamp(cx.now);
+        let remaining = options.timeout.unwrap_or(wire.constraints.request_timeout);
         let wants_progress =
             DETAILS && wants_reply && options.progress && function.signature.progress().next().is_some();
         let header = RequestHeader {
@@ -203,8 +190,8 @@ impl<P: Port> Session<P> {
         Ok(Checked { header, priority, length, lease: function.attributes.lease, is_urgent })
     }
 
-    fn check_length(&self, priority: Priority, delivery: Delivery, length: usize) -> Result<(), Error> {
-        let peer = self.peer_message_size();
+    fn check_length(wire: &Wire<P>, priority: Priority, delivery: Delivery, length: usize) -> Result<(), Error> {
+        let peer = wire.peer_message_size();
         if length > peer as usize {
             return Err(Error::TooLarge { limit: peer });
         }
@@ -217,23 +204,8 @@ impl<P: Port> Session<P> {
         if length > limit { Err(Error::TooLarge { limit: limit as u32 }) } else { Ok(()) }
     }
 
-    fn take_id(&mut self, cx: &mut Context<'_, P>, checked: &Checked, wants_reply: bool) -> Result<CallId, Error> {
-        let header = &checked.header;
-        let id = if wants_reply {
-            let (deadline, class) = (cx.now + header.remaining, checked.priority);
-            let leased = checked.lease.is_some();
-            self.requests.open(header.slot, header.generation, deadline, class, leased, checked.is_urgent)?
-        } else {
-            self.requests.next_id()
-        };
-        if id.is_none() {
-            self.close(cx, CloseReason::Exhausted);
-        }
-        id.ok_or(Error::Closed(CloseReason::Exhausted))
-    }
-
     fn send_reliable(
-        &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         checked: &Checked,
         parameters: &ParametersView,
@@ -241,10 +213,10 @@ impl<P: Port> Session<P> {
         let Checked { header, priority, length, .. } = checked;
         let total = REQUEST_BYTES.saturating_add(*length);
         // Beside the stream, which may be blocked; both copies have one id, and the callee runs it once.
-        let has_left = *priority == Priority::Emergency && self.send_emergency_datagram(cx, header, parameters);
+        let has_left = *priority == Priority::Emergency && Self::send_emergency_datagram(wire, cx, header, parameters);
         // A caller that waits is not kept waiting for others, and an emergency for no one.
-        let hold = !header.wants_reply && *priority != Priority::Emergency && self.timers.may_gather(cx.now);
-        let Self { link, theirs, .. } = self;
+        let hold = !header.wants_reply && *priority != Priority::Emergency && wire.may_gather(cx.now);
+        let Wire { link, theirs, .. } = wire;
         let signature = theirs.function(header.slot).ok_or(Error::StaleFunction)?.signature;
         // The piece of code that also sends answers.
         let write: &mut dyn FnMut(&mut ChunkWriter<'_>) = &mut |writer| {
@@ -252,73 +224,42 @@ impl<P: Port> Session<P> {
             block::write(signature.arguments(), parameters, writer);
         };
         let sent = link.send_message(cx.mailman, cx.buffers, *priority, total, hold, write);
-        match self.after_sending(cx, hold, sent) {
+        match wire.after_sending(cx, hold, sent) {
             // What is before it in the stream are emergencies as well.
             Err(Error::Full(_)) if has_left => Ok(()),
             sent => sent,
         }
     }
 
-    /// What an attempt to send means for the messages that gather. A message that is refused leaves them where they
-    /// were: they go out now, because nothing else may come to take them along, and they hold the buffer that the next
-    /// attempt needs.
-    pub(super) fn after_sending(
-        &mut self,
-        cx: &mut Context<'_, P>,
-        hold: bool,
-        sent: Result<(), Error>,
-    ) -> Result<(), Error> {
-        match sent {
-            Ok(()) if hold && self.link.queued() < GATHERED_BYTES => {
-                self.timers.gathered = self.timers.gathered.min(cx.now + crate::config::GATHER);
-                return sent;
-            }
-            // What is not held has taken with it what was.
-            Ok(()) if !hold => self.timers.gathered = Instant::FAR_FUTURE,
-            Ok(()) => self.flush(cx),
-            Err(Error::Closed(reason)) => self.end(reason),
-            Err(_) => self.flush(cx),
-        }
-        if sent.is_ok() {
-            self.timers.last_write = cx.now;
-        }
-        sent
-    }
-
     /// The second copy of an emergency; at-most-once removes the double. Whether it has left, to a peer that has told that datagrams come.
     fn send_emergency_datagram(
-        &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         header: &RequestHeader,
         parameters: &ParametersView,
     ) -> bool {
         let mut message = [0; EMERGENCY_BYTES];
-        let Some(signature) = self.theirs.function(header.slot).map(|function| function.signature) else {
+        let Some(signature) = wire.theirs.function(header.slot).map(|function| function.signature) else {
             return false;
         };
         let length = write_message(&mut message, header, signature, parameters);
         let prefix = SessionBody::message_prefix(Priority::Emergency.to_wire());
-        let sent = self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
-        sent && self.liveness.is_heard()
+        let sent = wire.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
+        sent && wire.liveness.is_heard()
     }
 
     fn send_best_effort(
-        &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         checked: &Checked,
         parameters: &ParametersView,
     ) -> Result<(), Error> {
         let mut message = [0; DATAGRAM_BYTES];
-        let signature = self.theirs.function(checked.header.slot).ok_or(Error::StaleFunction)?.signature;
+        let signature = wire.theirs.function(checked.header.slot).ok_or(Error::StaleFunction)?.signature;
         let length = write_message(&mut message, &checked.header, signature, parameters);
         let prefix = SessionBody::message_prefix(checked.priority.to_wire());
-        let sent = self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
+        let sent = wire.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
         if sent { Ok(()) } else { Err(Error::Network) }
-    }
-
-    /// Writes what has gathered now.
-    pub fn flush_gathered(&mut self, cx: &mut Context<'_, P>) {
-        self.flush(cx);
     }
 }
 

@@ -1,7 +1,7 @@
 //! What the access table lets the peer do.
 
 use super::publishing::Refusals;
-use super::{Remote, Session};
+use super::wire::{Remote, Wire};
 use crate::config::Priority;
 use crate::distribution::function::Signature;
 use crate::distribution::function_list::{Function, Slot};
@@ -37,55 +37,33 @@ pub(super) fn decide_call<E>(
     decide(access, remote, function, Verb::Call)
 }
 
-impl<P: Port> Session<P> {
-    /// The access table of the context is another one than before: the peer is told what it may see from here on,
-    /// leases end that it may not hold any more, and of what it has published this unit sees what it may. For a live link; before that, what is published is under the new table anyway.
-    /// Returns the serial that comes back with [`Event::Acknowledged`](super::Event::Acknowledged).
-    pub fn access_changed(&mut self, cx: &mut Context<'_, P>) -> u32 {
-        self.publishing.fill_buckets();
-        self.cut_forbidden_leases(cx);
-        let remote = self.remote.as_ref();
-        self.theirs.show_only(|name| decide(cx.table(), remote, name, Verb::Publish).is_allowed());
-        self.end_of_changes(cx)
-    }
+/// Whether the peer sees a function: one that it may call, or list.
+pub(super) fn may_see<P: Port>(wire: &Wire<P>, cx: &Context<'_, P>, slot: Slot) -> bool {
+    cx.table().is_none() || may(wire, cx, slot, Verb::Call) || may(wire, cx, slot, Verb::List)
+}
 
-    fn cut_forbidden_leases(&mut self, cx: &mut Context<'_, P>) {
-        for index in 0..self.granted.len() {
-            let Some(slot) = self.granted.get(index).map(|granted| granted.slot) else { return };
-            if !self.may(cx, slot, Verb::Call) {
-                self.cut_lease(cx, index);
-            }
-        }
-    }
+pub(super) fn may<P: Port>(wire: &Wire<P>, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
+    let function = cx.functions.function(slot);
+    function.is_none_or(|function| decide(cx.table(), wire.remote.as_ref(), function.name(), verb).is_allowed())
+}
 
-    /// Whether the peer sees a function: one that it may call, or list.
-    pub(super) fn may_see(&self, cx: &Context<'_, P>, slot: Slot) -> bool {
-        cx.table().is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
-    }
-
-    fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
-        let function = cx.functions.function(slot);
-        function.is_none_or(|function| decide(cx.table(), self.remote.as_ref(), function.name(), verb).is_allowed())
-    }
-
-    /// A request has arrived for a function that the peer was told of, and there is a table: may it be called, and so soon?
-    pub(super) fn permit_call(
-        &mut self,
-        cx: &Context<'_, P>,
-        function: &Function<'_, dyn Service>,
-        priority: Priority,
-        takes_over: bool,
-    ) -> Result<(), Error> {
-        match decide_call(cx.table(), self.remote.as_ref(), function.name(), takes_over) {
-            Decision::Denied => Err(Error::NotAllowed),
-            Decision::Allowed { rate: None, .. } => Ok(()),
-            // A stop never comes too often, nor does another emergency.
-            Decision::Allowed { .. } if function.attributes.is_urgent(priority) => Ok(()),
-            Decision::Allowed { rate: Some(rate), .. } => match self.publishing.bucket(function.slot) {
-                Some(bucket) => bucket.take(cx.now, rate),
-                None => Err(Error::UnknownFunction),
-            },
-        }
+/// A request has arrived for a function that the peer was told of, and there is a table: may it be called, and so soon?
+pub(super) fn permit_call<P: Port>(
+    wire: &mut Wire<P>,
+    cx: &Context<'_, P>,
+    function: &Function<'_, dyn Service>,
+    priority: Priority,
+    takes_over: bool,
+) -> Result<(), Error> {
+    match decide_call(cx.table(), wire.remote.as_ref(), function.name(), takes_over) {
+        Decision::Denied => Err(Error::NotAllowed),
+        Decision::Allowed { rate: None, .. } => Ok(()),
+        // A stop never comes too often, nor does another emergency.
+        Decision::Allowed { .. } if function.attributes.is_urgent(priority) => Ok(()),
+        Decision::Allowed { rate: Some(rate), .. } => match wire.publishing.bucket(function.slot) {
+            Some(bucket) => bucket.take(cx.now, rate),
+            None => Err(Error::UnknownFunction),
+        },
     }
 }
 

@@ -1,6 +1,7 @@
 //! Round trips of the protocol itself, with no function involved.
 
-use super::{Event, Phase, Session};
+use super::Phase;
+use super::wire::Wire;
 use crate::error::{Error, Limit};
 use crate::host::frame::Frame;
 use crate::services::{Context, Port};
@@ -15,21 +16,26 @@ const FORGOTTEN: Duration = Duration::from_secs(10);
 pub(super) struct Pings {
     unanswered: u16,
     last: Instant,
-    own: Option<Own>,
+    own: Own,
 }
 
 /// The ping that somebody asked for.
 #[derive(Clone, Copy, Debug)]
-struct Own {
-    sent: Instant,
-    /// Answers up to its own.
-    behind: u16,
-    took: Option<Duration>,
+enum Own {
+    None,
+    /// So many answers come up to its own.
+    Sent {
+        at: Instant,
+        behind: u16,
+    },
+    Answered {
+        took: Duration,
+    },
 }
 
 impl Pings {
     pub(super) const fn new() -> Self {
-        Self { unanswered: 0, last: Instant::START, own: None }
+        Self { unanswered: 0, last: Instant::START, own: Own::None }
     }
 
     fn sent(&mut self, now: Instant) {
@@ -41,52 +47,46 @@ impl Pings {
     }
 
     /// An answer has come; whether it is the one that somebody waits for.
-    fn answered(&mut self, now: Instant) -> bool {
+    pub(super) fn answered(&mut self, now: Instant) -> bool {
         self.unanswered = self.unanswered.saturating_sub(1);
-        let Some(own) = self.own.as_mut().filter(|own| own.took.is_none()) else { return false };
-        own.behind = own.behind.saturating_sub(1);
-        if own.behind == 0 {
-            own.took = Some(now.since(own.sent));
-        }
-        own.behind == 0
+        let Own::Sent { at, behind } = self.own else { return false };
+        let is_own = behind <= 1;
+        self.own = match is_own {
+            true => Own::Answered { took: now.since(at) },
+            false => Own::Sent { at, behind: behind.saturating_sub(1) },
+        };
+        is_own
     }
-}
 
-impl<P: Port> Session<P> {
-    /// Asks the peer for a sign of life and measures how long it takes: [`Event::Answered`] comes with it, and
-    /// [`round_trip`](Self::round_trip) tells. A ping before it that has not been answered is given up.
-    ///
-    /// [`Error::NotConnected`] on a link that is not live, [`Error::Full`] where the stream has no room.
-    pub fn ping(&mut self, cx: &mut Context<'_, P>) -> Result<(), Error> {
-        if self.phase != Phase::Live {
+    /// A ping before it that has not been answered is given up.
+    pub(super) fn ping<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Result<(), Error> {
+        if wire.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        self.pings.own = None;
-        if !self.send_ping(cx.now) {
+        self.own = Own::None;
+        if !self.send(wire, cx.now) {
             return Err(Error::Full(Limit::SendQueue));
         }
-        self.pings.own = Some(Own { sent: cx.now, behind: self.pings.unanswered, took: None });
-        self.flush(cx);
+        self.own = Own::Sent { at: cx.now, behind: self.unanswered };
+        wire.flush(cx);
         Ok(())
     }
 
-    /// How long the answer to the last [`ping`](Self::ping) took, once it has come.
-    pub fn round_trip(&self) -> Option<Duration> {
-        self.pings.own.and_then(|own| own.took)
+    /// How long the answer to the last ping that somebody asked for took, once it has come.
+    pub(super) fn round_trip(&self) -> Option<Duration> {
+        match self.own {
+            Own::Answered { took } => Some(took),
+            Own::None | Own::Sent { .. } => None,
+        }
     }
 
     /// Puts a ping into the stream; `false` where there is no room.
-    pub(super) fn send_ping(&mut self, now: Instant) -> bool {
-        let accepted = self.link.send_frame(&Frame::Ping);
+    pub(super) fn send<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
+        let accepted = wire.link.send_frame(&Frame::Ping);
         if accepted {
-            self.pings.sent(now);
+            self.sent(now);
         }
         accepted
-    }
-
-    pub(super) fn pong_arrived(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        self.show_life(cx);
-        if self.pings.answered(cx.now) { Some(Event::Answered) } else { None }
     }
 }
 
@@ -102,11 +102,11 @@ mod tests {
 
     fn ping(pings: &mut Pings, now: Instant) {
         pings.sent(now);
-        pings.own = Some(Own { sent: now, behind: pings.unanswered, took: None });
+        pings.own = Own::Sent { at: now, behind: pings.unanswered };
     }
 
     fn took(pings: &Pings) -> Option<Duration> {
-        pings.own.and_then(|own| own.took)
+        pings.round_trip()
     }
 
     #[test]

@@ -1,16 +1,17 @@
 //! Which of this unit's functions one peer has been told of, and what it is still to be told.
 
 use super::LEAST_MESSAGE_BYTES;
+use super::granting::Granting;
+use super::permitting::may_see;
 use super::streaming::Subscription;
-use super::{Phase, Session};
+use super::wire::Wire;
 use crate::ability::{HELP, STREAMS, State};
-use crate::config::{Priority, SIGNATURE_BYTES};
+use crate::config::SIGNATURE_BYTES;
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::hello::Limits;
 use crate::distribution::identity::Identity;
 use crate::distribution::message::{CONTROL_BYTES, Control, LONGEST_HEADER_BYTES, PUBLISH_BYTES};
-use crate::host::secure::Secure;
 use crate::services::access::Bucket;
 use crate::services::lease::ActuatorState;
 use crate::services::{Context, Port};
@@ -198,6 +199,30 @@ impl<S: Storage> Publishing<S> {
         self.acknowledged = self.acknowledged.max(serial);
     }
 
+    /// Whether the peer has read this unit's list up to `serial`.
+    pub(super) const fn is_acknowledged(&self, serial: u32) -> bool {
+        self.acknowledged >= serial
+    }
+
+    /// The peer is to see what has changed. Returns the serial that comes back when it has.
+    pub(super) const fn end_changes(&mut self) -> u32 {
+        self.serial = self.serial.wrapping_add(1);
+        self.dirty = true;
+        self.end_due = true;
+        self.serial
+    }
+
+    /// Whether the peer was told of anything.
+    pub(super) const fn has_begun(&self) -> bool {
+        self.serial != 0
+    }
+
+    /// Whether something waits for room.
+    pub(super) const fn has_news(&self) -> bool {
+        let list = self.dirty || self.end_due || self.actuators_due;
+        list || self.limits_due || self.acknowledgement_due.is_some()
+    }
+
     pub(super) fn notify_limits(&mut self) {
         self.limits_due = true;
     }
@@ -212,173 +237,106 @@ impl<S: Storage> Publishing<S> {
     }
 }
 
-impl<P: Port> Session<P> {
-    /// Whether the peer has read this unit's list up to `serial`.
-    pub fn is_acknowledged(&self, serial: u32) -> bool {
-        self.publishing.acknowledged >= serial
-    }
-
-    /// Hides a function from the peer.
-    pub fn withdraw(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> u32 {
-        if let Some(publication) = self.publishing.table.get_mut(usize::from(slot.0)) {
-            publication.wanted = None;
-        }
-        self.end_of_changes(cx)
-    }
-
-    pub(super) fn end_of_changes(&mut self, cx: &mut Context<'_, P>) -> u32 {
-        self.publishing.serial = self.publishing.serial.wrapping_add(1);
-        self.publishing.dirty = true;
-        self.publishing.end_due = true;
-        self.cut_gone(cx);
-        self.pump(cx);
-        self.publishing.serial
-    }
-
-    /// Tells the peer what it is still to be told, as far as there is room.
-    pub(super) fn pump(&mut self, cx: &mut Context<'_, P>) {
-        if !self.may_advertise() {
-            return;
-        }
-        self.send_ends(cx);
-        if self.publishing.limits_due && self.send_limits(cx) {
-            self.publishing.limits_due = false;
-        }
-        self.send_claim(cx);
-        if let Some(serial) = self.publishing.acknowledgement_due {
-            let skipped = u16::try_from(self.theirs.skipped()).unwrap_or(u16::MAX);
-            if self.send_control(cx, &Control::ListAck { serial, skipped }) {
-                self.publishing.acknowledgement_due = None;
-            }
-        }
-        if self.publishing.dirty {
-            self.publishing.dirty = !self.send_news(cx);
-        }
-        if self.publishing.actuators_due && !self.publishing.dirty {
-            self.publishing.actuators_due = !self.send_actuators(cx);
-        }
-        // The end of the list goes behind all of it: its acknowledgement says that the peer has read everything before.
-        if self.publishing.end_due && !self.publishing.dirty && !self.publishing.actuators_due {
-            let serial = self.publishing.serial;
-            self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
-        }
-        if STREAMS {
-            self.pump_streams(cx);
+/// Tells the peer what it is still to be told of this unit's list, as far as there is room, and that it has read its own.
+pub(super) fn send_list<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
+    if let Some(serial) = wire.publishing.acknowledgement_due {
+        let skipped = u16::try_from(wire.theirs.skipped()).unwrap_or(u16::MAX);
+        if wire.send_control(cx, &Control::ListAck { serial, skipped }) {
+            wire.publishing.acknowledgement_due = None;
         }
     }
-
-    /// Whether the peer may be told what is published: it has proven itself to this end, which dialled, or the link is live.
-    fn may_advertise(&mut self) -> bool {
-        match self.phase {
-            Phase::Live => true,
-            Phase::Proving { .. } => self.dialed && self.link.cipher().is_sealing(),
-            _ => false,
-        }
+    if wire.publishing.dirty {
+        wire.publishing.dirty = !send_news(wire, cx);
     }
-
-    /// Whether the peer was told of everything up to the unit's newest publication, or will be as soon as there is room.
-    pub(super) fn is_advertised(&self, cx: &mut Context<'_, P>) -> bool {
-        self.publishing.serial != 0 && !self.is_behind(cx)
+    if wire.publishing.actuators_due && !wire.publishing.dirty {
+        wire.publishing.actuators_due = !send_actuators(wire, cx);
     }
-
-    /// Whether something waits for room.
-    pub(super) fn has_news(&self) -> bool {
-        let publishing = &self.publishing;
-        let advertised = publishing.acknowledgement_due.is_none()
-            && self.ends.is_empty()
-            && !self.obedience.has_news
-            && !(STREAMS && self.streaming.has_news());
-        publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !advertised
+    // The end of the list goes behind all of it: its acknowledgement says that the peer has read everything before.
+    if wire.publishing.end_due && !wire.publishing.dirty && !wire.publishing.actuators_due {
+        let serial = wire.publishing.serial;
+        wire.publishing.end_due = !wire.send_control(cx, &Control::ListEnd { serial });
     }
+}
 
-    /// Tells the state of what each function moves, if it has changed; `false` when there was no more room.
-    fn send_actuators(&mut self, cx: &mut Context<'_, P>) -> bool {
-        let functions = cx.functions;
-        let moves = |slot| functions.function(slot).filter(|function| function.attributes.lease.is_some());
-        let leases = self.publishing.all_slots().filter_map(|slot| moves(slot)?.handler.lease());
-        let changes = leases.fold(0, |sum: u32, lease| sum.rotate_left(7).wrapping_add(lease.changes()));
-        if changes == self.publishing.actuators_reported {
-            return true;
-        }
-        let peer = self.identity().map_or(0, Identity::id);
-        for slot in self.publishing.all_slots() {
-            let advertised =
-                self.publishing.table.get(usize::from(slot.0)).and_then(|publication| publication.advertised);
-            let Some(function) = moves(slot).filter(|function| advertised == Some(function.generation)) else {
-                continue;
-            };
-            let ActuatorState { latch, last } = function.handler.state();
-            // A link's nonce and a claim are their own caller's alone.
-            let last = last.map(|last| if last.holder == peer { last } else { last.of_another() });
-            if !self.send_control(cx, &Control::Actuator { slot: slot.0, latch, last }) {
-                return false;
-            }
-        }
-        self.publishing.actuators_reported = changes;
-        true
+/// Tells the state of what each function moves, if it has changed; `false` when there was no more room.
+fn send_actuators<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
+    let functions = cx.functions;
+    let moves = |slot| functions.function(slot).filter(|function| function.attributes.lease.is_some());
+    let leases = wire.publishing.all_slots().filter_map(|slot| moves(slot)?.handler.lease());
+    let changes = leases.fold(0, |sum: u32, lease| sum.rotate_left(7).wrapping_add(lease.changes()));
+    if changes == wire.publishing.actuators_reported {
+        return true;
     }
-
-    fn send_limits(&mut self, cx: &mut Context<'_, P>) -> bool {
-        let Limits { message_size, minimum_interval, calls, .. } = Limits::from(&self.constraints);
-        self.send_control(cx, &Control::Limits { message_size, minimum_interval, calls })
-    }
-
-    /// Sends each function whose news the peer does not have; `false` when there was no more room.
-    fn send_news(&mut self, cx: &mut Context<'_, P>) -> bool {
-        for index in 0..self.publishing.table.len() {
-            let Some(&publication) = self.publishing.table.get(index) else { break };
-            let slot = Slot(index as u16);
-            let wanted = publication.wanted.filter(|_| self.may_see(cx, slot));
-            if wanted == publication.advertised {
-                continue;
-            }
-            let function = wanted.and_then(|generation| cx.functions.lookup(slot, generation).ok());
-            let sent = match function {
-                None => self.send_control(cx, &Control::Withdraw { slot: slot.0 }),
-                Some(function) => {
-                    let actuator = self.actuator_of(cx, function.handler);
-                    let whole = function.signature.as_bytes();
-                    let least = if HELP { function.signature.without_help().as_bytes() } else { whole };
-                    let control = Control::Publish {
-                        slot: slot.0,
-                        generation: function.generation.0,
-                        attributes: &Attributes { actuator, ..*function.attributes }.encode(),
-                        // One that the peer has no buffer for would end the link. Without one it counts as not kept there,
-                        // as any that it cannot read.
-                        signature: [whole, least].into_iter().find(|one| self.may_hold(one.len())).unwrap_or_default(),
-                    };
-                    self.send_control(cx, &control)
-                }
-            };
-            if !sent {
-                return false;
-            }
-            if function.is_some_and(|function| function.attributes.lease.is_some()) {
-                (self.publishing.actuators_due, self.publishing.actuators_reported) = (true, 0);
-            }
-            // Only once it is in the queue: after a full queue the loop begins again at the first function that is not told.
-            if let Some(publication) = self.publishing.table.get_mut(index) {
-                publication.advertised = wanted;
-            }
-        }
-        true
-    }
-
-    /// Whether the peer takes a message with a signature of this length.
-    fn may_hold(&self, length: usize) -> bool {
-        let theirs = self.hello().map_or(0, |hello| hello.limits.message_size);
-        let limit = (theirs as usize).saturating_add(LONGEST_HEADER_BYTES).max(LEAST_MESSAGE_BYTES);
-        CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES <= LEAST_MESSAGE_BYTES
-            || length.saturating_add(CONTROL_BYTES + PUBLISH_BYTES) <= limit
-    }
-
-    /// Sends a control message; `false` when there is no room, or nobody to send it to.
-    pub(super) fn send_control(&mut self, cx: &mut Context<'_, P>, control: &Control<'_>) -> bool {
-        if !self.may_advertise() {
+    let peer = wire.identity().map_or(0, Identity::id);
+    for slot in wire.publishing.all_slots() {
+        let advertised = wire.publishing.table.get(usize::from(slot.0)).and_then(|publication| publication.advertised);
+        let Some(function) = moves(slot).filter(|function| advertised == Some(function.generation)) else {
+            continue;
+        };
+        let ActuatorState { latch, last } = function.handler.state();
+        // A link's nonce and a claim are their own caller's alone.
+        let last = last.map(|last| if last.holder == peer { last } else { last.of_another() });
+        if !wire.send_control(cx, &Control::Actuator { slot: slot.0, latch, last }) {
             return false;
         }
-        let mut bytes = [0; CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES];
-        let Some(message) = control.encode(&mut bytes) else { return false };
-        self.send(cx, Priority::High, message.len(), &mut |writer| writer.put(message)).is_ok()
     }
+    wire.publishing.actuators_reported = changes;
+    true
+}
+
+/// Tells the peer the limits of this unit, where they have changed.
+pub(super) fn send_limits<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
+    if wire.publishing.limits_due {
+        let Limits { message_size, minimum_interval, calls, .. } = Limits::from(&wire.constraints);
+        wire.publishing.limits_due = !wire.send_control(cx, &Control::Limits { message_size, minimum_interval, calls });
+    }
+}
+
+/// Sends each function whose news the peer does not have; `false` when there was no more room.
+fn send_news<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
+    for index in 0..wire.publishing.table.len() {
+        let Some(&publication) = wire.publishing.table.get(index) else { break };
+        let slot = Slot(index as u16);
+        let wanted = publication.wanted.filter(|_| may_see(wire, cx, slot));
+        if wanted == publication.advertised {
+            continue;
+        }
+        let function = wanted.and_then(|generation| cx.functions.lookup(slot, generation).ok());
+        let sent = match function {
+            None => wire.send_control(cx, &Control::Withdraw { slot: slot.0 }),
+            Some(function) => {
+                let actuator = Granting::actuator_of(wire, cx, function.handler);
+                let whole = function.signature.as_bytes();
+                let least = if HELP { function.signature.without_help().as_bytes() } else { whole };
+                let control = Control::Publish {
+                    slot: slot.0,
+                    generation: function.generation.0,
+                    attributes: &Attributes { actuator, ..*function.attributes }.encode(),
+                    // One that the peer has no buffer for would end the link. Without one it counts as not kept there,
+                    // as any that it cannot read.
+                    signature: [whole, least].into_iter().find(|one| may_hold(wire, one.len())).unwrap_or_default(),
+                };
+                wire.send_control(cx, &control)
+            }
+        };
+        if !sent {
+            return false;
+        }
+        if function.is_some_and(|function| function.attributes.lease.is_some()) {
+            (wire.publishing.actuators_due, wire.publishing.actuators_reported) = (true, 0);
+        }
+        // Only once it is in the queue: after a full queue the loop begins again at the first function that is not told.
+        if let Some(publication) = wire.publishing.table.get_mut(index) {
+            publication.advertised = wanted;
+        }
+    }
+    true
+}
+
+/// Whether the peer takes a message with a signature of this length.
+fn may_hold<P: Port>(wire: &Wire<P>, length: usize) -> bool {
+    let theirs = wire.hello().map_or(0, |hello| hello.limits.message_size);
+    let limit = (theirs as usize).saturating_add(LONGEST_HEADER_BYTES).max(LEAST_MESSAGE_BYTES);
+    CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES <= LEAST_MESSAGE_BYTES
+        || length.saturating_add(CONTROL_BYTES + PUBLISH_BYTES) <= limit
 }

@@ -13,7 +13,9 @@
 //! A turn is the last frame of its direction under the old keys, so each frame is opened with the keys that it was sealed
 //! with, however many are on their way. Only the end that dialled begins, so two renewals never meet.
 
-use super::{Event, Session};
+use super::Event;
+use super::due::Part;
+use super::wire::Wire;
 use crate::config::{HANDSHAKE_LIFE, Mode, PREVIOUS_KEY_LIFE, RENEWAL_TIMEOUT, SHORTEST_HANDSHAKE_LIFE};
 use crate::error::CloseReason;
 use crate::host::connections::{LinkCounter, Span};
@@ -59,189 +61,213 @@ impl Renewal {
         };
         step.min(self.forget)
     }
-}
 
-impl<P: Port> Session<P> {
+    fn note_due<P: Port>(&self, wire: &mut Wire<P>) {
+        wire.due.set(Part::Keys, self.deadline(wire.dialed));
+    }
+
     /// Makes the keys of a secured link anew each time they are as old as `span`, or up to an eighth younger, instead of
     /// [`HANDSHAKE_LIFE`]; at least [`SHORTEST_HANDSHAKE_LIFE`]. Holds from the next handshake on, for the end that dialled:
     /// the other one follows.
-    pub fn renew_every(&mut self, span: Duration) {
-        self.renewal.every = span.max(SHORTEST_HANDSHAKE_LIFE);
+    pub(super) fn renew_every(&mut self, span: Duration) {
+        self.every = span.max(SHORTEST_HANDSHAKE_LIFE);
     }
 
     /// The link is live, or has new keys.
-    pub(super) fn rest_until_renewal(&mut self, now: Instant) {
-        if self.mode() == Mode::Plain {
+    pub(super) fn rest<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) {
+        if wire.mode() == Mode::Plain {
             return;
         }
-        let pause = if self.dialed() { self.life_of_keys() } else { SHORTEST_HANDSHAKE_LIFE.divided_by(2) };
-        self.renewal.step = Step::Resting { due: now + pause };
+        let pause = if wire.dialed() { self.life_of_keys(wire.nonce) } else { SHORTEST_HANDSHAKE_LIFE.divided_by(2) };
+        self.step = Step::Resting { due: now + pause };
+        self.note_due(wire);
     }
 
     /// Links that began together have nonces of their own.
-    fn life_of_keys(&self) -> Duration {
-        let eighth = self.renewal.every.divided_by(8).as_micros();
-        let less = (eighth >> 8).saturating_mul(self.nonce & 0xff);
-        Duration::from_micros(self.renewal.every.as_micros().saturating_sub(less))
+    fn life_of_keys(&self, nonce: u64) -> Duration {
+        let eighth = self.every.divided_by(8).as_micros();
+        let less = (eighth >> 8).saturating_mul(nonce & 0xff);
+        Duration::from_micros(self.every.as_micros().saturating_sub(less))
     }
 
     /// Does what is due of the renewal.
-    pub(super) fn poll_renewal(&mut self, cx: &mut Context<'_, P>) {
+    pub(super) fn poll<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, moves: bool) {
         if !P::RENEWS_KEYS {
-            return self.end_with_keys(cx);
+            return self.end_with_keys(wire, cx, moves);
         }
-        if cx.now >= self.renewal.forget {
-            self.link.cipher().forget_previous();
-            self.renewal.forget = Instant::FAR_FUTURE;
+        if cx.now >= self.forget {
+            wire.link.cipher().forget_previous();
+            self.forget = Instant::FAR_FUTURE;
+            self.note_due(wire);
         }
         // Only the end that dialled begins: two handshakes at once on one link would each wait for the other's answer.
-        if let Step::Resting { due } = self.renewal.step {
-            if self.dialed() && (cx.now >= due || self.link.cipher().is_worn()) {
-                self.begin_renewal(cx, &[0; PROOF_BYTES]);
+        if let Step::Resting { due } = self.step {
+            if wire.dialed() && (cx.now >= due || wire.link.cipher().is_worn()) {
+                self.begin(wire, cx, &[0; PROOF_BYTES]);
             }
             return;
         }
-        match cx.now >= self.renewal.deadline(self.dialed()) {
+        match cx.now >= self.deadline(wire.dialed()) {
             // A peer that keeps the link alive and does not go on would leave it under worn keys for ever.
-            true => self.close(cx, CloseReason::HelloTimeout),
-            false => self.pump_renewal(cx),
+            true => wire.close(cx, CloseReason::HelloTimeout),
+            false => self.pump(wire, cx),
         }
     }
 
     /// In place of a renewal the end that dialled ends the link, to dial it again: as long as the keys last not while anything moves.
-    fn end_with_keys(&mut self, cx: &mut Context<'_, P>) {
-        let Step::Resting { due } = self.renewal.step else { return };
-        if !self.dialed() || cx.now < due && !self.link.cipher().is_worn() {
+    fn end_with_keys<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, moves: bool) {
+        let Step::Resting { due } = self.step else { return };
+        if !wire.dialed() || cx.now < due && !wire.link.cipher().is_worn() {
             return;
         }
-        if self.moves() && !self.link.cipher().is_worn() {
-            self.renewal.step = Step::Resting { due: cx.now + SHORTEST_HANDSHAKE_LIFE };
+        if moves && !wire.link.cipher().is_worn() {
+            self.step = Step::Resting { due: cx.now + SHORTEST_HANDSHAKE_LIFE };
+            self.note_due(wire);
         } else {
-            self.close(cx, CloseReason::Exhausted);
+            wire.close(cx, CloseReason::Exhausted);
         }
     }
 
     /// Proves once more that this unit has the key of the pair; the end that was dialled answers the peer's `message`.
-    fn begin_renewal(&mut self, cx: &mut Context<'_, P>, message: &[u8; PROOF_BYTES]) {
-        let Some(credentials) = self.credentials(cx) else { return };
-        let begins = self.dialed();
-        let reported = match self.link.cipher().prove(begins, credentials) {
-            Ok(None) => self.link.cipher().answer(message),
+    fn begin<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, message: &[u8; PROOF_BYTES]) {
+        let Some(credentials) = wire.credentials(cx) else { return };
+        let begins = wire.dialed();
+        let reported = match wire.link.cipher().prove(begins, credentials) {
+            Ok(None) => wire.link.cipher().answer(message),
             reported => reported,
         };
         match reported {
             Ok(Some(message)) => {
-                self.renewal.step = Step::Telling { until: cx.now + RENEWAL_TIMEOUT, message };
-                self.pump_renewal(cx);
+                self.step = Step::Telling { until: cx.now + RENEWAL_TIMEOUT, message };
+                self.note_due(wire);
+                self.pump(wire, cx);
             }
-            Ok(None) | Err(_) => self.fail(cx),
+            Ok(None) | Err(_) => wire.fail(cx),
         }
     }
 
     /// Sends what waits for room.
-    pub(super) fn pump_renewal(&mut self, cx: &mut Context<'_, P>) {
+    pub(super) fn pump<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         if !P::RENEWS_KEYS {
             return;
         }
-        let sent = match self.renewal.step {
+        let sent = match self.step {
             Step::Resting { .. } | Step::Awaiting { .. } => return,
-            Step::Telling { message, .. } if self.dialed() => self.link.send_frames(&[Frame::Proof(&message)]),
-            Step::Telling { message, .. } => self.send_turn(Some(&message)),
-            Step::Confirming { .. } => self.send_turn(None),
-            Step::Acknowledging => self.link.send_frames(&[Frame::ACKNOWLEDGEMENT]),
+            Step::Telling { message, .. } if wire.dialed() => wire.link.send_frames(&[Frame::Proof(&message)]),
+            Step::Telling { message, .. } => Self::send_turn(wire, Some(&message)),
+            Step::Confirming { .. } => Self::send_turn(wire, None),
+            Step::Acknowledging => wire.link.send_frames(&[Frame::ACKNOWLEDGEMENT]),
         };
         if !sent {
             return;
         }
-        match self.renewal.step {
-            Step::Telling { until, .. } | Step::Confirming { until } => self.renewal.step = Step::Awaiting { until },
-            _ => self.rest_until_renewal(cx.now),
+        match self.step {
+            // Until the same time as before.
+            Step::Telling { until, .. } | Step::Confirming { until } => self.step = Step::Awaiting { until },
+            _ => self.rest(wire, cx.now),
         }
-        self.flush(cx);
+        wire.flush(cx);
     }
 
     /// The last frame under the old keys, behind the message of the end that was dialled, and the first one under the new.
-    fn send_turn(&mut self, message: Option<&[u8]>) -> bool {
-        let confirmation = self.link.cipher().confirmation();
+    fn send_turn<P: Port>(wire: &mut Wire<P>, message: Option<&[u8]>) -> bool {
+        let confirmation = wire.link.cipher().confirmation();
         let confirm = Frame::Confirm(&confirmation);
         match message {
-            Some(message) => self.link.send_frames(&[Frame::Proof(message), Frame::TURN, confirm]),
-            None => self.link.send_frames(&[Frame::TURN, confirm]),
+            Some(message) => wire.link.send_frames(&[Frame::Proof(message), Frame::TURN, confirm]),
+            None => wire.link.send_frames(&[Frame::TURN, confirm]),
         }
     }
 
     /// A proof frame on a live link: the peer's message, or its turn.
-    pub(super) fn proof_on_live(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
-        let message = self.link.view(span, lent);
-        let understood = match (message.first_chunk(), self.renewal.step) {
-            (None, _) if message.is_empty() => self.link.cipher().turned(),
-            (Some(_), Step::Awaiting { .. }) if self.dialed() => return self.answered_anew(cx, span, lent),
+    pub(super) fn proof_arrived<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        span: Span,
+        lent: &[u8],
+    ) -> Option<Event> {
+        let message = wire.link.view(span, lent);
+        let understood = match (message.first_chunk(), self.step) {
+            (None, _) if message.is_empty() => wire.link.cipher().turned(),
+            (Some(_), Step::Awaiting { .. }) if wire.dialed() => {
+                if wire.link.answer(span, lent) != Ok(None) {
+                    wire.fail(cx);
+                }
+                return None;
+            }
             // Not before it is due: a handshake costs a board much computing, which a peer could otherwise ask for at will.
-            (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed() && message.len() == PROOF_BYTES => {
+            (Some(first), Step::Resting { due }) if cx.now >= due && !wire.dialed() && message.len() == PROOF_BYTES => {
                 let first = *first;
-                self.begin_renewal(cx, &first);
+                self.begin(wire, cx, &first);
                 return None;
             }
             _ => Err(CloseReason::Protocol),
         };
         if let Err(reason) = understood {
-            self.close(cx, reason);
-        }
-        None
-    }
-
-    fn answered_anew(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
-        if self.link.answer(span, lent) != Ok(None) {
-            self.fail(cx);
+            wire.close(cx, reason);
         }
         None
     }
 
     /// A confirm frame on a live link: the first one under the peer's new keys, or what acknowledges this end's.
-    pub(super) fn confirmation_on_live(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> Option<Event> {
-        let Step::Awaiting { until } = self.renewal.step else {
-            self.close(cx, CloseReason::Protocol);
+    pub(super) fn confirmation_arrived<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        span: Span,
+        lent: &[u8],
+    ) -> Option<Event> {
+        let Step::Awaiting { until } = self.step else {
+            wire.close(cx, CloseReason::Protocol);
             return None;
         };
-        let understood = match self.link.view(span, lent).is_empty() {
-            true if self.dialed() => self.adopt_keys(cx).map(|()| self.rest_until_renewal(cx.now)),
+        let understood = match wire.link.view(span, lent).is_empty() {
+            true if wire.dialed() => Self::adopt_keys(wire, cx).map(|()| self.rest(wire, cx.now)),
             true => Err(CloseReason::Protocol),
-            false => self.link.confirmed(span, lent).and_then(|()| self.confirmed_anew(cx, until)),
+            false => wire.link.confirmed(span, lent).and_then(|()| self.confirmed_anew(wire, cx, until)),
         };
         if let Err(reason) = understood {
-            self.close(cx, reason);
+            wire.close(cx, reason);
         }
         None
     }
 
     /// The peer has turned and confirmed. Its confirmation also says that it has that of an end that was dialled.
-    fn confirmed_anew(&mut self, cx: &mut Context<'_, P>, until: Instant) -> Result<(), CloseReason> {
-        self.renewal.forget = cx.now + RENEWAL_TIMEOUT;
-        if self.dialed() {
-            self.renewal.step = Step::Confirming { until };
+    fn confirmed_anew<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        until: Instant,
+    ) -> Result<(), CloseReason> {
+        self.forget = cx.now + RENEWAL_TIMEOUT;
+        if wire.dialed() {
+            self.step = Step::Confirming { until };
         } else {
-            self.adopt_keys(cx)?;
-            self.renewal.step = Step::Acknowledging;
+            Self::adopt_keys(wire, cx)?;
+            self.step = Step::Acknowledging;
         }
-        self.pump_renewal(cx);
+        self.note_due(wire);
+        self.pump(wire, cx);
         Ok(())
     }
 
     /// The peer has the key of this end's datagrams.
-    fn adopt_keys(&mut self, cx: &mut Context<'_, P>) -> Result<(), CloseReason> {
-        self.link.cipher().acknowledged()?;
-        if let Some(peer) = self.identity() {
+    fn adopt_keys<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Result<(), CloseReason> {
+        wire.link.cipher().acknowledged()?;
+        if let Some(peer) = wire.identity() {
             cx.hub.enter(&mut |hub| hub.node.proven_anew(peer));
         }
-        self.link.counters.count(LinkCounter::KeysRenewed);
-        debug!("link {} has new keys", self.link.id().0);
+        wire.link.counters.count(LinkCounter::KeysRenewed);
+        debug!("link {} has new keys", wire.link.id().0);
         Ok(())
     }
 
     /// A datagram has been opened; the first one under a new key lets the one before go.
-    pub(super) fn datagram_opened(&mut self, now: Instant) {
-        if P::RENEWS_KEYS && self.renewal.forget != Instant::FAR_FUTURE && self.link.cipher().hears_newest() {
-            self.renewal.forget = self.renewal.forget.min(now + PREVIOUS_KEY_LIFE);
+    pub(super) fn datagram_opened<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) {
+        if P::RENEWS_KEYS && self.forget != Instant::FAR_FUTURE && wire.link.cipher().hears_newest() {
+            self.forget = self.forget.min(now + PREVIOUS_KEY_LIFE);
+            self.note_due(wire);
         }
     }
 }

@@ -6,8 +6,9 @@
 
 use super::permitting::decide;
 use super::publishing::Advertised;
-use super::{Event, Phase, Results, Session};
-use crate::ability::{Ability, Begins, Streams};
+use super::wire::Wire;
+use super::{Event, Phase, Results};
+use crate::ability::{Ability, Begins, STREAMS, State, Streams};
 use crate::config::Priority;
 use crate::distribution::block;
 use crate::distribution::function_list::{Function, Generation, Slot};
@@ -31,7 +32,7 @@ pub struct Sample {
     pub slot: Slot,
     /// Its age on arrival; never too low.
     pub age: Duration,
-    /// The values: [`Session::results`] shows them.
+    /// The values: [`Session::results`](super::Session::results) shows them.
     pub values: Results,
 }
 
@@ -78,10 +79,6 @@ pub(super) struct Streaming {
     active: u16,
     /// The slot that is looked at first: each stream has its turn where there is room for few.
     first: usize,
-    /// When the next sample is due.
-    due: Instant,
-    /// Samples wait since then for the stream to be empty.
-    blocked: Option<Instant>,
     /// Up to here the peer has had the bytes that it may.
     paid: Instant,
     answers_due: bool,
@@ -89,27 +86,32 @@ pub(super) struct Streaming {
 }
 
 impl Begins for Streaming {
-    const BEGIN: &'static Self = &Self {
-        active: 0,
-        first: 0,
-        due: Instant::FAR_FUTURE,
-        blocked: None,
-        paid: Instant::START,
-        answers_due: false,
-        wishes_due: false,
-    };
+    const BEGIN: &'static Self =
+        &Self { active: 0, first: 0, paid: Instant::START, answers_due: false, wishes_due: false };
+}
+
+/// When samples follow.
+#[derive(Clone, Copy)]
+pub(super) struct Pace {
+    /// The next one is due.
+    due: Instant,
+    /// They wait since then for the stream to be empty; in the far future where they do not.
+    blocked: Instant,
+}
+
+impl Begins for Pace {
+    const BEGIN: &'static Self = &Self { due: Instant::FAR_FUTURE, blocked: Instant::FAR_FUTURE };
+}
+
+impl Pace {
+    /// When a sample can be made, where so many bytes wait on the link.
+    pub(super) fn deadline(&self, queued: usize) -> Instant {
+        // What blocked the stream has gone out with something else, so that the port is not told that it takes bytes again.
+        if queued == 0 && self.blocked != Instant::FAR_FUTURE { self.blocked } else { self.due }
+    }
 }
 
 impl Streaming {
-    /// When a sample can be made, where so many bytes wait on the link.
-    pub(super) fn deadline(&self, queued: usize) -> Instant {
-        match self.blocked {
-            // What blocked the stream has gone out with something else, so that the port is not told that it takes bytes again.
-            Some(since) if queued == 0 => since,
-            _ => self.due,
-        }
-    }
-
     pub(super) const fn has_news(&self) -> bool {
         self.answers_due || self.wishes_due
     }
@@ -126,85 +128,83 @@ enum Attempt {
     Ended(SubscriptionRefusal),
 }
 
-impl<P: Port> Session<P> {
-    /// Wants values of a stream of the peer, at least `interval` apart; the peer may grant a longer one, which comes as
-    /// [`Event::Subscribed`]. Of several calls for one stream the last one counts. The subscription ends with the link, and when
-    /// the peer publishes another stream in its place: a port subscribes again with [`Event::ListChanged`], which changes nothing
-    /// where nothing has changed. [`Error::UnknownFunction`] where the peer has no such stream, [`Error::NotConnected`].
-    pub fn subscribe(&mut self, cx: &mut Context<'_, P>, stream: &str, interval: Duration) -> Result<Slot, Error> {
+/// The part, which a build may leave out.
+pub(super) type StreamsPart = State<Streaming, { STREAMS as usize }>;
+
+impl StreamsPart {
+    /// Wants values of a stream of the peer; without an interval, no more of them.
+    pub(super) fn wish<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        stream: &str,
+        interval: Option<Duration>,
+    ) -> Result<Slot, Error> {
         let longest = NO_SUBSCRIPTION.saturating_sub(1);
-        self.wish(cx, stream, u32::try_from(interval.as_millis()).map_or(longest, |interval| interval.min(longest)))
-    }
-
-    /// Wants no more values of a stream of the peer.
-    pub fn unsubscribe(&mut self, cx: &mut Context<'_, P>, stream: &str) {
-        // Where there is no such stream, none comes.
-        let _ = self.wish(cx, stream, NO_SUBSCRIPTION);
-    }
-
-    fn wish(&mut self, cx: &mut Context<'_, P>, stream: &str, interval: u32) -> Result<Slot, Error> {
-        if self.phase != Phase::Live {
+        let interval = interval.map_or(NO_SUBSCRIPTION, |interval| {
+            u32::try_from(interval.as_millis()).map_or(longest, |interval| interval.min(longest))
+        });
+        if wire.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        let known = self.theirs.named(stream).filter(|function| function.attributes.is_stream());
+        let known = wire.theirs.named(stream).filter(|function| function.attributes.is_stream());
         let slot = known.ok_or(Error::UnknownFunction)?.slot;
-        if let Some(wish) = self.theirs.wish_mut(slot) {
+        if let Some(wish) = wire.theirs.wish_mut(slot) {
             wish.interval = interval;
-            self.streaming.change(|streaming| streaming.wishes_due = true);
+            self.change(|streaming| streaming.wishes_due = true);
         }
-        self.pump_streams(cx);
+        self.pump(wire, cx);
         Ok(slot)
     }
 
-    /// A stream of this unit has a new value: [`poll`](Self::poll) then sends it where it is due. Whether the peer has any
-    /// subscription.
-    pub fn stream_changed(&mut self, now: Instant) -> bool {
-        let wanted = self.streaming.active > 0;
+    /// A stream of this unit has a new value.
+    pub(super) fn changed<P: Port>(&self, wire: &mut Wire<P>, now: Instant) -> bool {
+        let wanted = self.active > 0;
         if wanted {
-            self.streaming.change(|streaming| streaming.due = streaming.due.min(now));
+            wire.pace_samples(Pace { due: wire.pace.due.min(now), ..*wire.pace });
         }
         wanted
     }
 
     /// Streams of this unit that the peer is subscribed to.
-    pub fn subscriptions(&self) -> u16 {
-        self.streaming.active
+    pub(super) fn active(&self) -> u16 {
+        self.active
     }
 
     /// Tells the peer what this unit wants of its streams, and what became of its own wishes.
-    pub(super) fn pump_streams(&mut self, cx: &mut Context<'_, P>) {
-        while P::CALLS && self.streaming.wishes_due {
-            let Some((slot, generation, interval)) = self.theirs.untold_wish() else {
-                self.streaming.change(|streaming| streaming.wishes_due = false);
+    pub(super) fn pump<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
+        while P::CALLS && self.wishes_due {
+            let Some((slot, generation, interval)) = wire.theirs.untold_wish() else {
+                self.change(|streaming| streaming.wishes_due = false);
                 break;
             };
-            if !self.send_control(cx, &Control::Subscribe { slot: slot.0, generation: generation.0, interval }) {
+            if !wire.send_control(cx, &Control::Subscribe { slot: slot.0, generation: generation.0, interval }) {
                 break;
             }
-            if let Some(wish) = self.theirs.wish_mut(slot) {
+            if let Some(wish) = wire.theirs.wish_mut(slot) {
                 wish.advertised = interval;
             }
         }
-        if self.streaming.answers_due {
-            let are_due = !self.send_answers(cx);
-            self.streaming.change(|streaming| streaming.answers_due = are_due);
+        if self.answers_due {
+            let are_due = !Self::send_answers(wire, cx);
+            self.change(|streaming| streaming.answers_due = are_due);
         }
     }
 
     /// Answers each subscription that is not; `false` when there was no more room.
-    fn send_answers(&mut self, cx: &mut Context<'_, P>) -> bool {
-        let bytes = self.constraints.stream_bytes;
-        for slot in self.publishing.all_slots() {
+    fn send_answers<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
+        let bytes = wire.constraints.stream_bytes;
+        for slot in wire.publishing.all_slots() {
             let Some(&mut Subscription { interval, generation, answer: Some(refusal), .. }) =
-                self.publishing.subscription(slot)
+                wire.publishing.subscription(slot)
             else {
                 continue;
             };
             let answer = Control::Subscribed { slot: slot.0, generation: generation.0, interval, bytes, refusal };
-            if !self.send_control(cx, &answer) {
+            if !wire.send_control(cx, &answer) {
                 return false;
             }
-            if let Some(subscription) = self.publishing.subscription(slot) {
+            if let Some(subscription) = wire.publishing.subscription(slot) {
                 subscription.answer = None;
             }
         }
@@ -212,8 +212,9 @@ impl<P: Port> Session<P> {
     }
 
     /// The peer wants values of a stream of this unit, or no more of them.
-    pub(super) fn subscription_arrived(
+    pub(super) fn subscription_arrived<P: Port>(
         &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         slot: Slot,
         generation: Generation,
@@ -221,12 +222,12 @@ impl<P: Port> Session<P> {
     ) {
         let granted = match interval {
             NO_SUBSCRIPTION => Ok(NO_SUBSCRIPTION),
-            _ => self.check_subscription(cx, slot, generation).map(|least| interval.max(least)),
+            _ => self.check_subscription(wire, cx, slot, generation).map(|least| interval.max(least)),
         };
         if granted.is_err() {
-            self.link.counters.add(LinkCounter::SubscriptionsRefused, 1);
+            wire.link.counters.add(LinkCounter::SubscriptionsRefused, 1);
         }
-        let Some(subscription) = self.publishing.subscription(slot) else { return };
+        let Some(subscription) = wire.publishing.subscription(slot) else { return };
         // One that goes on at another pace has had the newest value.
         let (version, due) = match subscription.is_active() && subscription.generation == generation {
             true => (subscription.version, subscription.due.min(cx.now + millis(interval))),
@@ -235,122 +236,129 @@ impl<P: Port> Session<P> {
         let answer = Some(granted.err().unwrap_or(SubscriptionRefusal::None));
         let interval = granted.unwrap_or(NO_SUBSCRIPTION);
         *subscription = Subscription { interval, version, generation, answer, due };
-        let active = self.publishing.count_subscriptions();
-        self.streaming.change(|streaming| {
-            (streaming.active, streaming.answers_due, streaming.due) = (active, true, cx.now);
-        });
-        self.pump_streams(cx);
+        let active = wire.publishing.count_subscriptions();
+        self.change(|streaming| (streaming.active, streaming.answers_due) = (active, true));
+        wire.pace_samples(Pace { due: cx.now, ..*wire.pace });
+        self.pump(wire, cx);
     }
 
     /// Whether the peer may have a stream; its least interval in milliseconds.
-    fn check_subscription(
-        &mut self,
+    fn check_subscription<P: Port>(
+        &self,
+        wire: &mut Wire<P>,
         cx: &Context<'_, P>,
         slot: Slot,
         generation: Generation,
     ) -> Result<u32, SubscriptionRefusal> {
-        let stream = self.stream(cx, slot, generation).ok_or(SubscriptionRefusal::Unknown)?;
-        if !self.decide_stream(cx, &stream).is_allowed() {
+        let stream = Self::stream(wire, cx, slot, generation).ok_or(SubscriptionRefusal::Unknown)?;
+        if !Self::decide_stream(wire, cx, &stream).is_allowed() {
             return Err(SubscriptionRefusal::NotAllowed);
         }
-        let is_new = self.publishing.subscription(slot).is_some_and(|subscription| !subscription.is_active());
-        if is_new && self.streaming.active >= self.constraints.subscriptions_per_peer {
+        let is_new = wire.publishing.subscription(slot).is_some_and(|subscription| !subscription.is_active());
+        if is_new && self.active >= wire.constraints.subscriptions_per_peer {
             return Err(SubscriptionRefusal::Full);
         }
         Ok(u32::from(stream.attributes.stream.unwrap_or(0)))
     }
 
     /// A stream of this unit that the peer was told of.
-    fn stream<'f>(
-        &self,
+    fn stream<'f, P: Port>(
+        wire: &Wire<P>,
         cx: &Context<'f, P>,
         slot: Slot,
         generation: Generation,
     ) -> Option<Function<'f, dyn crate::services::lease::Service>> {
         let function = cx.functions.lookup(slot, generation).ok()?;
-        let is_advertised = matches!(self.publishing.advertised(slot, generation), Advertised::Now);
+        let is_advertised = matches!(wire.publishing.advertised(slot, generation), Advertised::Now);
         (is_advertised && function.attributes.is_stream()).then_some(function)
     }
 
-    fn decide_stream(
-        &self,
+    fn decide_stream<P: Port>(
+        wire: &Wire<P>,
         cx: &Context<'_, P>,
         stream: &Function<'_, dyn crate::services::lease::Service>,
     ) -> Decision {
-        decide(cx.table(), self.remote.as_ref(), stream.name(), Verb::Call)
+        decide(cx.table(), wire.remote.as_ref(), stream.name(), Verb::Call)
     }
 
     /// Sends each value that is due, as far as the stream is empty: so none is ever before a call that this end sends later, and
     /// one that waits is the newest when it leaves.
-    pub(super) fn send_samples(&mut self, cx: &mut Context<'_, P>) {
-        self.streaming.change(|streaming| (streaming.due, streaming.blocked) = (Instant::FAR_FUTURE, None));
-        if self.streaming.active == 0 || self.phase != Phase::Live {
+    pub(super) fn send_samples<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
+        wire.pace_samples(*Pace::BEGIN);
+        if self.active == 0 || wire.phase != Phase::Live {
             return;
         }
-        let slots = self.publishing.slots();
-        let first = self.streaming.first;
-        let mut next = Instant::FAR_FUTURE;
+        let slots = wire.publishing.slots();
+        let first = self.first;
+        let mut pace = *Pace::BEGIN;
         for index in (first..slots).chain(0..first.min(slots)) {
             let slot = Slot(index as u16);
-            let Some(&mut subscription) = self.publishing.subscription(slot) else { continue };
+            let Some(&mut subscription) = wire.publishing.subscription(slot) else { continue };
             if !subscription.is_active() {
                 continue;
             }
-            match self.attempt(cx, slot, &subscription) {
-                Attempt::Sent => self.streaming.change(|streaming| streaming.first = index.saturating_add(1)),
-                Attempt::Later(due) => next = next.min(due),
-                Attempt::Ended(why) => self.end_subscription(slot, why),
+            match self.attempt(wire, cx, slot, &subscription) {
+                Attempt::Sent => self.change(|streaming| streaming.first = index.saturating_add(1)),
+                Attempt::Later(due) => pace.due = pace.due.min(due),
+                Attempt::Ended(why) => self.end_subscription(wire, slot, why),
                 Attempt::Blocked => {
-                    self.streaming.change(|streaming| streaming.blocked = Some(cx.now));
+                    pace.blocked = cx.now;
                     break;
                 }
             }
         }
-        self.streaming.change(|streaming| streaming.due = next);
-        self.pump_streams(cx);
+        wire.pace_samples(pace);
+        self.pump(wire, cx);
     }
 
-    fn attempt(&mut self, cx: &mut Context<'_, P>, slot: Slot, subscription: &Subscription) -> Attempt {
-        let Some(stream) = self.stream(cx, slot, subscription.generation) else {
+    fn attempt<P: Port>(
+        &mut self,
+        wire: &mut Wire<P>,
+        cx: &mut Context<'_, P>,
+        slot: Slot,
+        subscription: &Subscription,
+    ) -> Attempt {
+        let Some(stream) = Self::stream(wire, cx, slot, subscription.generation) else {
             return Attempt::Ended(SubscriptionRefusal::Unknown);
         };
         let Some(source) = stream.handler.stream() else { return Attempt::Ended(SubscriptionRefusal::Unknown) };
         if source.version() == subscription.version {
             return Attempt::Later(Instant::FAR_FUTURE);
         }
-        let due = subscription.due.max(self.streaming.paid);
+        let due = subscription.due.max(self.paid);
         if due > cx.now {
             return Attempt::Later(due);
         }
         // What gathers goes first.
-        if self.link.queued() > 0 {
-            self.flush(cx);
+        if wire.link.queued() > 0 {
+            wire.flush(cx);
         }
-        if self.link.queued() > 0 || self.phase != Phase::Live {
+        if wire.link.queued() > 0 || wire.phase != Phase::Live {
             return Attempt::Blocked;
         }
-        match self.decide_stream(cx, &stream) {
+        match Self::decide_stream(wire, cx, &stream) {
             Decision::Denied => return Attempt::Ended(SubscriptionRefusal::NotAllowed),
             Decision::Allowed { rate: None, .. } => {}
             Decision::Allowed { rate: Some(rate), .. } => {
-                let bucket = self.publishing.bucket(slot);
+                let bucket = wire.publishing.bucket(slot);
                 if let Some(Err(Error::TooSoon { wait })) = bucket.map(|bucket| bucket.take(cx.now, rate)) {
                     return Attempt::Later(cx.now + wait);
                 }
             }
         }
-        self.send_sample(cx, slot, subscription, source)
+        self.send_sample(wire, cx, slot, subscription, source)
     }
 
-    fn send_sample(
+    fn send_sample<P: Port>(
         &mut self,
+        wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
         slot: Slot,
         subscription: &Subscription,
         source: &dyn Source,
     ) -> Attempt {
-        let (stamp, since) = self.clock.stamp(cx.now);
-        let most = self.peer_message_size() as usize;
+        let (stamp, since) = wire.clock.stamp(cx.now);
+        let most = wire.peer_message_size() as usize;
         let mut sent = None;
         source.newest(&mut |value: &Value<'_>| {
             let total = SAMPLE_BYTES.saturating_add(value.block.len());
@@ -360,7 +368,7 @@ impl<P: Port> Session<P> {
             // One that the peer cannot take is passed over, as the next one may be shorter.
             let result = match value.block.len() > most {
                 true => Err(Error::TooLarge { limit: most as u32 }),
-                false => self.send(cx, Priority::Low, total, &mut |writer| {
+                false => wire.send(cx, Priority::Low, total, &mut |writer| {
                     writer.put(&header.encode());
                     writer.put(value.block);
                 }),
@@ -372,16 +380,16 @@ impl<P: Port> Session<P> {
             return Attempt::Later(cx.now + RETRY);
         }
         if result.is_ok() {
-            self.link.counters.add(LinkCounter::SamplesSent, 1);
+            wire.link.counters.add(LinkCounter::SamplesSent, 1);
             let second = (total as u64).saturating_mul(SECOND);
-            let cost = second.checked_div(u64::from(self.constraints.stream_bytes)).unwrap_or(SECOND);
-            self.streaming.change(|streaming| streaming.paid = cx.now + Duration::from_micros(cost));
+            let cost = second.checked_div(u64::from(wire.constraints.stream_bytes)).unwrap_or(SECOND);
+            self.change(|streaming| streaming.paid = cx.now + Duration::from_micros(cost));
         }
         if subscription.version != 0 {
             let replaced = version.wrapping_sub(subscription.version).saturating_sub(1);
-            self.link.counters.add(LinkCounter::SamplesReplaced, replaced.into());
+            wire.link.counters.add(LinkCounter::SamplesReplaced, replaced.into());
         }
-        if let Some(span) = self.publishing.subscription(slot) {
+        if let Some(span) = wire.publishing.subscription(slot) {
             span.version = version;
             // Counted from when it was due, so that the pace holds where polls come late.
             let interval = millis(subscription.interval);
@@ -392,50 +400,50 @@ impl<P: Port> Session<P> {
     }
 
     /// The peer is told that it has a stream no longer.
-    fn end_subscription(&mut self, slot: Slot, why: SubscriptionRefusal) {
-        if let Some(subscription) = self.publishing.subscription(slot) {
+    fn end_subscription<P: Port>(&mut self, wire: &mut Wire<P>, slot: Slot, why: SubscriptionRefusal) {
+        if let Some(subscription) = wire.publishing.subscription(slot) {
             *subscription =
                 Subscription { answer: Some(why), generation: subscription.generation, ..Subscription::NONE };
-            self.streaming.change(|streaming| streaming.answers_due = true);
+            self.change(|streaming| streaming.answers_due = true);
         }
-        let active = self.publishing.count_subscriptions();
-        self.streaming.change(|streaming| streaming.active = active);
+        let active = wire.publishing.count_subscriptions();
+        self.change(|streaming| streaming.active = active);
     }
 
     /// A value of a stream of the peer.
-    pub(super) fn sample_arrived(
-        &mut self,
+    pub(super) fn sample_arrived<P: Port>(
+        wire: &mut Wire<P>,
         now: Instant,
         header: &SampleHeader,
         block: Span,
         lent: &[u8],
     ) -> Option<Event> {
         let SampleHeader { slot, generation, made } = *header;
-        let stream = self.theirs.function(slot).filter(|function| function.generation == generation);
+        let stream = wire.theirs.function(slot).filter(|function| function.generation == generation);
         let known =
-            stream.is_some_and(|stream| block::check(stream.signature.results(), self.link.view(block, lent)).is_ok());
-        let wanted = self.theirs.wish_mut(slot).is_some_and(|wish| wish.interval != NO_SUBSCRIPTION);
+            stream.is_some_and(|stream| block::check(stream.signature.results(), wire.link.view(block, lent)).is_ok());
+        let wanted = wire.theirs.wish_mut(slot).is_some_and(|wish| wish.interval != NO_SUBSCRIPTION);
         if !known || !wanted {
-            self.link.counters.add(LinkCounter::SamplesDropped, 1);
+            wire.link.counters.add(LinkCounter::SamplesDropped, 1);
             return None;
         }
-        self.link.counters.add(LinkCounter::SamplesReceived, 1);
+        wire.link.counters.add(LinkCounter::SamplesReceived, 1);
         let age = micros(now.as_micros()).saturating_sub(made);
         let age = Duration::from_micros(u64::try_from(age).unwrap_or(0));
-        let values = Results { slot, generation, block, step: self.step };
+        let values = Results { slot, generation, block, step: wire.step };
         Streams::of(Sample { slot, age, values }).map(Event::Sample)
     }
 
     /// What became of a subscription of this unit.
-    pub(super) fn subscription_answered(
-        &mut self,
+    pub(super) fn subscription_answered<P: Port>(
+        wire: &mut Wire<P>,
         slot: Slot,
         generation: Generation,
         granted: Granted,
         refusal: SubscriptionRefusal,
     ) -> Option<Event> {
-        self.theirs.function(slot).filter(|function| function.generation == generation)?;
-        let wish = self.theirs.wish_mut(slot).filter(|wish| wish.interval != NO_SUBSCRIPTION)?;
+        wire.theirs.function(slot).filter(|function| function.generation == generation)?;
+        let wish = wire.theirs.wish_mut(slot).filter(|wish| wish.interval != NO_SUBSCRIPTION)?;
         let error = match refusal {
             SubscriptionRefusal::None if granted.interval >= millis(NO_SUBSCRIPTION) => return None,
             SubscriptionRefusal::None => return event(slot, Ok(granted)),

@@ -1,17 +1,15 @@
 //! What a session does because time has passed: keep-alives, deadlines, leases, the end of a silent link.
 
+use super::due::Part;
 use super::granting::expire_granted;
+use super::holding::Calling;
+use super::publishing::{send_limits, send_list};
 use super::{CHALLENGE_DATAGRAMS, Event, Phase, Session, close_code};
 use crate::ability::{DETAILS, STREAMS};
-use crate::bytes::copy;
-use crate::config::{DATAGRAM_BYTES, GATHER};
-use crate::distribution::datagram;
-use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
+use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Error};
 use crate::host::connections::{LinkCounter, Report};
-use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
-use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
 use crate::services::lease::LeaseEnd;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
@@ -24,9 +22,6 @@ pub(super) struct PeerClock {
     heard: Instant,
 }
 
-/// Longest session datagram.
-const LONGEST_DATAGRAM: usize =
-    datagram::SESSION_HEADER_BYTES + SESSION_BODY_BYTES + DATAGRAM_BYTES + DATAGRAM_OVERHEAD;
 /// A sample of the peer's clock counts for this long, however late the newer ones came.
 const SAMPLE_LIFE: Duration = Duration::from_secs(10);
 /// Part of the time since a sample by which the two clocks may have drifted apart.
@@ -61,70 +56,44 @@ pub(super) fn sent_at_earliest(now: Instant, stamp: u64, since: Duration) -> Opt
     if Instant::from_micros(stamp) > now { None } else { Some(sent_at.min(now)) }
 }
 
-/// When each thing is due.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Timers {
-    pub(super) keep_alive: Instant,
-    /// The last write, behind which one-way messages gather.
-    pub(super) last_write: Instant,
-    /// Gathered messages go out.
-    pub(super) gathered: Instant,
-    /// The earliest end of a granted lease.
-    pub(super) lease: Instant,
-    /// The earliest renewal of a held lease.
-    pub(super) renewal: Instant,
-    /// The next try to send a release that the stream had no room for.
-    pub(super) release: Instant,
-}
-
-impl Timers {
-    pub(super) fn new(now: Instant) -> Self {
-        Self {
-            keep_alive: now,
-            last_write: Instant::START,
-            gathered: Instant::FAR_FUTURE,
-            lease: Instant::FAR_FUTURE,
-            renewal: Instant::FAR_FUTURE,
-            release: Instant::FAR_FUTURE,
-        }
-    }
-
-    /// Whether a one-way message made at `now` may wait for company.
-    pub(super) fn may_gather(&self, now: Instant) -> bool {
-        self.last_write != Instant::START && now < self.last_write + GATHER
-    }
-}
-
 impl<P: Port> Session<P> {
     /// When [`poll`](Self::poll) has something to do next.
     pub fn deadline(&self) -> Instant {
-        match self.phase {
+        match self.wire.phase {
             Phase::AwaitingHello { until } | Phase::Proving { until } => until,
             Phase::Deciding => Instant::FAR_FUTURE,
             Phase::Ending(_) => Instant::START,
             Phase::Ended => Instant::FAR_FUTURE,
             Phase::Live => {
-                let timers = &self.timers;
-                let own =
-                    timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal).min(timers.release);
-                let own = own.min(self.obedience.next);
-                let own = own.min(self.renewal.deadline(self.dialed));
-                let own = if STREAMS { own.min(self.streaming.deadline(self.link.queued())) } else { own };
-                let own = if DETAILS { own.min(self.details.deadline()) } else { own };
-                let own = if P::CALLS { own.min(self.requests.deadline()) } else { own };
-                own.min(self.liveness.deadline())
+                debug_assert!(self.is_due_right(), "a part has changed its deadline and has not said so");
+                self.wire.due.next()
             }
         }
     }
 
+    /// Whether the table is what each part would say now. Of calls, leases and renewals it may say too early a time, and never too late.
+    fn is_due_right(&self) -> bool {
+        let due = &self.wire.due;
+        let granted = self.granting.granted.iter().map(|granted| granted.end);
+        let held = self.calling.held.iter().map(|held| held.next);
+        due.next() == due.earliest()
+            && granted.chain([Instant::FAR_FUTURE]).all(|end| due.at(Part::Leases) <= end)
+            && held.chain([Instant::FAR_FUTURE]).all(|next| due.at(Part::Renewals) <= next)
+            && (!P::CALLS || due.at(Part::Calls) <= self.calling.requests.deadline())
+            && due.at(Part::Keys) == self.renewal.deadline(self.wire.dialed)
+            && due.at(Part::Liveness) == self.wire.liveness.deadline()
+            && (!STREAMS || due.at(Part::Streams) == self.wire.pace.deadline(self.wire.link.queued()))
+            && (!DETAILS || due.at(Part::Details) == self.details.deadline())
+    }
+
     /// Does what is due. Returns one event at a time; call it until it returns `None`.
     pub fn poll(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        match self.phase {
+        match self.wire.phase {
             Phase::AwaitingHello { until } | Phase::Proving { until } => {
                 if cx.now < until {
                     return None;
                 }
-                self.close(cx, CloseReason::HelloTimeout);
+                self.wire.close(cx, CloseReason::HelloTimeout);
                 self.poll_ending(cx, CloseReason::HelloTimeout)
             }
             Phase::Deciding | Phase::Ended => None,
@@ -135,175 +104,178 @@ impl<P: Port> Session<P> {
 
     fn poll_live(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         // Leases come first: what moves must stop before anything else is done.
-        if (cx.now >= self.timers.lease || self.was_stopped(cx))
-            && let Some(slot) = self.expire_lease(cx)
+        if (self.wire.due.has_come(Part::Leases, cx.now) || self.granting.was_stopped(cx))
+            && let Some(slot) = self.granting.expire_lease(&mut self.wire, cx)
         {
             return Some(Event::LeaseExpired(slot));
         }
         if P::CALLS
-            && let Some(pending) = self.requests.expire(cx.now)
+            && self.wire.due.has_come(Part::Calls, cx.now)
+            && let Some(pending) = self.calling.expire_call(&mut self.wire, cx.now)
         {
             let id = pending.id;
-            self.send_cancel(cx, &pending);
-            self.release_call(cx, id, Some(pending));
-            self.link.counters.count(LinkCounter::CallsTimedOut);
+            Calling::send_cancel(&mut self.wire, cx, &pending);
+            self.calling.release_call(&mut self.wire, cx, id, Some(pending));
+            self.wire.link.counters.count(LinkCounter::CallsTimedOut);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
         }
-        if DETAILS && let Some(event) = self.poll_details(cx.now) {
+        if DETAILS
+            && self.wire.due.has_come(Part::Details, cx.now)
+            && let Some(event) = self.details.poll(&mut self.wire, &mut self.calls, cx.now)
+        {
             return Some(event);
         }
         // From here on only frames are sent; what the port has to do for others was returned above, one event a call.
         if self.has_news() {
             self.pump(cx);
         }
-        if P::CALLS && cx.now >= self.timers.release {
-            self.send_releases(cx);
+        if P::CALLS && self.wire.due.has_come(Part::Releases, cx.now) {
+            self.calling.send_releases(&mut self.wire, cx);
         }
-        if cx.now >= self.timers.gathered {
-            self.flush(cx);
+        if self.wire.due.has_come(Part::Gathered, cx.now) {
+            self.wire.flush(cx);
         }
         if P::CALLS
-            && cx.now >= self.timers.renewal
-            && let Some(event) = self.renew_leases(cx)
+            && self.wire.due.has_come(Part::Renewals, cx.now)
+            && let Some(event) = self.calling.renew_leases(&mut self.wire, cx)
         {
             return Some(event);
         }
-        if cx.now >= self.timers.keep_alive {
+        if self.wire.due.has_come(Part::KeepAlive, cx.now) {
             self.send_keep_alive(cx);
         }
-        self.poll_renewal(cx);
-        self.poll_obedience(cx);
-        self.look_for_peer(cx);
-        if STREAMS && cx.now >= self.streaming.deadline(self.link.queued()) {
-            self.send_samples(cx);
+        let moves = self.moves();
+        self.renewal.poll(&mut self.wire, cx, moves);
+        if self.wire.due.has_come(Part::Claims, cx.now) {
+            self.poll_claims(cx);
         }
-        match self.phase {
+        self.look_for_peer(cx);
+        if STREAMS && self.wire.due.has_come(Part::Streams, cx.now) {
+            self.streaming.send_samples(&mut self.wire, cx);
+        }
+        match self.wire.phase {
             Phase::Ending(reason) => self.poll_ending(cx, reason),
             _ => None,
         }
     }
 
+    fn poll_claims(&mut self, cx: &mut Context<'_, P>) {
+        let Some((silent_at, until)) = self.granting.obedience.poll(&mut self.wire, cx) else { return };
+        if self.wire.challenged {
+            if cx.now >= silent_at {
+                self.wire.close(cx, CloseReason::PeerRestarted);
+            }
+        } else if !self.has_given_way(cx) && cx.now >= until {
+            (0..self.granting.granted.len()).for_each(|index| self.granting.cut_lease(&mut self.wire, cx, index));
+        }
+    }
+
+    /// Ends a link that gives way when nothing of it moves; whether it has.
+    pub(super) fn has_given_way(&mut self, cx: &mut Context<'_, P>) -> bool {
+        let ends = self.granting.obedience.gives_way() && self.granting.is_quiet(&self.wire, cx);
+        if ends {
+            self.wire.close(cx, CloseReason::PeerRestarted);
+        }
+        ends
+    }
+
+    /// Tells the peer what it is still to be told, as far as there is room.
+    pub(super) fn pump(&mut self, cx: &mut Context<'_, P>) {
+        if !self.wire.may_advertise() {
+            return;
+        }
+        self.granting.send_ends(&mut self.wire, cx);
+        send_limits(&mut self.wire, cx);
+        self.granting.obedience.send_claim(&mut self.wire, cx);
+        send_list(&mut self.wire, cx);
+        if STREAMS {
+            self.streaming.pump(&mut self.wire, cx);
+        }
+    }
+
+    /// Whether something waits for room.
+    fn has_news(&self) -> bool {
+        self.wire.publishing.has_news() || self.granting.has_news() || (STREAMS && self.streaming.has_news())
+    }
+
     /// Asks a peer that has missed a keep-alive for a sign of life, and gives it up when none comes.
     fn look_for_peer(&mut self, cx: &mut Context<'_, P>) {
         // What is not read for now has come all the same.
-        if self.holds && !self.liveness.hears() {
-            self.liveness.heard(cx.now);
+        if self.wire.holds && !self.wire.liveness.hears() {
+            self.wire.heard(cx.now);
         }
-        let look = self.liveness.poll(cx.now, self.sent());
+        if !self.wire.due.has_come(Part::Liveness, cx.now) {
+            return;
+        }
+        let look = self.wire.liveness.poll(cx.now, self.wire.sent());
+        self.wire.note_liveness();
         if look.missed {
-            self.link.counters.count(LinkCounter::KeepAlivesMissed);
+            self.wire.link.counters.count(LinkCounter::KeepAlivesMissed);
         }
         if look.lost {
-            return self.close(cx, CloseReason::Silent);
+            return self.wire.close(cx, CloseReason::Silent);
         }
         if look.deaf {
-            self.link.counters.count(LinkCounter::DatagramsMissing);
+            self.wire.link.counters.count(LinkCounter::DatagramsMissing);
             // The peer is told at once, in the stream: it sends its keep-alives there then.
-            self.timers.keep_alive = cx.now;
+            self.wire.due.set(Part::KeepAlive, cx.now);
         }
         if look.ask {
-            self.send_datagram(cx, &SessionBody::PING, &[]);
+            self.wire.send_datagram(cx, &SessionBody::PING, &[]);
         }
         if look.probe {
-            self.send_ping(cx.now);
-            self.flush(cx);
-        }
-    }
-
-    /// Bytes written into the stream, as reports count them.
-    fn sent(&self) -> u32 {
-        self.link.counters.value(LinkCounter::BytesSent) as u32
-    }
-
-    /// What comes of the peer here.
-    pub(super) fn report(&self) -> Report {
-        Report {
-            received: self.link.counters.value(LinkCounter::BytesReceived) as u32,
-            hears: self.liveness.hears(),
-            holds: self.holds,
+            self.pings.send(&mut self.wire, cx.now);
+            self.wire.flush(cx);
         }
     }
 
     /// The peer tells what comes of this unit there.
     pub(super) fn reported(&mut self, cx: &mut Context<'_, P>, report: Report) {
-        let sent = self.sent();
-        if let Some(long) = self.liveness.reported(cx.now, sent, report) {
+        let sent = self.wire.sent();
+        if let Some(long) = self.wire.liveness.reported(cx.now, sent, report) {
             let reason = CloseReason::StreamDead { long };
             // What the stream does not bring there: the peer need not find out by itself.
             for _ in 0..CHALLENGE_DATAGRAMS {
-                self.send_datagram(cx, &SessionBody::close(close_code(reason)), &[]);
+                self.wire.send_datagram(cx, &SessionBody::close(close_code(reason)), &[]);
             }
-            self.link.counters.count(LinkCounter::StreamsDied);
-            self.close(cx, reason);
+            self.wire.link.counters.count(LinkCounter::StreamsDied);
+            self.wire.close(cx, reason);
         }
     }
 
     /// Reports what ended with the link, one by one: leases first.
     fn poll_ending(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) -> Option<Event> {
-        while let Some(granted) = self.granted.pop() {
+        while let Some(granted) = self.granting.granted.pop() {
             if expire_granted(cx, &granted, LeaseEnd::Expired) {
                 return Some(Event::LeaseExpired(granted.slot));
             }
         }
         if P::CALLS
-            && let Some(id) = self.requests.interrupt()
+            && let Some(id) = self.calling.requests.interrupt()
         {
             return Some(Event::Reply(id, Err(Error::Interrupted)));
         }
-        self.link.release(cx.buffers);
+        self.wire.link.release(cx.buffers);
         self.calls.release(cx.buffers);
         // Results that were not looked at were in a buffer that has gone back.
-        self.step = self.step.wrapping_add(1);
-        self.phase = Phase::Ended;
+        self.wire.step = self.wire.step.wrapping_add(1);
+        self.wire.phase = Phase::Ended;
         Some(Event::Closed(reason))
     }
 
     fn send_keep_alive(&mut self, cx: &mut Context<'_, P>) {
         // The peer counts by what it was told in the hello.
-        let reported = Duration::from_millis(self.reported_keep_alive.into());
-        self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(reported).max(Duration::from_millis(1));
-        self.publishing.actuators_due = true;
+        let reported = Duration::from_millis(self.wire.reported_keep_alive.into());
+        let pause = self.wire.constraints.keep_alive.min(reported).max(Duration::from_millis(1));
+        self.wire.due.set(Part::KeepAlive, cx.now + pause);
+        self.wire.publishing.actuators_due = true;
         self.pump(cx);
-        let body = SessionBody::keep_alive(cx.now.as_micros(), self.report());
-        self.send_datagram(cx, &body, &[]);
+        let body = SessionBody::keep_alive(cx.now.as_micros(), self.wire.report());
+        self.wire.send_datagram(cx, &body, &[]);
         // Where none come, none may arrive there either: the peer could not tell.
-        if !self.liveness.is_heard() || !self.liveness.hears() {
-            self.link.send_frame(&Frame::Session(&body));
-            self.flush(cx);
+        if !self.wire.liveness.is_heard() || !self.wire.liveness.hears() {
+            self.wire.link.send_frame(&Frame::Session(&body));
+            self.wire.flush(cx);
         }
-    }
-
-    /// Sends a session datagram; `body` and `rest` follow each other in it. `false` when the network refused it.
-    pub(super) fn send_datagram(&mut self, cx: &mut Context<'_, P>, body: &[u8], rest: &[u8]) -> bool {
-        let Some((to, header)) = self.datagram_header() else { return false };
-        let (front, back) = self.link.cipher().datagram_room();
-        let mut bytes = [0; LONGEST_DATAGRAM];
-        let start = header.len().saturating_add(front);
-        let end = start.saturating_add(body.len()).saturating_add(rest.len());
-        let place = bytes.get_mut(start..end).and_then(|place| place.split_at_mut_checked(body.len()));
-        let Some((place, behind)) = place else { return false };
-        copy(body, place);
-        copy(rest, behind);
-        let Some(whole) = bytes.get_mut(..end.saturating_add(back)) else { return false };
-        let Some((head, sealed)) = whole.split_first_chunk_mut() else { return false };
-        *head = header;
-        if !self.link.cipher().seal_datagram(&header, sealed) {
-            return false;
-        }
-        let sent = cx.mailman.send_to(to, whole);
-        if sent {
-            self.link.counters.count(LinkCounter::DatagramsSent);
-        }
-        sent
-    }
-
-    fn datagram_header(&mut self) -> Option<(P::Endpoint, [u8; datagram::SESSION_HEADER_BYTES])> {
-        let mode = self.mode();
-        let remote = self.remote.as_ref()?;
-        if remote.datagrams.port() == 0 {
-            return None;
-        }
-        let header = datagram::session_header(mode, remote.version, self.fleet, remote.hello.link, remote.hello.nonce);
-        Some((remote.datagrams, header))
     }
 }

@@ -181,7 +181,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
 
     /// The order that a call of the peer has here.
     pub(super) fn order_of(&self, call: CallId) -> Order {
-        let granted = self.session.granted.iter().find(|granted| granted.call == call.0);
+        let granted = self.session.granting.granted.iter().find(|granted| granted.call == call.0);
         granted.and_then(|granted| granted.order).unwrap()
     }
 
@@ -238,7 +238,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
     pub(super) fn hear_of(&mut self, definition: &str, slot: u16, generation: u16) {
         let definition = Definition::parse(definition).unwrap();
         let attributes = setup::attributes(&definition, 0);
-        self.session.theirs.insert(Slot(slot), Generation(generation), attributes, definition.as_bytes()).unwrap();
+        self.session.wire.theirs.insert(Slot(slot), Generation(generation), attributes, definition.as_bytes()).unwrap();
     }
 
     /// Others use up the pool.

@@ -433,7 +433,7 @@ fn the_caller_is_told_the_state_of_what_it_moves() {
     assert_eq!([go, dock, lift].map(|slot| state(&pair, slot)), [None; 3], "there is nothing to say");
     let moves = call(&mut pair, "go");
     pair.run(Duration::from_secs(1));
-    let link = pair.manager.session.nonce as u32;
+    let link = pair.manager.session.wire.nonce as u32;
     let last = LastOrder { holder: 1, link, call: moves.0, claim: claim::Claim::NONE, end: None };
     assert_eq!([go, dock].map(|slot| state(&pair, slot)), [Some(ActuatorState { latch: None, last: Some(last) }); 2]);
     assert_eq!(state(&pair, lift), Some(ActuatorState::default()));

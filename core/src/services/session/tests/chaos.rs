@@ -125,8 +125,8 @@ fn apply(pair: &mut Pair, asked: &mut [Asked; 2], act: Act, manager: bool) {
 /// Bytes that the network has not refused have a time at which they go out.
 fn check_nothing_stays(side: &Side) {
     let Side { session, now, .. } = side;
-    let gathers = session.is_live() && session.link.queued() > 0 && !session.wants_to_write();
-    assert!(!gathers || session.deadline() <= *now + GATHER, "{} bytes stay", session.link.queued());
+    let gathers = session.is_live() && session.wire.link.queued() > 0 && !session.wants_to_write();
+    assert!(!gathers || session.deadline() <= *now + GATHER, "{} bytes stay", session.wire.link.queued());
 }
 
 /// Everything comes right again, and every call that still runs is answered.

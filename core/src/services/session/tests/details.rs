@@ -200,7 +200,7 @@ fn progress_waits_for_its_interval_and_for_an_empty_stream() {
     assert_eq!(pair.agv.report_progress(&call, 3), Ok(()));
     pair.run(PROGRESS_INTERVAL);
     pair.agv.net.capacity = 0;
-    pair.agv.session.send_frame(&Frame::Ping);
+    pair.agv.session.wire.send_frame(&Frame::Ping);
     assert_eq!(pair.agv.report_progress(&call, 4), full);
     pair.agv.net.capacity = 1 << 20;
     pair.settle();
@@ -282,7 +282,7 @@ fn a_call_that_has_not_begun_does_not_begin_once_it_is_cancelled() {
 #[test]
 fn a_cancellation_that_comes_before_its_request_keeps_it_from_running() {
     let mut pair = with(GO);
-    let next = pair.manager.session.requests.newest().0 + 1;
+    let next = pair.manager.session.calling.requests.newest().0 + 1;
     let cancel = SessionBody::cancel(&Release { call: next, class: Priority::Normal });
     pair.agv.hear_datagram(pair.agv.session.nonce(), &cancel);
     let id = pair.manager.watched("go");

@@ -200,7 +200,7 @@ fn a_best_effort_call_that_arrives_behind_its_release_does_not_begin() {
     let mut pair = Pair::live();
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
-    let id = pair.manager.session.requests.newest().0 + 1;
+    let id = pair.manager.session.calling.requests.newest().0 + 1;
     let nonce = pair.agv.session.nonce();
     let release = crate::distribution::message::Release { call: id, class: Priority::Normal };
     pair.agv.hear_datagram(nonce, &SessionBody::release(&release));
@@ -363,7 +363,7 @@ fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
     renewal_arrives(&mut pair, call, Priority::Normal, Duration::ZERO);
     assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 1);
     pair.run(millis(100));
-    assert!(pair.agv.session.granted.is_empty(), "the lease of the function before was prolonged");
+    assert!(pair.agv.session.granting.granted.is_empty(), "the lease of the function before was prolonged");
     assert_eq!(expirations(&pair), 0, "the hook of the function that is there now runs");
 }
 

@@ -242,7 +242,7 @@ fn a_release_arrives_with_every_table_full_and_a_stream_that_takes_nothing() {
 #[test]
 fn releases_that_wait_for_the_stream_are_all_sent() {
     let (mut pair, slots) = vehicle(&Setup { datagrams: false, ..Setup::default() });
-    let held: Vec<_> = pair.manager.session.held.iter().map(|held| held.call).collect();
+    let held: Vec<_> = pair.manager.session.calling.held.iter().map(|held| held.call).collect();
     pair.manager.net.capacity = 0;
     for _ in 0..40 {
         let _ = stop(&mut pair, "work");

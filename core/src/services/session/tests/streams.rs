@@ -265,10 +265,10 @@ fn a_call_goes_before_a_sample() {
     pair.agv.net.frozen = true;
     pair.agv.put_all(image, &values);
     pair.run(MS);
-    let queued = pair.agv.session.link.queued();
+    let queued = pair.agv.session.wire.link.queued();
     pair.agv.put(pose, 1);
     pair.run(MS);
-    assert_eq!(pair.agv.session.link.queued(), queued, "a second one waits");
+    assert_eq!(pair.agv.session.wire.link.queued(), queued, "a second one waits");
     let call = pair.manager.call("pos_info", &none()).unwrap();
     pair.run(MS);
     (pair.agv.net.capacity, pair.agv.net.frozen) = (1_000, false);
