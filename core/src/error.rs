@@ -96,7 +96,7 @@ impl Constraint {
     }
 }
 
-/// What a unit tells the other end when it does not take a link.
+/// Why a unit refuses a link; sent to the other end.
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
@@ -116,7 +116,7 @@ pub enum Refusal {
     /// Another live node has the same name, id and role.
     #[error("another live node has the same name and id: give each node its own")]
     DuplicateIdentity,
-    /// Both ends have the same role or identity where that cannot be.
+    /// Both ends are s_units.
     #[error("the two roles cannot be joined: make one of them an m_unit, which s_units join")]
     Role,
     /// The peers are connected already.
@@ -208,13 +208,13 @@ pub enum CloseReason {
     /// The other end broke the protocol.
     #[error("the peer broke the protocol: check its version")]
     Protocol = 5,
-    /// A frame or message above the told limit.
+    /// A frame or message above the limit that this unit advertises.
     #[error("the peer sent more than the limit that it was told: check its version, or raise message_size here")]
     Oversize = 6,
     /// No hello came in time, or no proof behind it.
     #[error("no hello or no proof came in time: the other end is silent, or no CARA unit of this mode")]
     HelloTimeout = 7,
-    /// The unit refused the link.
+    /// One of the two units refused the link.
     #[error("{0}")]
     Refused(Refusal) = 8,
     /// The connection could not be opened.
@@ -246,7 +246,7 @@ pub enum CloseReason {
     } = 14,
 }
 
-/// What a handler answers instead of results. Text and values of a failure go beside it: `Failure`, with the feature `details`.
+/// What a handler returns instead of results. With the feature `details`, `Failure` adds a text and values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum ServiceError {
@@ -264,16 +264,16 @@ pub enum ServiceError {
     BadResults,
 }
 
-/// What a variable is in a signature.
+/// The part of a signature in which a variable stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Part {
     /// What a caller passes.
     Argument,
     /// What it gets back.
     Result,
-    /// What it is told meanwhile.
+    /// What it gets while the call runs.
     Progress,
-    /// What it is told of a failure.
+    /// What it gets with a failure.
     Failure,
 }
 
@@ -300,7 +300,7 @@ pub enum Error {
         "the peer has not published this function to this unit: check the name against its list, and publish it there"
     )]
     UnknownFunction,
-    /// The peer's function is of another version than the interface here; nothing was sent.
+    /// The peer's function is of another version than this program's interface; nothing was sent.
     #[error("the peer's function is of another version: its {0} differs: update one of the two")]
     Mismatch(Part),
     /// The function was removed or changed since its list was read; the news follows.
@@ -381,7 +381,7 @@ pub enum Error {
         /// The limit that there is.
         have: u32,
     },
-    /// The heart that a call of a leased function names may let the lease end between two beats.
+    /// The heart that a call names beats too slowly: the function's lease may end between two beats.
     #[error("the heart beats every {have} ms, and the function's lease needs it every {need} ms: let it beat as often")]
     SlowHeart {
         /// Twice within the lease, in milliseconds.
@@ -429,8 +429,8 @@ pub enum Error {
     /// The callee is of an earlier version, which does not know something that the request depends on; it did not run it.
     #[error("the peer's version does not know what the request asks for: update the peer, or ask without it")]
     Unsupported,
-    /// Another unit, with this ID number, moves what the function moves, or an operator of it. For a program an operator of its
-    /// own unit is another one, and the reverse. The callee did not run it.
+    /// Another holder moves what the function moves: the unit with this ID number, or an operator of it. A unit's program and
+    /// its operators are two holders. The callee did not run it.
     #[error(
         "what this function moves is held by {}unit {by}: wait until it is released, or take it over",
         if *operator { "an operator of " } else { "" }
@@ -452,8 +452,7 @@ pub enum Error {
         /// Why, as the callee numbers its reasons; 0 for a function that stops.
         reason: u16,
     },
-    /// The callee has begun a later call of this unit that moves the same thing, so it did not run this one: what was asked for
-    /// last counts.
+    /// The callee has begun a call that this unit made later and that moves the same thing, so it did not run this one.
     #[error("a later call of this unit has what this function moves: if it is still wanted, call it again")]
     Replaced,
     /// The callee's rules do not let this unit call the function.

@@ -1,8 +1,8 @@
 //! The core of CARA: state machines for calling services between AGVs and their managers, which a port polls.
 //!
-//! It decides everything that both ends must agree on: who is found and taken, what may be called, how long a call or a
-//! motion goes on. It has no sockets, clock, threads, allocator or `async`. A program uses a port (`cara-std`,
-//! `cara-embassy`, the simulator); this crate is for those who write one.
+//! It decides everything that both ends must agree on: which nodes are found and admitted, what may be called, how long a call
+//! or a motion lasts. It has no sockets, clock, threads, allocator or `async`, and forbids `unsafe`. A program uses a port
+//! (`cara-std`, `cara-embassy`, the simulator); this crate is for authors of ports.
 //!
 //! # Layers
 //! Each layer calls the one below; results come up as return values.
@@ -22,9 +22,9 @@
 //! ```
 //!
 //! # Polling
-//! The port calls a machine when bytes have come, when a stream can be written to again, and at its deadline. Each call is
-//! lent the time and everything else that it may touch in a [`Context`]. After each call the port takes events until there
-//! are none, and asks for the next deadline. A session that is not polled keeps its state and sends nothing.
+//! The port calls a state machine when bytes have arrived, when a stream can be written to again, and at its deadline. Each
+//! call is lent the time and everything else that it may touch, in a [`Context`]. After each call the port takes events until
+//! there are none, and asks for the next deadline. A session that is not polled keeps its state and sends nothing.
 //!
 //! ```
 //! use cara_core::time::Instant;
@@ -52,7 +52,8 @@
 //! }
 //! ```
 //!
-//! The whole contract stands on the front page of [`services`], the way to a new port in `docs/porting.md`.
+//! The whole contract is on the front page of [`services`], the way to a new port in `docs/porting.md`, and the bytes that
+//! travel in `docs/wire.md`.
 #![no_std]
 
 #[cfg(test)]

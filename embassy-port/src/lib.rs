@@ -56,8 +56,9 @@
 //! }
 //! ```
 //!
-//! When no task runs any more, the lease stops a vehicle, since a motor's interrupt reads it; when a handler or a task
-//! hangs, the watchdog does. See `docs/boards.md`, "What stops the motors".
+//! If no task runs any more, the lease still stops the vehicle, since a motor's interrupt reads it; if a handler or a task
+//! hangs, the watchdog resets the board. See `docs/boards.md`, "What stops the motors", and "Beside the unit" for what
+//! interrupts and other cores may use.
 
 #![no_std]
 

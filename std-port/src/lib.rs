@@ -1,9 +1,13 @@
 //! CARA on Linux: the paper's `Communication_System` and `Unit` over sockets and threads.
 //!
-//! Units prove their identity and seal their frames. A unit's [keys] are in a file that `cara keys` makes; without one,
-//! building the unit is an error that names the command. [`Builder::insecure`] opts out.
+//! A manager is a [`CommunicationSystem`], a vehicle a [`Unit`]. Their handles can be used from any thread. A few threads of
+//! the unit read all links and run handlers; the thread that waits for a reply reads it itself. All rules are in `cara-core`:
+//! this crate gives it sockets, time, threads and files.
 //!
-//! A vehicle and its manager share a trait, which [`interface`](macro@interface) makes a server and a client of:
+//! Units prove their identity, and encrypt and authenticate their frames. A unit's [keys] are in a file that `cara keys`
+//! makes; without one, building the unit is an error that names the command. [`Builder::insecure`] opts out.
+//!
+//! A vehicle and its manager share a trait, of which [`interface`](macro@interface) makes a server and a client:
 //!
 //! ```no_run
 //! use std::time::Duration;
@@ -39,7 +43,9 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! Functions can also be named and found while the program runs, as in the paper's listing:
+//! What moves has a lease and a heart: see [`Heart`] and [`Actuator`]. Values that change are streams: see [`Stream`].
+//!
+//! Functions can also be named and found at run time, as in the paper's listing:
 //!
 //! ```no_run
 //! use cara_std::{CommunicationSystem, Parameters};

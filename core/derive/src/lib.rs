@@ -1,6 +1,8 @@
-//! CARA's typed services: a derive for structs of variables and enums, and an attribute that makes of a trait a list of
-//! functions, a server and clients. They are used by their names in `cara_core`, `cara_std` or `cara_embassy`, which export
-//! them with the feature `derive`.
+//! The macros of CARA's typed services: `#[derive(Variables)]` for structs and enums, and `#[interface]`, which makes a
+//! server and a client of a trait.
+//!
+//! Use them as exported by `cara_core`, `cara_std` or `cara_embassy` (feature `derive`): the three forms of each macro differ
+//! only in the crate that the generated code names.
 
 mod attributes;
 mod calling;

@@ -1,20 +1,31 @@
 //! The cipher of CARA: one suite, `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`, with a key for each pair of units.
 //!
 //! - [`keys`]: the keys of a fleet, derived from one root that stays where they are made;
-//! - [`handshake`]: two messages that prove the pair's key, and agree on keys of this link alone;
+//! - [`handshake`]: two messages that prove the pair's key and agree on keys for this link alone;
 //! - [`channel`]: the frames of a link, sealed in place;
-//! - [`datagram`]: the datagrams beside it, with keys of their own and a window against replays;
-//! - [`link`]: the cipher of one link, which joins the two above and the datagrams;
-//! - [`keyring`]: where a unit finds its keys, and the codes that it makes with them;
+//! - [`datagram`]: the datagrams beside it, with keys of their own and a replay window;
+//! - [`link`]: the cipher of one link, made of the three above;
+//! - [`keyring`]: where a unit finds its keys, and the authentication codes that it makes with them;
 //! - [`mac`]: codes for discovery, which is authenticated and not secret;
 //! - [`random`]: random numbers for boards, whose sources of noise may be poor.
+//!
+//! # What is implemented
+//! | what | from |
+//! |---|---|
+//! | the handshake, with the pair's key as psk 0 | [Noise Protocol Framework](https://noiseprotocol.org/noise.html), sections 5, 7 and 9 |
+//! | a live link's keys renewed by a handshake over the hash of the last one | the same, section 11.2 (channel binding) |
+//! | rekeying each 2^20 frames | the same, sections 4.2 and 11.3 |
+//! | X25519; ChaCha20-Poly1305; BLAKE2s | [RFC 7748](https://www.rfc-editor.org/rfc/rfc7748); [RFC 8439](https://www.rfc-editor.org/rfc/rfc8439); [RFC 7693](https://www.rfc-editor.org/rfc/rfc7693) |
+//! | the window of 64 datagrams | as [RFC 4303](https://www.rfc-editor.org/rfc/rfc4303#section-3.4.3), section 3.4.3 |
+//!
+//! `docs/wire.md`, section 17, has the bytes.
 //!
 //! With the feature `ring`, frames and datagrams are sealed by *ring*, which is several times as fast on a Linux host;
 //! without it, by portable code, which boards use. Both seal alike.
 //!
-//! Another suite would be another version of the protocol; nothing is negotiated. This crate has no source of
+//! Another suite would be another bit of the hello; nothing is negotiated within a handshake. This crate has no source of
 //! randomness, reads no file and allocates nothing: the caller supplies 32 fresh bytes for each handshake. It does not
-//! decide which peer may speak; that is the business of the tables above.
+//! decide which peer may do what; that is the task of access tables.
 
 #![no_std]
 

@@ -2,10 +2,10 @@
 //!
 //! # How a port drives the machines
 //!
-//! A port owns sockets, time, threads and memory; the machines own every decision. A [`Hub`](hub::Hub) is what the links of one
-//! unit share: the [`Node`](crate::distribution::connection_handler::Node) that finds and admits peers, and the publications. A
-//! [`Session`](session::Session) is one link. Both are called with the time and what they need, do what they can at once, and
-//! return what happened; neither waits, reads a clock or allocates.
+//! A port owns sockets, time, threads and memory; the state machines make every decision. A [`Hub`](hub::Hub) is what the links
+//! of one unit share: the [`Node`](crate::distribution::connection_handler::Node) that finds and admits peers, and the
+//! publications. A [`Session`](session::Session) is one link. Each is called with the time and what it needs, does what it can at
+//! once, and returns what happened. Neither waits, reads a clock or allocates.
 //!
 //! | what happens | what the port calls |
 //! |---|---|
@@ -17,7 +17,7 @@
 //! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.poll` and `session.next_call`, each until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
 //! | the stream takes bytes again, and `session.wants_to_write()` | `session.writable` |
 //! | a datagram has come | `session.datagram` of the link that [`for_session`](crate::distribution::datagram::for_session) names, if there is one; else `node.datagram` |
-//! | at `session.deadline()`, and after each call that may have ended it | `session.poll` until `None`, **before** anything that has arrived: leases end here |
+//! | at `session.deadline()`, and after each call that may have ended the link | `session.poll` until `None`, **before** anything that has arrived: leases end here |
 //! | a handler has run, outside of all locks | `session.answer`, then `session.next_call` |
 //! | the stream has ended | `session.disconnected` |
 //!
@@ -25,10 +25,10 @@
 //! |---|---|
 //! | [`LeaseExpired`](session::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
 //! | [`Incoming`](session::Event::Incoming) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
-//! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
-//! | `Sample`, `Subscribed` (feature `streams`) | keeps the value, which `session.results` shows, or what became of a subscription. It says `session.subscribe` again with each [`ListChanged`](session::Event::ListChanged), and `session.stream_changed`, then `session.poll`, for each value that the unit publishes |
-//! | [`Joined`](session::Event::Joined) | the peer is taken, and is being told what is published to it; from here on it is `session.peer()` |
-//! | [`Closed`](session::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
+//! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | gives the program the event that [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` returns. It calls `session.cancel` for a call that the program gives up, `session.release` for all calls of a function |
+//! | `Sample`, `Subscribed` (feature `streams`) | keeps the value, which `session.results` returns, or the outcome of a subscription. It calls `session.subscribe` again at each [`ListChanged`](session::Event::ListChanged), and `session.stream_changed`, then `session.poll`, for each value that the unit publishes |
+//! | [`Joined`](session::Event::Joined) | notes that the peer is admitted and learns what is published to it; from now on it is `session.peer()` |
+//! | [`Closed`](session::Event::Closed) | the last event: drops the session (`into_storage` returns its slices), then calls `node.left`, also for a link that never joined |
 //!
 //! Ports differ only in which thread or task makes these calls, and under which lock. Two sessions are never locked at
 //! the same time; a session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].

@@ -1,14 +1,15 @@
-//! Settings of a board in two pages of its flash, so that one image serves all boards of a kind. Without writable flash
-//! they come as text.
+//! Settings of a board in two pages of its flash, so that one image serves all boards of a kind. A board without writable
+//! flash gets them as text.
 //!
-//! [`Settings`] is what a board is provisioned with. [`page`] is its layout in flash: two copies, each with a generation
-//! and a checksum, so that a power cut while one is written leaves the other. Its text form (`FromStr` and `Display`) is
-//! for command lines and an emulator's arguments.
+//! [`Settings`] is what a board is provisioned with: identity, manager, network. [`page`] is its layout in flash: two copies,
+//! each with a generation and a checksum, so that a power cut while one is written leaves the other. The text form (`FromStr`
+//! and `Display`) is for command lines and an emulator's arguments.
 //!
-//! With the feature `keys`, the module `keys` adds keys behind the settings in the same copy, and `boots` is the boot
+//! With the feature `keys`, the module `keys` stores keys after the settings in the same copy, and `boots` is the boot
 //! counter, in two pages of its own.
 //!
-//! [`board`] is the table of boards and the addresses of their pages; [`uf2`] is the file format of some boot loaders.
+//! [`board`] is the table of boards and the addresses of their pages; [`uf2`] is the
+//! [file format](https://github.com/microsoft/uf2) of some boot loaders.
 //!
 //! The crate drives no flash controller: a board lends the bytes of its pages, and a driver for the boot counter.
 

@@ -1,4 +1,8 @@
-//! The `cara` command: lists the nodes of a fleet, calls their functions, and finds out why a node is missing.
+//! The `cara` command: lists the nodes of a fleet, calls their functions, stops them, and finds out why a node is missing.
+//!
+//! A verb asks the manager that runs on this host, through its control socket, and decides nothing that the manager decides.
+//! Only with `--as` is the command a manager itself. Each verb is a file of [`commands`]; `doctor`, `keys`, `provision` and
+//! `web` are crates of their own. `docs/cara.md` has all options, JSON keys and exit codes.
 
 mod attended;
 mod command_line;
