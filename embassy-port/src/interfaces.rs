@@ -18,6 +18,56 @@ use crate::handler::{Handler, Hook, Safe, Served, ServiceOptions};
 use crate::lease::LeaseWatch;
 
 /// What functions of an interface move, stop or reset: see [`ServiceOptions::lease`].
+///
+#[cfg_attr(feature = "derive", doc = "```")]
+#[cfg_attr(not(feature = "derive"), doc = "```ignore")]
+/// use cara_core::ServiceError;
+/// use cara_core::error::Error;
+/// use cara_core::services::heart::{Heart, Renew};
+/// use cara_core::services::lease::Lease;
+/// use cara_core::time::Duration;
+/// use cara_embassy::{Actuator, Handle, Peer, interface, now};
+/// use embassy_time::Timer;
+///
+/// #[interface]
+/// trait Agv {
+///     #[actuator(drive)]
+///     #[lease(ms = 400)]
+///     fn go_to(&mut self, x: i64) -> Result<(), ServiceError>;
+/// }
+///
+/// struct Vehicle { target: i64 }
+///
+/// impl Agv for Vehicle {
+///     fn go_to(&mut self, x: i64) -> Result<(), ServiceError> {
+///         self.target = x;
+///         Ok(())
+///     }
+/// }
+///
+/// /// The motors' interrupt reads it too: `DRIVE.is_live(now())`.
+/// static DRIVE: Lease = Lease::new();
+///
+/// fn cut_power() { /* a pin */ }
+///
+/// fn offer(vehicle: Handle<Vehicle>) -> Result<(), Error> {
+///     vehicle.my_function_list().serve(AgvServer { drive: Actuator::new(&DRIVE, &cut_power) })?;
+///     vehicle.publish_my_function_list()
+/// }
+///
+/// /// In a manager: the vehicle drives while this loop beats its heart, for three seconds here.
+/// async fn drive<T>(vehicle: &Peer<T>) {
+///     static HEART: Heart = Heart::new(Duration::from_millis(200));
+///     HEART.beat(now());
+///     let call = AgvClient::at(vehicle).go_to(5).renewing(Renew::Heart(HEART.beats())).hold();
+///     // Dropped at the end, the hold stops the vehicle.
+///     let Ok(_order) = call.await else { return };
+///     for _ in 0..30 {
+///         HEART.beat(now());
+///         Timer::after_millis(100).await;
+///     }
+/// }
+/// ```
 pub struct Actuator<T: 'static> {
     lease: &'static Lease,
     safe: &'static Safe,

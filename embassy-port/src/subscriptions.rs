@@ -78,6 +78,21 @@ impl<T> Peer<T> {
     ///
     /// [`Error::Full`] while the cell has another subscription, [`Error::BadName`]. What the node refuses, and a stream that it
     /// does not have, [`Subscription::next`] tells.
+    ///
+    /// ```
+    /// use cara_core::error::Error;
+    /// use cara_core::time::Duration;
+    /// use cara_embassy::{Peer, SubscriptionCell};
+    ///
+    /// async fn follow<T>(agv: &Peer<T>, cell: &'static SubscriptionCell<64>) -> Result<(), Error> {
+    ///     let mut pose = agv.subscribe("pose", Duration::from_millis(100), cell)?;
+    ///     loop {
+    ///         pose.next().await?;
+    ///         let position = pose.latest(|values, _age| values.variable::<[f64; 2]>("position"));
+    ///         // … `position` is `Some`: a value has come …
+    ///     }
+    /// }
+    /// ```
     pub fn subscribe<const BYTES: usize>(
         &self,
         stream: &str,

@@ -81,6 +81,47 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// }
 /// ```
 ///
+/// What moves has an actuator and a lease. This function also declares progress and the values of its failures:
+///
+/// ```
+/// use cara_core::{ServiceError, TypedCall, Variables, interface};
+///
+/// #[derive(Variables)]
+/// struct Left { metres: f64 }
+///
+/// #[derive(Variables)]
+/// struct Blocked { at: f64 }
+///
+/// #[interface]
+/// trait Drive {
+///     #[actuator(drive)]
+///     #[lease(ms = 400)]
+///     fn go_to(&mut self, call: &impl TypedCall<Left, Blocked>, #[unit = "m"] x: f64) -> Result<(), ServiceError>;
+///
+///     #[priority(emergency)]
+///     #[actuator(drive)]
+///     #[stop]
+///     fn stop();
+/// }
+///
+/// struct Vehicle { x: f64, target: f64 }
+///
+/// impl Drive for Vehicle {
+///     fn go_to(&mut self, call: &impl TypedCall<Left, Blocked>, x: f64) -> Result<(), ServiceError> {
+///         if x > 100.0 {
+///             return Err(call.fail_with(1, "the hall ends at 100 m", &Blocked { at: self.x }));
+///         }
+///         // Nothing changes if the order has ended meanwhile.
+///         call.commit(|| self.target = x)?;
+///         call.progress(&Left { metres: x - self.x })?;
+///         Ok(())
+///     }
+///
+///     // Empty: the unit itself has ended the orders before this runs.
+///     fn stop() {}
+/// }
+/// ```
+///
 /// | attribute of a function | means |
 /// |---|---|
 /// | `#[returns(sum)]` | the names of the results; not needed for `()` and for structs that derive `Variables` |

@@ -260,6 +260,23 @@ impl<const BYTES: usize, R: Deref<Target = ParametersView>, A> Deref for Frame<B
 
 /// A call that has not been sent.
 ///
+/// ```
+/// use cara_core::Parameters;
+/// use cara_core::config::Priority;
+/// use cara_core::error::Error;
+/// use cara_core::services::call::{BlockingCaller, Call, Dynamic};
+/// use cara_core::time::Duration;
+///
+/// /// `peer` is a port's handle to a node; its `call` makes the same object.
+/// fn position<P: BlockingCaller>(peer: &P) -> Result<[i64; 2], Error> {
+///     let mut position = Parameters::new();
+///     position.add_int("position", 2)?;
+///     let call = Call::new(peer, Dynamic::new("pos_info", &mut position));
+///     call.timeout(Duration::from_millis(200)).priority(Priority::High).wait().map_err(|failed| failed.error)?;
+///     position.variable("position")
+/// }
+/// ```
+///
 /// `W` hears its progress, and `K` says what it leads to.
 #[must_use = "nothing is sent before `.wait()`, `.await` or `.send()`"]
 pub struct Call<'c, C: Caller, Q, W = Unwatched, K = Once> {
