@@ -30,7 +30,7 @@ const PAUSE: Duration = Duration::from_millis(5);
 pub type CallError<F = ()> = call::CallError<F, details::Kept>;
 
 impl<T> Peer<T> {
-    /// An error of the compiler in a unit that calls others without the feature.
+    /// Makes a unit that calls others without the feature `call` fail to compile.
     pub(crate) const MAY_CALL: () = assert!(
         Board::CALLS,
         "a unit that calls others or reads their streams needs the feature `call` of cara-embassy"

@@ -91,8 +91,8 @@ impl Config {
         self
     }
 
-    /// This life of the unit, if it is not to be drawn, or the seed of an insecure one: a count of starts, on a board
-    /// without a source of noise.
+    /// The epoch of this start, instead of a drawn one (or one from the seed of an insecure unit): for example a count of
+    /// starts, on a board without a source of noise.
     pub fn epoch(mut self, epoch: u64) -> Self {
         self.node.epoch = Epoch(epoch);
         self

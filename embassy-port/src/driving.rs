@@ -1,5 +1,5 @@
-//! What happened on a link goes to the machine of its unit, and what comes of it is done, as
-//! the front page of `cara_core::services` says. Nothing here waits or runs a handler.
+//! Feeds what happens on links into the state machines of the unit, and does what they return, as the front page of
+//! `cara_core::services` says. Nothing here waits or runs a handler.
 //!
 //! The large functions are kept apart: merged into their callers, the frames of all of them would lie on the stack at
 //! once, though only one runs at a time.
@@ -33,13 +33,13 @@ use crate::replies::ended;
 use crate::replies::reported;
 use crate::time::now;
 
-/// How long a dialling peer may take for its hello, and for its proof, while no other one could dial, or while another
-/// one has dialled. A slow controller takes most of it for the proof.
+/// How long a peer that dialled may take for its hello, and for its proof, if it keeps others from dialling or another one
+/// waits for its proof. A slow controller needs most of this for its own part of the proof.
 const PATIENCE: Duration = Duration::from_millis(300);
 /// Refused links are logged at most this often.
 const LOGGED: Duration = Duration::from_secs(1);
-/// How often the cable and the address are looked at, since the stack wakes one task only for them: it is left to the
-/// application's `wait_config_up`.
+/// How often cable and address are checked. The stack could wake one task when they change, but only one, and that is left
+/// to the application's `wait_config_up`.
 const LOOK: Duration = Duration::from_millis(50);
 
 /// What the runner has to do outside of the machine.

@@ -49,7 +49,7 @@ type GiveUp<T> = fn(&mut Machine<T>, &InFlight);
 /// the heap drop a task with its last waker, which the machine may have.
 pub(crate) struct Unwanted<T: 'static> {
     calls: Cell<heapless::Vec<InFlight, LEASES>>,
-    /// A pointer, so that an image that calls nothing has nothing of it.
+    /// A pointer, so that the image of a unit that calls nothing does not contain the function.
     give_up: Cell<Option<GiveUp<T>>>,
 }
 
@@ -58,7 +58,7 @@ impl<T> Unwanted<T> {
         Self { calls: Cell::new(heapless::Vec::new()), give_up: Cell::new(None) }
     }
 
-    /// One more than [`LEASES`] at a time is not kept: what it holds ends with its heart.
+    /// At most [`LEASES`] at a time are kept: what another one holds ends with its heart.
     pub(crate) fn add(&self, call: InFlight) {
         let mut calls = self.calls.take();
         let _ = calls.push(call);

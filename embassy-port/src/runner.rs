@@ -89,7 +89,7 @@ impl<T> Runner<T> {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
         shared.unwanted.release(machine);
-        // Anything may be due behind whatever is done, but nothing before the time to which the last rest has looked.
+        // Each step may make something due at once. Only after a rest is it known until when nothing is due.
         let awaits_hook = machine.awaits_hook();
         let is_due = awaits_hook | (now() >= core::mem::replace(&mut self.rested_until, Instant::START));
         if is_due || machine.address.is_none() {
@@ -124,7 +124,7 @@ impl<T> Runner<T> {
 
     fn read(&mut self, machine: &mut Machine<T>) -> Step {
         let busy = self.unanswered.is_some();
-        // Peers take turns: that whose call began last comes last.
+        // Peers take turns: the one whose call began last comes last.
         let last = usize::from(machine.started_on);
         for index in machine.indices().cycle().skip(last.saturating_add(1)).take(machine.indices().len()) {
             let arguments = if busy { None } else { Some(&mut *self.arguments) };
@@ -241,7 +241,7 @@ impl<T> Runner<T> {
         let result = handler.run(&self.shared.state, &reported, self.arguments);
         #[cfg(feature = "details")]
         reported.running.take()?;
-        // Where it cannot be kept now, its code waits alone.
+        // If the failure cannot be kept now, only its code waits.
         #[cfg(feature = "details")]
         if let Some(failure) = reported.failure.take()
             && result == Err((&failure).into())

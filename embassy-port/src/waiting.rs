@@ -13,7 +13,7 @@ use crate::machine::Machine;
 use crate::replies::called;
 
 impl<T> Machine<T> {
-    /// Whether there is a place for a call that is about to be made; an emergency has some where the others are taken.
+    /// Whether there is capacity for a call that is about to be made; some is reserved for emergencies.
     pub(crate) fn can_wait(&self, link: u16, function: &str, class: Option<Priority>) -> bool {
         let Some(link) = self.link(link) else { return false };
         let is_urgent = || {

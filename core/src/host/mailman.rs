@@ -1,6 +1,6 @@
 //! The paper's `Mailman`: the one trait between the core and a port.
 //!
-//! It is synchronous and never blocks; a port lends it to each call that may write. Reading is turned round: the port
+//! It is synchronous and never blocks; a port lends it to each call that may write. Reading goes the other way: the port
 //! reads (a Linux thread blocks in the read without any lock), lends what it has to
 //! [`Session::receive`](crate::services::session::Session::receive) or
 //! [`Node::datagram`](crate::distribution::connection_handler::Node::datagram), and is told how much was consumed.
@@ -25,8 +25,8 @@ pub trait Mailman<E> {
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason>;
 
     /// Most bytes of sealed frames that wait for the stream at a time; one frame may be longer, and 0 means the peer's
-    /// longest chunk. More of them cost fewer writes per message. What is sealed is not overtaken, not even by an
-    /// emergency, of which then only the datagram is in time.
+    /// longest chunk. More bytes mean fewer writes per message. Sealed frames are not overtaken, not even by an
+    /// emergency: then only its datagram is in time.
     fn seals_ahead(&self) -> usize {
         0
     }

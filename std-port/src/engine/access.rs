@@ -94,7 +94,7 @@ mod operator {
 
     use super::*;
 
-    /// Functions of which the operator's use of a rate is remembered, before those are forgotten whose rate is whole again.
+    /// Functions for which the operator's use of a rate is remembered. Beyond that, those with a full rate are forgotten.
     const OPERATOR_BUCKETS: usize = 256;
 
     impl Guard {
@@ -118,7 +118,7 @@ mod operator {
             let decision = match table.decide(Principal::Operator, function, verb) {
                 Decision::Allowed { rate: Some(rate), .. } if verb == Verb::Call => {
                     let taken = self.take(now, function, rate);
-                    // A stop never comes too often, nor does another emergency.
+                    // No rate applies to stops and other emergencies.
                     taken.or_else(|error| if is_urgent(links, function) { Ok(()) } else { Err(error) })
                 }
                 Decision::Allowed { .. } => Ok(()),

@@ -22,7 +22,7 @@ use super::state_gate::Mark;
 use crate::error::CallError;
 use crate::growing::CallParameters;
 
-/// The pause before the next try for calls of many links, of which one or the other soon has room.
+/// The pause before the next try for calls on many links: one of the links soon has room.
 const SHORT_PAUSE: Duration = Duration::from_millis(2);
 
 /// A call that was answered, by its link.
@@ -52,7 +52,7 @@ pub struct Pending<T: Send + 'static> {
     made: Made,
     alarm: Alarm,
     mark: Option<Mark>,
-    /// For the audit log; dropped before the call has ended, it notes that.
+    /// For the audit log, which gets a line also if the call is dropped before it has ended.
     recorded: Option<Recorded>,
 }
 
@@ -199,7 +199,7 @@ impl<T: Send + 'static> Pending<T> {
         }
     }
 
-    /// It has ended so. What has not ended well is given up.
+    /// The call has ended with this outcome. After an error it is given up.
     fn over(&mut self, ended: Result<(), CallError>) -> Poll<Result<Answered, CallError>> {
         let stage = self.stage;
         self.stage = Stage::Over { was_sent: stage != Stage::Unsent };
@@ -216,7 +216,7 @@ impl<T: Send + 'static> Pending<T> {
         Poll::Ready(answered)
     }
 
-    /// Whether it has left, or has ended after that.
+    /// Whether the request has been sent, also if the call has ended since.
     pub(crate) const fn was_sent(&self) -> bool {
         matches!(self.stage, Stage::Sent(_) | Stage::Over { was_sent: true })
     }

@@ -28,7 +28,7 @@ use crate::sys::stream::{Received, Wait};
 pub(super) const PAUSE: Duration = Duration::from_millis(20);
 
 thread_local! {
-    /// What a caller reads into. A caller that reads runs no handlers, so one is in use at a time in a thread.
+    /// The buffer that a caller reads into. A caller that reads runs no handlers, so a thread uses one at a time.
     static READ_BUFFER: std::cell::RefCell<Vec<u8>> = const { std::cell::RefCell::new(Vec::new()) };
 }
 
@@ -165,7 +165,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
                 continue;
             }
-            // A thread that reads is woken by what comes alone, so one that may be told to give up looks now and then.
+            // Only arriving bytes wake a thread that reads, so a call with a canceller looks at it now and then.
             let until = if canceller.is_some() { deadline.min(now + PAUSE) } else { deadline };
             token = token.or_else(|| self.links.read_by(now, link, &mut state, Cause::Wants));
             if let Some(token) = token {
@@ -221,7 +221,7 @@ impl<T: Send + 'static> Engine<T> {
     ) -> (Locked<'l, LinkState>, Instant) {
         READ_BUFFER.with_borrow_mut(|buffer| {
             if buffer.is_empty() {
-                // Zeros of the system, none of which is touched before something is read.
+                // Zeroed pages of the system, which cost nothing before something is read.
                 *buffer = vec![0; READ_BYTES];
             }
             loop {
@@ -289,7 +289,7 @@ impl<T: Send + 'static> Engine<T> {
         mut state: Locked<'_, LinkState>,
         token: Token,
     ) {
-        // A task reads nothing itself: it would wait until the clock gives the link to the pool.
+        // Not while a task waits for a reply: no thread reads a kept link until the clock gives it to the pool.
         let may_keep = state.session.is_live() && !state.is_paused() && !state.has_task() && !self.is_stopping();
         let waiter = state.next_reader();
         self.links.read_by(now, link, &mut state, Cause::Replied { token, asked, may_keep, waiter });
@@ -297,7 +297,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     #[expect(clippy::too_many_arguments, reason = "those of a request, and where and when it is made")]
-    /// A request on a link, with more slots for calls if all of those are taken that it has.
+    /// A request on a link. If all of the link's slots for calls are taken, it gets more.
     pub(super) fn request_on(
         &self,
         now: Instant,
@@ -316,7 +316,7 @@ impl<T: Send + 'static> Engine<T> {
             drop(state.session.lend_calls(filled(most, None)));
             outcome = self.with(link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
         }
-        // An operator's is not the program's to ask after.
+        // Only the program asks later what became of a call, and only of its own.
         if let Ok(id) = outcome
             && !options.operator
             && state.session.last_order().is_some_and(|(_, order)| order == id)
@@ -394,7 +394,7 @@ fn outline(result: &Result<CallId, CallError>) -> Result<(), Error> {
     result.as_ref().map(drop).map_err(|error| error.error)
 }
 
-/// After what time a request that failed so may succeed; after `pause` where only the end of another call makes room.
+/// When a request that failed with this error may succeed: after `pause` if only the end of another call makes room.
 pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> {
     match *error {
         Error::TooSoon { wait } => Some(wait),

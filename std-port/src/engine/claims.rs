@@ -142,7 +142,7 @@ impl Claims {
         if identity.role() == Role::MUnit {
             if file.is_none() {
                 tracing::info!("no folder of state is set (CARA_STATE): the claim of this manager is not stored");
-                // By the clock it is above that of its last start, mostly; otherwise vehicles fence it until it raises its claim.
+                // The clock usually makes it higher than at the last start; if not, vehicles fence it until it raises its claim.
                 let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
                 kept.own.term = since.map_or(0, |since| since.as_secs());
             }

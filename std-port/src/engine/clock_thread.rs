@@ -50,7 +50,7 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Whether none is left.
+    /// Takes some datagrams of a socket. Whether none is left.
     pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) -> bool {
         for _ in 0..BATCH {
             let Some((count, from)) = self.sockets.datagrams.receive(socket, buffer) else { return true };
@@ -101,7 +101,7 @@ impl<T: Send + 'static> Engine<T> {
             match listener.accept() {
                 Accepted::Stream(stream, address) => {
                     if self.sockets.shortens(address.ip()) {
-                        // The one that it was meant for is there.
+                        // The limit was set for this connection alone.
                         listener.limit_segments(false);
                     }
                     self.accepted(stream, address);
@@ -137,7 +137,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
                 self.settle(&link, state);
             }
-            // Its tag is of the keys before.
+            // Its tag was made with the previous keys.
             if self.hub.lock().identity().0.role() == Role::MUnit && claim != Claim::NONE {
                 self.announce_claim(claim);
             }

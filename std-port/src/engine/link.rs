@@ -40,7 +40,7 @@ impl Port for Linux {
     type Endpoint = SocketAddr;
 }
 
-/// Calls that leave no room for more hold up what follows them for so long after the last one has ended.
+/// How long calls that use all slots hold up the bytes behind them after the last one has ended.
 const STALLED: Duration = Duration::from_millis(20);
 
 /// Bytes of sealed frames that wait for a stream at a time: three messages of 20,000 characters go out with one system
@@ -230,14 +230,14 @@ impl LinkCell {
 }
 
 impl LinkState {
-    /// What was read cannot be looked at yet: nothing more is read meanwhile, so that the peer feels it.
+    /// Bytes that were read cannot be processed yet, so nothing more is read, and TCP slows the peer down.
     pub(crate) fn is_paused(&self) -> bool {
         self.backlog.is_waiting()
     }
 
-    /// Whether to look no further at what was read, because the calls that wait leave no room for more: they run, and
-    /// what follows stays where it is, so that the peer feels it. Replies may be among what follows, so it is looked at
-    /// where a call waits for one, and requests that find no room are refused.
+    /// Whether to stop processing what was read, because waiting calls use all slots: the bytes behind them stay unread, and
+    /// TCP slows the peer down. Not while a call of this unit waits: its reply may be among these bytes, so they are
+    /// processed, and requests without a slot are refused.
     pub(crate) fn holds_back(&self) -> bool {
         self.waiters.is_empty() && self.session.is_live() && !self.session.has_call_room()
     }
@@ -360,12 +360,12 @@ impl Backlog {
         self.position < self.bytes.len()
     }
 
-    /// The calls that leave no room do not get on: what follows them is to be looked at.
+    /// The calls that use all slots make no progress: the bytes behind them are to be processed.
     pub(crate) fn is_stalled(&self, now: Instant) -> bool {
         self.is_waiting() && now >= self.moved_at + STALLED
     }
 
-    /// Calls get on, or have just been found not to.
+    /// A call has ended, or the calls have just been found to make no progress.
     pub(crate) fn moved(&mut self, now: Instant) {
         self.moved_at = now;
     }

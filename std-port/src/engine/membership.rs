@@ -28,9 +28,9 @@ use crate::sys::limits;
 use crate::sys::stream::Stream;
 use crate::threads::DATAGRAM;
 
-/// Descriptors that links which have proven nothing leave to those that do, and to the control socket.
+/// Descriptors that are reserved for proven links and the control socket.
 const KEPT_FOR_PROVEN: u64 = 24;
-/// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
+/// Of these, the ones that only the control socket, key files and dialling use: two for each operator's connection, and some more.
 const KEPT_FOR_OPERATOR: u64 = 20;
 
 /// The node that a link is dialled for, as far as it is known.
@@ -75,7 +75,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn accepted(&self, stream: Stream, address: SocketAddr) {
         let mut stream = stream;
         if limits::left_above(&stream) < KEPT_FOR_PROVEN && self.make_room() {
-            // Into the place that is free now: the next connection would get it, and not be seen to be one too many.
+            // Moved to the descriptor that is free now, so that the number of the next one shows when too many are open.
             stream = stream.with_lowest_number();
         }
         if limits::left_above(&stream) < KEPT_FOR_OPERATOR {
@@ -346,7 +346,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn tell_interval_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
-        // Read under the lock of the link: of two threads the last one tells what holds.
+        // Read under the lock of the link, so that of two threads the later one sends the newest interval.
         let reported = self.on_link(link, |session, cx| match peer.streams.interval(&watched.name) {
             Some(interval) => session.subscribe(cx, &watched.name, interval).map(drop),
             None => {
@@ -386,7 +386,7 @@ impl<T: Send + 'static> Engine<T> {
         // Before the node's lock: a thread that reads a new key file keeps the ring to itself meanwhile.
         let codes = self.keys().codes();
         if self.hub.lock().hub.node.searches_at() <= self.now() {
-            // What others have asked and answered may lie unread for as long as this thread was busy with other units.
+            // Discovery datagrams may lie unread for as long as this thread was busy with other units.
             let mut buffer = [0; DATAGRAM];
             let emptied = [Socket::Shared, Socket::Own].map(|socket| self.datagrams_ready(socket, &mut buffer));
             if emptied != [true; 2] {

@@ -260,7 +260,7 @@ impl<T: Send + 'static> Engine<T> {
             let Handler { run, actuator, .. } = functions.function(call.slot).ok_or(Error::StaleFunction)?.handler;
             (run.clone(), actuator.clone())
         };
-        // What stops or resets waits as well: the hook of what it has stopped comes first, unless that takes long.
+        // A stop or reset waits too: the hooks of what it has stopped run first, unless they take long.
         let is_safe = actuator.as_ref().is_none_or(|actuator| actuator.safe.has_run());
         let moved = actuator.zip(call.order);
         if let Some((actuator, _)) = &moved {

@@ -28,7 +28,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn settle_at<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, mut guard: Locked<'l, LinkState>) {
         let state = &mut *guard;
         self.dispatch_emergencies(link, state);
-        // Before the poll, which looks for values: one that is published meanwhile finds either the note or the poll.
+        // Before the poll, which looks for values: so a value that is published meanwhile is noticed by one of the two.
         link.note_subscriptions(state.session.subscriptions() > 0);
         let mut deadline = state.session.deadline();
         if deadline <= now {
@@ -37,7 +37,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         if !state.details.progress.is_empty() {
             for (ticket, values) in std::mem::take(&mut state.details.progress) {
-                // What is wrong with it was told when it was new.
+                // Its errors were returned to the handler when it was new.
                 let _ = self.send_progress(now, link, state, ticket, &values);
             }
             deadline = state.session.deadline();

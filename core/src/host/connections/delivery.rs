@@ -1,6 +1,6 @@
 //! Whether what this end writes into the stream reaches the peer.
 //!
-//! The peer tells with each keep-alive how much of the stream has reached it. So each direction has its own proof, made by the
+//! The peer reports with each keep-alive how much of the stream has reached it. So each direction has a proof of its own, made by the
 //! program at the other end: the peer's TCP, or a relay between the two, may acknowledge what never arrives, and bytes that
 //! come say nothing of those that go.
 
@@ -10,7 +10,7 @@ use crate::time::{Duration, Instant};
 /// Reports without progress before the stream counts as dead, however much time has passed: after a suspension the first one may
 /// be as old as that.
 const STALE_REPORTS: u8 = 3;
-/// A look that comes so much too early counts: it is due with a keep-alive, for which the unit wakes up anyway.
+/// A check may come early by this much, since it is made with a keep-alive, for which the unit wakes up anyway.
 const SLACK: Duration = Duration::from_millis(100);
 
 /// What a unit tells of the stream and the datagrams of its peer.
@@ -68,8 +68,8 @@ impl Delivery {
         Probe { write: core::mem::replace(&mut self.sent, sent) == sent, ask }
     }
 
-    /// The peer told how much has come, when so much was `sent`, and something came from there at `heard` last, on a path that may be
-    /// `lossy`. When the stream is dead: how many bytes are missing there.
+    /// The peer reported how many bytes have arrived. `sent` bytes were written by then, something last came in the stream at
+    /// `heard`, and `lossy` says whether the path loses datagrams. If the stream is dead: how many bytes are missing there.
     pub(super) fn reported(
         &mut self,
         now: Instant,
@@ -80,12 +80,12 @@ impl Delivery {
     ) -> Option<u32> {
         let stands = core::mem::replace(&mut self.received, report.received) == report.received;
         self.last_report = now;
-        // More than was sent is a lie, and means nothing.
+        // The peer cannot have received more than was sent: such a report is ignored.
         let missing = u32::try_from(sent.wrapping_sub(report.received) as i32).unwrap_or(0);
         match self.stuck_since.filter(|_| stands && !report.holds && missing > 0) {
             Some(since) => {
                 self.stale = self.stale.saturating_add(1);
-                // Progress of the other direction counts as well, but not for ever: long packets may vanish in this one alone.
+                // Progress of the other direction delays this, but not for ever: long packets may get lost in this direction alone.
                 let is_dead = match lossy {
                     false => now >= since + ONE_WAY_DEAD || now >= since.max(heard) + STREAM_DEAD,
                     true => now >= since + LOSSY_DEAD,

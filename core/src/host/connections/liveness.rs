@@ -1,4 +1,4 @@
-//! Whether the peer is still there, and by which ways: the stream and its datagrams each have signs of life of their own.
+//! Whether the peer is still there, and over which path: the stream and the datagrams have separate signs of life.
 
 use super::delivery::{Delivery, Report, is_long};
 use crate::config::{LONGEST_KEEP_ALIVE, MISSED_KEEP_ALIVES, SHORTEST_KEEP_ALIVE, STREAM_ONLY_LOSS};
@@ -16,7 +16,7 @@ const LOSSY: Duration = Duration::from_secs(60);
 /// A peer that has missed a keep-alive is pinged repeatedly until something of it arrives: a live peer is heard despite
 /// lost frames, and a dead one is detected no later. While keep-alives arrive, no pings are sent.
 ///
-/// Datagrams may not pass at all: after three keep-alives without one the link does without them. Of the stream the peer tells
+/// Datagrams may not pass at all: after three keep-alives without one the link does without them. For the stream, the peer reports
 /// how much of it arrives ([`Report`]).
 ///
 /// At most one keep-alive counts as missed per poll, so that a suspended host or a jumped clock ends nothing by itself.
@@ -115,7 +115,7 @@ impl Liveness {
         !core::mem::replace(&mut self.hears, true)
     }
 
-    /// The peer told what it receives, when `sent` bytes had been written into the stream. When the stream is dead: whether more
+    /// The peer reported what it receives, when `sent` bytes had been written into the stream. If the stream is dead: whether more
     /// than one segment is missing there.
     pub(crate) fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<bool> {
         self.is_heard = report.hears;
@@ -183,7 +183,7 @@ impl Liveness {
         let probe = self.delivery.poll(now, sent);
         ask |= self.hears && probe.ask;
         self.note_due();
-        // Datagrams may have ceased to pass while the stream goes on: it is asked as well, once for each miss.
+        // Perhaps only datagrams have ceased to pass: so the peer is pinged in the stream as well, once for each miss.
         let probe = !lost && (silent || missed_datagram || probe.write);
         Look { missed: silent || missed_datagram, ask, probe, deaf, lost }
     }

@@ -116,7 +116,7 @@ pub struct Link<S: Storage, C: Seal> {
 }
 
 impl<S: Storage, C: Seal> Link<S, C> {
-    /// A link; `small` is its own buffer of [`crate::config::LINK_BUFFER_BYTES`], the limits are what this unit told.
+    /// A link; `small` is its own buffer of [`crate::config::LINK_BUFFER_BYTES`], the limits are those that this unit advertises.
     pub fn new(id: LinkId, cipher: C, small: S::Slice<u8>, chunk_limit: usize, message_limit: usize) -> Self {
         let overhead = cipher.overhead();
         Self {
@@ -144,7 +144,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.receiver.set_chunk_limit(limit);
     }
 
-    /// Sets the longest chunk that the peer takes, as its hello told.
+    /// Sets the longest chunk that the peer accepts, from its hello.
     pub(crate) fn set_peer_limits(&mut self, chunk: usize) {
         self.sender.set_chunk(chunk.max(MINIMUM_CHUNK_BYTES));
     }
