@@ -50,7 +50,7 @@ impl<T> fmt::Debug for Served<T> {
 }
 
 impl<T> Served<T> {
-    /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
+    /// Runs `change` unless the order of the call has ended; always if the service has no lease.
     pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
         match &self.lease {
             Some(lease) => lease.commit(change),
@@ -58,7 +58,7 @@ impl<T> Served<T> {
         }
     }
 
-    /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
+    /// Completes when what the call started may no longer continue, for whatever reason; never for a service without a lease.
     /// Cancelling loses nothing.
     pub async fn lease_ended(&self) {
         self.unit.lease_ended(self.lease).await;
@@ -227,9 +227,9 @@ impl<T> ServiceOptions<T> {
         self
     }
 
-    /// Before the handler runs, whichever order holds this lease ends, and its hook runs before any other work; none begins
-    /// until it is reset, and none that was asked for before, ever. The stop of this unit, not a substitute for an emergency
-    /// stop that is certified.
+    /// Before the handler runs, the order that holds this lease ends, whichever caller has it, and its hook runs before any
+    /// other work. No order begins until a reset, and none that was asked for before the stop ever does. Not a substitute for
+    /// a certified emergency stop.
     pub const fn stops(mut self, lease: &'static Lease) -> Self {
         self.lease = Some(lease);
         self.stops_all()

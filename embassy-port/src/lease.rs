@@ -32,7 +32,7 @@ impl LeaseWatch {
         lease.zip(call.order).map(|(lease, order)| Self { lease, order })
     }
 
-    /// Does what the call wants to change, or nothing once its order has ended.
+    /// Runs `change` while the order lives, and nothing once it has ended.
     pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
         if self.is_live() { Ok(change()) } else { Err(Ended) }
     }

@@ -187,7 +187,7 @@ impl<T> Handle<T> {
 }
 
 impl<T> TakenCall<T> {
-    /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
+    /// Completes when what the call started may no longer continue, for whatever reason; never for a service without a lease.
     /// Cancelling loses nothing.
     pub async fn lease_ended(&self) {
         self.unit.lease_ended(self.lease).await;

@@ -62,8 +62,8 @@ impl Actuator {
         LeaseWatch::new(self.lease.clone(), self.clock)
     }
 
-    /// What it moves takes so long to stand still: an order that ends before it is finished is
-    /// [stopping](LeaseWatch::stage) for so long, and no other one begins meanwhile (`Busy`). At most a minute.
+    /// How long what it moves takes to stand still: an order that ends unfinished is [stopping](LeaseWatch::stage) for this
+    /// time, and no other one begins meanwhile (`Busy`). At most a minute.
     #[must_use]
     pub fn ramp(self, span: impl Into<cara_core::time::Duration>) -> Self {
         self.word().set_ramp(span.into());

@@ -242,8 +242,8 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     /// Passes on a stream of a node to this unit's other nodes, as a stream of its own called `node/stream`, until the returned
-    /// guard is dropped: however many read it, the node's link has one subscription, at least `interval` apart. Ages go
-    /// on: a value is as old there as it is here, and more. It is seen once this unit's list is
+    /// guard is dropped: however many read it, the node's link has one subscription, at least `interval` apart. Ages
+    /// count from when the value was made, passing on included. It is seen once this unit's list is
     /// [published](Self::publish_my_function_list). The errors are those of [`Peer::stream`] and
     /// [`MyFunctionList::add_stream`](crate::MyFunctionList::add_stream), and [`Error::BadName`] where the name is too long.
     ///

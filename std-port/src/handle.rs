@@ -217,8 +217,8 @@ impl<T: Send + 'static, R> Handle<T, R> {
     ///
     /// An m_unit first asks for its own identity and waits 300 ms: [`StartError::AlreadyRunning`] where a live m_unit answers.
     /// One that is stopped (`SIGSTOP`) or hangs does not answer; on this host it holds its control socket, which is
-    /// [`StartError::SocketHeld`]. From one on another host, or without a socket, the links go to this one. One that is to
-    /// [take over](crate::Builder::take_over) starts all the same.
+    /// [`StartError::SocketHeld`]. If it is on another host, or has no socket, this one starts and gets its links. An m_unit
+    /// that is to [take over](crate::Builder::take_over) starts in any case.
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), StartError> {
         #[cfg(not(feature = "control"))]

@@ -44,7 +44,7 @@ pub struct Served {
 }
 
 impl Served {
-    /// Does what the call wants to change, unless its order has ended; always for a service without a lease. See
+    /// Runs `change` unless the order of the call has ended; always if the service has no lease. See
     /// [`LeaseWatch::commit`].
     ///
     /// ```
@@ -79,9 +79,9 @@ impl Served {
         error
     }
 
-    /// Tells the caller how far the call is, if it wants to know and the signature says `progress (…)`. It waits for nothing: of
-    /// values that cannot be sent at once the newest ones are, and none behind the answer. An error where they do not fit the
-    /// signature.
+    /// Tells the caller how far the call is, if it wants to know and the signature says `progress (…)`. It does not wait: of
+    /// values that cannot be sent at once only the newest are kept, and none is sent after the answer. An error if they do not
+    /// fit the signature.
     ///
     /// ```
     /// # use cara_std::{Served, Parameters, ParametersView, ServiceError};
@@ -108,7 +108,7 @@ impl Served {
         self.serving.is_cancelled()
     }
 
-    /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
+    /// Completes when what the call started may no longer continue, for whatever reason; never for a service without a lease.
     /// [`LeaseWatch::wait_until_ended`] is the form that blocks.
     pub fn lease_ended(&self) -> LeaseEnded {
         LeaseEnded { watch: self.lease.clone() }
@@ -315,8 +315,8 @@ impl<T> ServiceOptions<T> {
         self
     }
 
-    /// Before the handler runs, whichever order moves this ends and its hook starts; none begins until it is reset, and none that
-    /// was asked for before, ever. The stop of this unit, not a substitute for an emergency stop that is certified.
+    /// Before the handler runs, the order that moves this ends and its hook starts, whichever caller has it. No order begins until a
+    /// reset, and none that was asked for before the stop ever does. Not a substitute for a certified emergency stop.
     pub fn stops(mut self, actuator: &Actuator) -> Self {
         self.actuator = Some(actuator.clone());
         self.stops_all()

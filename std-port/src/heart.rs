@@ -13,10 +13,10 @@ use crate::locks::lock;
 /// Words of hearts that are not in use. A session may look at one at any time, so they are never freed.
 static FREE: Mutex<Vec<&'static heart::Heart>> = Mutex::new(Vec::new());
 
-/// Shows that one loop of the program runs: [`Handle::heart`](crate::Handle::heart). What names it goes on only while the
-/// loop beats it, and ends at once when it is dropped.
+/// Shows that one loop of the program runs: [`Handle::heart`](crate::Handle::heart). Orders that name it are renewed only
+/// while the loop beats it, and end at once when it is dropped.
 ///
-/// It belongs to one loop and can't be cloned: a beat of another one would hide that this one hangs.
+/// It belongs to one loop and can't be cloned: a beat of another loop would hide that this one hangs.
 ///
 /// ```no_run
 /// use cara_std::{Duration, Parameters};
@@ -79,7 +79,7 @@ impl Drop for Heart {
     }
 }
 
-/// What a call has started goes on as long as this is kept, if its caller is alive: [`Call::hold`](crate::Call::hold).
+/// Dropping this guard stops what the call has started: [`Call::hold`](crate::Call::hold).
 #[must_use = "dropped, it is released at once"]
 pub struct Hold<T: Send + 'static = ()> {
     pub(crate) engine: Arc<Engine<T>>,
@@ -87,8 +87,8 @@ pub struct Hold<T: Send + 'static = ()> {
 }
 
 impl<T: Send + 'static> Hold<T> {
-    /// Whether it is renewed: no longer when it has ended there, which [`UnitEvent::LeaseEnded`](crate::UnitEvent::LeaseEnded)
-    /// tells as well.
+    /// Whether the call's order is still held. Not once the node has ended it, which
+    /// [`UnitEvent::LeaseEnded`](crate::UnitEvent::LeaseEnded) reports too.
     pub fn is_held(&self) -> bool {
         self.call.link.lock().session.holds(self.call.id)
     }

@@ -84,7 +84,7 @@ impl LeaseWatch {
         }
     }
 
-    /// What a loop may do that moves what cannot stand still at once. The [ramp](crate::Actuator::ramp) is part of the
+    /// What the loop of a vehicle that cannot stand still at once may do now. The [ramp](crate::Actuator::ramp) is part of the
     /// bound: a vehicle stands at the latest a lease, a ramp and a turn of this loop after its manager's last sign.
     ///
     /// ```no_run
@@ -117,8 +117,8 @@ impl LeaseWatch {
         if self.is_live() { self.service.lease.left(self.clock.now()) } else { None }
     }
 
-    /// Does what the order wants, or nothing once it has ended: neither its end nor its safe hook comes in between, and
-    /// both wait for it. So `change` must be short, and ask nothing of the unit.
+    /// Runs `change` while the order lives, and nothing once it has ended. The order's end and its safe hook wait for
+    /// `change`, so it must be short, and ask nothing of the unit.
     pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
         match &self.order {
             Some((order, safe)) => safe.commit(*order, change),

@@ -45,9 +45,9 @@ const UNIT_SHIFT: u32 = 48;
 /// Threads that several units of one process share: at most 18, however many units there are. Each safe hook and each
 /// emergency service has one of its own besides.
 ///
-/// For processes with many s_units, such as simulations of a fleet and gateways. They share fate as well: a handler
-/// runs on a thread of all, and where 14 handlers wait, calls of all units wait. Units whose handlers call each other
-/// need threads of their own, which is what a unit has unless it is given these.
+/// For processes with many s_units, such as simulations of a fleet and gateways. The units also share a limit: if 14
+/// handlers wait, calls of all units wait. Units whose handlers call each other need threads of their own, which is what
+/// a unit has unless it is given these.
 ///
 /// ```no_run
 /// use cara_std::{Threads, Unit};
