@@ -39,6 +39,19 @@ use crate::taken::TakenCall;
 ///         Ok(())
 ///     }
 /// }
+///
+/// /// What the task does with the call that it has found in `docking`.
+/// async fn follow(call: TypedTaken<Agv, Left, ()>) {
+///     while !call.is_cancelled() {
+///         let left = metres_left().await;
+///         if left == 0.0 {
+///             return call.finish(&()).await;
+///         }
+///         // An error if values come faster than every 10 ms: this one is skipped.
+///         let _ = call.progress(&Left { left });
+///     }
+/// }
+/// # async fn metres_left() -> f32 { 0.0 }
 /// ```
 pub trait LongCall<P: Variables, F: Variables = ()>: TypedCall<P, F> {
     /// The state of the unit.
