@@ -109,8 +109,8 @@ impl<P: Port> Node<P> {
         self.answers.single.last().map(|answer| (&answer.who, answer.to))
     }
 
-    /// An s_unit that looks for no manager looks at the network. There is no key of it and this unit: in secured mode it
-    /// gets the answer of a broadcast, which the fleet's code alone is for.
+    /// An s_unit that looks for no manager surveys the network. This unit shares no pair key with it, so in secured mode the
+    /// reply is like a broadcast: authenticated with the fleet's key only.
     pub(super) fn answer_survey(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas, mode: Mode) {
         let delay = self.spread(who_has.expected);
         self.answer_unpaired(now + delay, from, who_has, mode);
