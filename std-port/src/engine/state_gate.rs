@@ -51,7 +51,7 @@ struct Gate<W> {
     holder: Option<Holder>,
     /// The holder waits for a reply of each of these peers.
     waits_for: Vec<LinkId>,
-    /// So many have held it until now: tells the waits of one holder from those of a later one.
+    /// How many have held the state until now: distinguishes the waits of one holder from those of a later one.
     held: u64,
     /// Those that wait, in their order.
     queue: VecDeque<Waiting<W>>,
@@ -72,7 +72,7 @@ enum Holder {
     Here(ThreadId),
 }
 
-/// That the holder waits for a peer.
+/// A mark that the holder of the state waits for a peer.
 #[derive(Debug)]
 pub(crate) struct Mark {
     peer: LinkId,
@@ -268,7 +268,7 @@ impl<T, W> StateGate<T, W> {
         if HOLDING.with(Cell::get) == 0 {
             return wait();
         }
-        // However the wait ends: a mark that stays would refuse that peer's later calls.
+        // Removed however the wait ends: a mark that stays would refuse that peer's later calls.
         struct Marked<'g, T, W>(&'g StateGate<T, W>, Option<Mark>);
         impl<T, W> Drop for Marked<'_, T, W> {
             fn drop(&mut self) {

@@ -17,9 +17,9 @@ use crate::locks::lock;
 
 /// A stream of this unit.
 pub(crate) struct OwnStream {
-    /// Without a rank: the link that sends a value takes buffers of the pool meanwhile, and nothing that holds those comes here.
+    /// No lock rank: the link that sends a value takes buffers of the pool meanwhile, but no holder of buffers locks this.
     newest: Mutex<Newest<Box<[u8]>>>,
-    /// In one order with the notes of the links that they have subscriptions.
+    /// Sequentially consistent with the links' subscription flags: of a new value and a new subscription one sees the other.
     version: AtomicU32,
 }
 
@@ -63,11 +63,11 @@ struct WatchedState {
     newest: Option<Received>,
     /// Values that have come.
     count: u64,
-    /// So many had come when the newest one was passed on.
+    /// The count of values when the newest one was passed on.
     passed: u64,
     refused: Option<Error>,
     relays: Vec<Weak<OwnStream>>,
-    /// Of the tasks that wait, each with the number of its handle.
+    /// Wakers of the tasks that wait, each with the number of its handle.
     tasks: Vec<(u64, Waker)>,
 }
 
@@ -132,7 +132,7 @@ impl Watched {
         let earlier =
             state.tasks.iter().position(|(known, _)| *known == id).map(|index| state.tasks.swap_remove(index));
         state.tasks.push((id, waker.clone()));
-        // A waker that is dropped may end a task, whose subscription is dropped then.
+        // Dropped without the lock: a dropped waker may end a task, and with it a subscription.
         drop(state);
         drop(earlier);
         None
@@ -203,7 +203,7 @@ impl Watched {
         };
         let Some(newest) = newest else { return false };
         let passed = relays.iter().filter_map(Weak::upgrade).map(|own| {
-            // A value that has become longer than declared comes under another signature, which the relay does not have.
+            // A value that is longer than declared here belongs to another signature, which the relay does not have.
             own.put(|own| own.pass_on(now, newest.age_at(now), &newest.block))
         });
         passed.filter(Result::is_ok).count() > 0

@@ -84,7 +84,7 @@ pub(super) struct Task {
     /// What is answered once it does not.
     result: Result<Box<ParametersView>, Error>,
     given_up: Option<Arc<GivenUp>>,
-    /// It is told that its call is given up, and not dropped.
+    /// The handler is notified that its call is given up, instead of being dropped.
     to_its_end: bool,
     lease: LeaseEnded,
     alarm: Alarm,
@@ -211,7 +211,7 @@ impl Future for Task {
 impl Drop for Task {
     fn drop(&mut self) {
         if !self.answered {
-            // What it holds may be what the call's order is to find free.
+            // The handler's future may hold what the order's end needs, so it is dropped first.
             let _ = catch_unwind(AssertUnwindSafe(|| self.work = None));
             let _ = self.answer(None);
         }

@@ -17,7 +17,7 @@ use crate::locks::lock;
 /// A start, and a manager's restart, take less: by then four searches at least have gone out, since the pauses before them are
 /// twice 0.25, 0.5, 1 and 2 s at most, and a dial that nothing answers has been given up, after 2 s.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// How often it is looked at from then on.
+/// How often the reason is checked from then on.
 const LOOK: Duration = Duration::from_secs(3);
 /// What happened longer ago is no reason: two dials are at most 16 s apart, and each takes 2 s.
 const FRESH: Duration = Duration::from_secs(30);
@@ -104,7 +104,7 @@ impl Unjoined {
         let failed = state.failed.as_ref().filter(|(at, _)| *at + FRESH > now).map(|(_, text)| text.clone());
         // The first of several others stays: they are heard by turns, and the reason is the same.
         state.other = state.other.take().or(other);
-        // Who else is heard is no reason of its own: a doctor that listens here would make a new one.
+        // Other units that are heard are no reason of their own: a doctor that listens here would count as one.
         let reason = failed.or(heard);
         if state.warned.as_ref() != Some(&reason) {
             let silence = || silence(discovery_port, before, counted, state.other.as_ref());

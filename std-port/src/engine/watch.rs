@@ -15,7 +15,7 @@ const MOST_STAYING: usize = 4;
 /// The clock's list of links. It looks as long as something happens that may need it, and need not be told of each call.
 #[derive(Debug)]
 pub(super) struct Watch {
-    /// Something has happened since it last looked.
+    /// Something has happened since the clock last looked.
     used: AtomicBool,
     looking: AtomicBool,
     /// Tokens of the links, as the epoll set has them.
@@ -67,7 +67,7 @@ impl Watch {
     /// Looks at each link; `stays` tells whether it remains on the list. Whether the clock is to come back: if not,
     /// whatever happens next tells it to.
     pub(super) fn look(&self, mut stays: impl FnMut(u64) -> bool) -> bool {
-        // Both before the list is read: a link that is put there from here on tells the clock.
+        // Both before the list is read: a link that is added after this wakes the clock itself.
         self.looking.store(false, Ordering::SeqCst);
         let used = self.used.swap(false, Ordering::SeqCst);
         let mut links = std::mem::take(&mut *self.links.lock().unwrap_or_else(PoisonError::into_inner));

@@ -1,6 +1,6 @@
 //! What a thread of the pool does for a unit: it reads the link that is ready, and runs the calls that it read.
 //!
-//! There is always a thread that reads, or comes back to: one that is about to run a handler starts another if none is
+//! There is always a thread that reads, or is about to: one that is about to run a handler starts another if none is
 //! idle, up to a limit; beyond it calls wait in their sessions until a handler returns. Before a handler that has been
 //! quick it starts none: the clock does, should it take long after all.
 //!
@@ -93,12 +93,12 @@ impl<T: Send + 'static> Engine<T> {
                     return call;
                 }
             };
-            // Where no other thread goes on reading, the call waits in the session: most of what is read is none.
+            // If no other thread can take over reading, leave the call queued in the session. Most reads carry no call.
             let at_once = call.is_none() && self.may_run_at_once(state.reading.is_quick());
             let arguments = if at_once { Some(&mut *worker.arguments) } else { None };
             let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
             call = call.or(self.feed(self.now(), link, state, bytes, arguments, None));
-            // A short read has emptied the stream; a hang-up shows in one more.
+            // A short read has emptied the stream. After a hang-up one more read returns the end of the stream.
             if state.is_paused() || (count < READ_BYTES && !hung_up) {
                 return call;
             }
