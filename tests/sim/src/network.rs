@@ -43,6 +43,7 @@ pub struct Network {
     calm: Path,
     fault_profile: Option<(u32, Path)>,
     paths: BTreeMap<(HostId, HostId), (u32, Path)>,
+    /// Of each cable to each other one.
     wires: BTreeMap<(HostId, HostId), Wire>,
     partitions: Vec<Partition>,
     frozen: Vec<Freezing>,
@@ -62,6 +63,8 @@ struct Host {
     running: bool,
     /// Its cable is in.
     plugged: bool,
+    /// The host whose cable it has: its own, unless it shares one.
+    cable: HostId,
     /// Counts crashes, so that timers of an earlier life do not go off in a later one.
     life: u32,
     /// Until then it neither sees nor does anything.
@@ -80,7 +83,7 @@ struct Host {
     trace: Trace,
 }
 
-/// The bandwidth of one direction between two hosts, shared by everything that goes there.
+/// The bandwidth of one direction between two cables, shared by everything that goes there.
 #[derive(Debug, Default)]
 struct Wire {
     free_at: Instant,
@@ -328,8 +331,8 @@ impl Network {
             return self.now;
         }
         self.counts.count(Fault::Bandwidth);
-        let now = self.now;
-        let wire = self.wires.entry((from, to)).or_default();
+        let (now, cables) = (self.now, (self.host(from).cable, self.host(to).cable));
+        let wire = self.wires.entry(cables).or_default();
         if wire.free_at < now {
             *wire = Wire { free_at: now, carry: 0 };
         }

@@ -129,15 +129,37 @@ fn an_m_unit_meets_the_m_units_that_it_has_chosen(world: &mut dyn World) {
     assert_eq!(world.ask(&a, "b", "note", &mut number("n", 1)), Ok(()));
 }
 
+/// The paper's figure 2: three m_units that know each other, and five s_units that know one of them each.
 fn an_m_unit_has_m_units_and_s_units(world: &mut dyn World) {
     let service = Service::numbered("note");
-    let manager = world.add(Spec::manager("manager", 1));
-    world.add(Spec::manager("station", 2).service(&service));
-    let agv = world.add(Spec::agv("agv", 7).service(&service));
-    world.wait("it knows both", || manager.nodes_offering("note").len() == 2, secs(40));
-    world.wait("it is known", || !agv.peers().is_empty(), secs(10));
-    assert_eq!(manager.number_of_s_units(), 1);
-    assert_eq!(agv.peers(), [manager.identity()], "an s_unit has exactly one peer");
+    let m_units = [("one", 1), ("two", 2), ("station", 2)];
+    let managers = m_units.map(|(name, id)| world.add(Spec::manager(name, id).service(&service)));
+    let agvs = [0, 0, 1, 1, 2].into_iter().enumerate().map(|(number, own): (usize, usize)| {
+        let (name, id) = m_units[own];
+        let agv = Spec::agv(&format!("agv-{number}"), 10 + number as u32).joins(name, id);
+        (world.add(agv.service(&service)), own)
+    });
+    let agvs: Vec<_> = agvs.collect();
+    for (index, manager) in managers.iter().enumerate() {
+        let own = agvs.iter().filter(|(_, own)| *own == index).count();
+        world.wait(
+            "it knows two m_units and its s_units",
+            || manager.nodes_offering("note").len() == 2 + own,
+            secs(40),
+        );
+        assert_eq!(manager.number_of_s_units(), own);
+        assert_eq!(manager.peers().len(), 2 + own, "and nobody else");
+    }
+    for (agv, own) in &agvs {
+        world.wait("it is known", || !agv.peers().is_empty(), secs(10));
+        assert_eq!(agv.peers(), [managers[*own].identity()], "an s_unit has exactly one peer");
+    }
+    for manager in &managers {
+        for node in manager.nodes_offering("note") {
+            assert_eq!(world.ask(manager, node.name(), "note", &mut number("n", 1)), Ok(()));
+        }
+    }
+    assert_eq!(service.log().values().len(), 3 * 2 + 5);
 }
 
 fn an_agv_finds_its_manager_at_a_new_address(world: &mut dyn World) {

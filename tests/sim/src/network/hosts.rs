@@ -39,6 +39,7 @@ impl Network {
             power: true,
             running: true,
             plugged: true,
+            cable: id,
             life: 0,
             suspended: Instant::START,
             ahead: Duration::ZERO,

@@ -79,6 +79,14 @@ impl Network {
         self.set_path(other, one, path);
     }
 
+    /// These hosts share one cable, as behind one switch port or radio: what any of them sends to a host waits for what all of them
+    /// send there, and the other way round.
+    pub fn share_cable(&mut self, hosts: &[HostId]) {
+        let Some(&first) = hosts.first() else { return };
+        let cable = self.host(first).cable;
+        hosts.iter().for_each(|&host| self.host_mut(host).cable = cable);
+    }
+
     /// The quality of one directed path for `span`; then it is as all others.
     pub fn degrade(&mut self, from: HostId, to: HostId, path: Path, span: Duration) {
         self.set_path(from, to, path);

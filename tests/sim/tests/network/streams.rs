@@ -84,6 +84,27 @@ fn two_streams_share_the_bandwidth_of_their_path() {
 }
 
 #[test]
+fn hosts_of_one_cable_share_its_bandwidth() {
+    for (shared, expected) in [(false, 64), (true, 128)] {
+        let mut pair = Pair::open(1);
+        let third = pair.network.add_host();
+        let to = at_port(&pair.network, pair.right, PORT);
+        let second = pair.network.connect(third, to);
+        while pair.network.next_event().is_some() {}
+        if shared {
+            pair.network.share_cable(&[pair.left, third]);
+        }
+        pair.network.set_calm(Path::LAN.delay(Duration::ZERO).bits_per_second(1_000_000));
+        let start = pair.network.now();
+        for stream in [pair.dialled, second] {
+            assert_eq!(pair.network.write(stream, &[&message(8000)]), Ok(8000));
+        }
+        while pair.network.next_event().is_some() {}
+        assert_eq!(pair.network.now().since(start), millis(expected), "shared: {shared}");
+    }
+}
+
+#[test]
 fn a_datagram_waits_for_one_segment_and_not_for_the_whole_message() {
     let mut pair = Pair::open(1);
     pair.network.set_calm(Path::LAN.delay(Duration::ZERO).bits_per_second(1_000_000));

@@ -6,11 +6,13 @@ use crate::bad_input::references;
 use super::RULES;
 
 /// Where tests below a folder run; of several, the first one that fits.
-const FOLDERS: [(&str, &str); 11] = [
+const FOLDERS: [(&str, &str); 13] = [
     ("core/", "core"),
     ("std-port/", "Linux"),
     ("examples/linux/", "Linux"),
     ("examples/smoltcp/", "smoltcp"),
+    ("tests/experiments/bench/src/deadlines.rs", "simulator"),
+    ("tests/experiments/bench/src/experiments/simulated.rs", "simulator"),
     ("tests/experiments/bench/", "Linux"),
     ("tests/embassy/", "embassy"),
     ("tests/firmware/", "QEMU"),
