@@ -23,6 +23,9 @@ pub const STREAMS: bool = Streams::IS_ON;
 pub const DETAILS: bool = Details::IS_ON;
 /// Lists and records.
 pub const NESTED: bool = Nested::IS_ON;
+/// Calls that wait begin by their deadlines, and those that cannot make them can be refused. Where the build cannot, calls begin as
+/// they came, whatever the constraints say.
+pub const SCHEDULING: bool = cfg!(feature = "scheduling");
 /// Lines for people behind signatures.
 pub const HELP: bool = cfg!(feature = "help");
 

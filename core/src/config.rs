@@ -201,8 +201,8 @@ impl Constraints {
     };
 }
 
-/// Which of the calls that wait begins next. Calls that move, stop or reset something keep their order in both, and of equal
-/// time-outs the call that came first is first in both.
+/// Which of the calls that wait begins next. Calls that move, stop or reset something keep their order in each and are never refused
+/// for their deadlines, and of equal time-outs the call that came first is first in each.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Scheduling {
     /// The one with the earliest deadline, but one that has waited half its time-out before all others. Where no more calls may
@@ -211,17 +211,22 @@ pub enum Scheduling {
     EarliestDeadline,
     /// The one that came first. Where no more calls may wait, the one that comes is refused.
     Fifo,
+    /// As [`EarliestDeadline`](Self::EarliestDeadline), and a call is refused as [`Busy`](crate::error::Error::Busy), when it comes
+    /// or when its turn comes, if its function has lately taken longer on average than it has left. One a second begins all the
+    /// same, so that a function that was slow once is tried again. So more deadlines are met where more is asked than can be done.
+    Admission,
 }
 
 impl Scheduling {
-    /// Both.
-    pub const ALL: [Self; 2] = [Self::EarliestDeadline, Self::Fifo];
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::EarliestDeadline, Self::Fifo, Self::Admission];
 
-    /// As people and files write it: `deadline` or `fifo`.
+    /// As people and files write it: `deadline`, `fifo` or `admission`.
     pub const fn word(self) -> &'static str {
         match self {
             Self::EarliestDeadline => "deadline",
             Self::Fifo => "fifo",
+            Self::Admission => "admission",
         }
     }
 }

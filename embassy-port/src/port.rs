@@ -20,7 +20,6 @@ impl Port for Board {
     const MANAGES: bool = cfg!(feature = "manager");
     const CALLS: bool = cfg!(feature = "call");
     const DISCOVERS: bool = cfg!(feature = "discover");
-    const SCHEDULES: bool = cfg!(feature = "scheduling");
     const HAS_ACCESS: bool = cfg!(feature = "access");
     const RENEWS_KEYS: bool = cfg!(feature = "rekey");
     const TAKES_DATAGRAM_REQUESTS: bool = cfg!(feature = "datagram-requests");

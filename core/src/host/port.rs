@@ -20,8 +20,6 @@ pub trait Port: 'static {
     const CALLS: bool = true;
     /// Whether its units search, answer searches and dial what they find. Where they do not, each has a manager at a fixed address.
     const DISCOVERS: bool = true;
-    /// Whether calls that wait can begin by their deadlines. Where they cannot, they begin as they came, whatever the constraints say.
-    const SCHEDULES: bool = true;
     /// Whether an access table is asked. Where none is, a joined node may do everything.
     const HAS_ACCESS: bool = true;
     /// Whether a live link gets new keys. Where it does not, a link ends when its keys are worn, and is dialled again.

@@ -64,6 +64,13 @@ pub struct Ticket {
     id: u32,
 }
 
+#[cfg(test)]
+impl Ticket {
+    pub(crate) const fn of(index: u16, id: u32) -> Self {
+        Self { index, id }
+    }
+}
+
 /// Whether a call that runs has been given up by its caller.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Cancelled {

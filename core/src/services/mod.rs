@@ -193,6 +193,7 @@ pub mod lease;
 mod own_list;
 pub mod publications;
 pub mod requests;
+mod run_times;
 pub mod session;
 pub mod stream;
 pub mod typed;

@@ -4,6 +4,7 @@
 use crate::distribution::function_list::Slot;
 use crate::distribution::identity::Identity;
 use crate::error::{Error, Limit};
+use crate::services::run_times::RunTimes;
 use crate::storage::Storage;
 
 /// A function that one identity may see.
@@ -13,18 +14,20 @@ pub struct PublishedToOne {
     slot: Slot,
 }
 
-/// The unit's record of what it has published.
+/// What the unit knows of its functions beside their list: to whom it shows them, and how long they run.
 pub struct Publications<S: Storage> {
     to_all: S::Slice<bool>,
     to_one: S::Slice<Option<PublishedToOne>>,
     version: u32,
+    /// How long the unit's functions run.
+    pub(crate) run_times: RunTimes,
 }
 
 impl<S: Storage> Publications<S> {
     /// A record with one flag per function of the unit's list, and as many functions shown to single nodes as there are
     /// slots in `to_one`.
     pub fn new(to_all: S::Slice<bool>, to_one: S::Slice<Option<PublishedToOne>>) -> Self {
-        Self { to_all, to_one, version: 0 }
+        Self { to_all, to_one, version: 0, run_times: RunTimes::default() }
     }
 
     /// Shows a function to every node.

@@ -78,7 +78,7 @@ fn bad(name: &str, value: u64) -> Failure {
             cara_core::config::LONGEST_KEEP_ALIVE.as_micros()
         ),
         "calls_per_peer" => format!("it is 1 to {}", u16::MAX),
-        "scheduling" => "it is 0 for deadline or 1 for fifo".to_owned(),
+        "scheduling" => "it is 0 for deadline, 1 for fifo or 2 for admission".to_owned(),
         _ => "this unit cannot hold it".to_owned(),
     };
     Failure::configuration("BadConstraint", format!("{name} cannot be {value}: {bounds}"))

@@ -152,6 +152,7 @@ pub(super) const fn constraints(constraints: &Constraints) -> ConstraintsInfo {
         scheduling: match constraints.scheduling {
             Scheduling::EarliestDeadline => SchedulingInfo::Deadline,
             Scheduling::Fifo => SchedulingInfo::Fifo,
+            Scheduling::Admission => SchedulingInfo::Admission,
         },
     }
 }

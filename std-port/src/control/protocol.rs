@@ -470,6 +470,8 @@ pub enum SchedulingInfo {
     Deadline,
     /// The one that came first.
     Fifo,
+    /// The one with the earliest deadline, and those that cannot make theirs are refused.
+    Admission,
 }
 
 /// A node as the unit sees it.

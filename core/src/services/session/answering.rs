@@ -4,7 +4,7 @@ use super::details::DetailsPart;
 use super::granting::Granting;
 use super::permitting::{decide_call, log_refusal};
 use super::{Incoming, Phase, Session};
-use crate::ability::DETAILS;
+use crate::ability::{DETAILS, SCHEDULING};
 use crate::config::{Priority, Scheduling};
 use crate::distribution::block;
 use crate::distribution::failure::Failure;
@@ -102,6 +102,7 @@ impl<P: Port> Session<P> {
         if lease.is_some() && self.wire.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
+        self.admit(cx, &head)?;
         // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
         let ticket = self.calls.begin(&head, attributes.reset, is_emergency(attributes, head.priority))?;
         let order = match lease.map_or(Ok(None), |length| self.granting.grant(&mut self.wire, cx, &head, length)) {
@@ -111,6 +112,10 @@ impl<P: Port> Session<P> {
                 return Err(error);
             }
         };
+        if self.is_measured(&head) {
+            let (now, running) = (cx.now, (self.wire.link.id(), ticket));
+            cx.hub.enter(&mut |hub| hub.publications.run_times.began(now, &head, running));
+        }
         self.wire.link.counters.count(LinkCounter::RequestsRun);
         let CallHead { slot, priority, wants_reply, deadline, .. } = head;
         Ok(Incoming { ticket, slot, priority, wants_reply, deadline, order })
@@ -158,6 +163,10 @@ impl<P: Port> Session<P> {
             }
         }
         self.calls.end(ticket);
+        if SCHEDULING && self.wire.constraints.scheduling == Scheduling::Admission {
+            let (now, running) = (cx.now, (self.wire.link.id(), ticket));
+            cx.hub.enter(&mut |hub| hub.publications.run_times.ended(now, running));
+        }
         if head.resets {
             self.pump(cx);
         }
@@ -186,7 +195,28 @@ impl<P: Port> Session<P> {
     }
 
     fn goes_by_deadline(&self) -> bool {
-        P::SCHEDULES && self.wire.constraints.scheduling == Scheduling::EarliestDeadline
+        SCHEDULING && self.wire.constraints.scheduling != Scheduling::Fifo
+    }
+
+    /// Whether the average of a call's function counts.
+    fn is_measured(&self, head: &CallHead) -> bool {
+        SCHEDULING
+            && self.wire.constraints.scheduling == Scheduling::Admission
+            && !head.keeps_order
+            && head.priority != Priority::Emergency
+    }
+
+    /// Refuses a call that cannot make its deadline any more.
+    pub(super) fn admit(&mut self, cx: &mut Context<'_, P>, head: &CallHead) -> Result<(), Error> {
+        let (now, mut is_too_late) = (cx.now, false);
+        if self.is_measured(head) {
+            cx.hub.enter(&mut |hub| is_too_late = hub.publications.run_times.is_too_late(now, head));
+        }
+        if is_too_late {
+            self.wire.link.counters.count(LinkCounter::RequestsTooLate);
+            return Err(Error::Busy);
+        }
+        Ok(())
     }
 
     /// A call that waits is refused in favour of one with an earlier deadline that came later. Whether that can wait now.

@@ -553,9 +553,12 @@ impl<P: Port> Session<P> {
             let waits = function.attributes.stop && Granting::awaits_hook(cx, header.slot, header.generation)
                 || function.attributes.lease.is_some()
                     && self.granting.obedience.may_move(&mut self.wire, cx).is_none();
-            let arguments = arguments.filter(|_| !waits);
+            let arguments = arguments.filter(|_| !waits && self.calls.is_idle(priority));
+            if arguments.is_none() {
+                self.admit(cx, &head)?;
+            }
             let bytes = self.wire.link.view(block, lent);
-            match arguments.filter(|_| self.calls.is_idle(priority)) {
+            match arguments {
                 // The arguments are checked before the call begins: a lease must not start for a request that is refused.
                 Some(arguments) => {
                     read_arguments(function.signature, bytes, arguments)?;

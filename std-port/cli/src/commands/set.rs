@@ -24,7 +24,7 @@ Constraints:
   chunk_size        longest frame received; a size from 320 B to 4 KiB
   keep_alive        between two signs of life; a time
   calls_per_peer    calls that one peer may have waiting or running here; a number
-  scheduling        which of the calls that wait begins next: deadline or fifo")]
+  scheduling        which of the calls that wait begins next: deadline, fifo or admission")]
 pub(crate) struct Arguments {
     /// The unit itself, by its name or as `.`; or a node, for this unit's side towards it: NAME, NAME/ID or #ID.
     node: String,
@@ -94,7 +94,7 @@ fn parse(name: &str, kind: Kind, text: &str) -> anyhow::Result<u64> {
             .iter()
             .position(|known| known.word() == text)
             .map(|at| at as u64)
-            .ok_or_else(|| format!("it is `deadline` or `fifo`, not `{text}`")),
+            .ok_or_else(|| format!("it is `deadline`, `fifo` or `admission`, not `{text}`")),
         Kind::Number => text.parse().map_err(|_| format!("write a whole number, as 64, not `{text}`")),
     };
     value.map_err(|wrong| Ended::usage(format!("{name}: {wrong}")))

@@ -90,6 +90,7 @@ pub(super) struct Constraints {
 pub(super) enum Scheduling {
     Deadline,
     Fifo,
+    Admission,
 }
 
 /// `[capacities]`

@@ -31,6 +31,7 @@ pub(super) fn constraints(table: &file::Constraints, role: Role, mistakes: &mut 
         limits.scheduling = match scheduling.get_ref() {
             file::Scheduling::Deadline => Scheduling::EarliestDeadline,
             file::Scheduling::Fifo => Scheduling::Fifo,
+            file::Scheduling::Admission => Scheduling::Admission,
         };
     }
     limits
@@ -122,6 +123,7 @@ mod tests {
             ("calls_per_peer = 0", None),
             ("scheduling = \"fifo\"", Some(Constraints { scheduling: Scheduling::Fifo, ..base })),
             ("scheduling = \"deadline\"", Some(base)),
+            ("scheduling = \"admission\"", Some(Constraints { scheduling: Scheduling::Admission, ..base })),
             ("minimum_interval = 0", Some(base)),
         ];
         for (text, expected) in cases {

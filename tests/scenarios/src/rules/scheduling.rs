@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use cara_core::config::Scheduling;
-use cara_core::error::ServiceError;
+use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
@@ -17,6 +17,7 @@ scenarios![
     the_earliest_deadline_begins_first_or_what_came_first: "74", Light, [], ["RequestsAhead", "fifo"];
     calls_that_move_begin_in_their_order_whatever_their_deadlines: "74", Light, [], ["RequestsRun"];
     a_call_that_has_waited_half_its_time_out_is_next: "74", Light, [ExactTime], ["RequestsAhead"];
+    one_slow_run_refuses_short_calls_for_seconds_only: "74", Light, [ExactTime], ["RequestsTooLate"];
     a_peer_with_short_deadlines_keeps_no_other_peer_waiting: "74", Light, [], ["RequestsRun"];
 ];
 
@@ -108,6 +109,28 @@ fn a_call_that_has_waited_half_its_time_out_is_next(world: &mut dyn World) {
     let waited = patient.ended_at().expect("it is over").since(began);
     assert!(waited > secs(4) && waited < secs(6), "after {} ms", waited.as_millis());
     assert!(agv.counted(LinkCounter::RequestsAhead) > 0);
+}
+
+/// The first run takes 2 s, all others nothing.
+fn one_slow_run_refuses_short_calls_for_seconds_only(world: &mut dyn World) {
+    let (gate, work) = (Gate::default(), Service::numbered("work").waits_at(&gate));
+    let (manager, agv) = one_at_a_time(world, &gate, &[&work]);
+    agv.change(|limits| limits.scheduling = Scheduling::Admission);
+    let ask = |world: &mut dyn World, timeout| {
+        let call = manager.begin("agv", "work", &number("n", 1), within(timeout));
+        world.finish(&call)
+    };
+    gate.close();
+    let slow = manager.begin("agv", "work", &number("n", 1), within(secs(10)));
+    world.run_for(secs(2));
+    gate.open();
+    assert_eq!(world.finish(&slow), Ok(()));
+    assert_eq!(ask(world, secs(3)), Ok(()), "it has the time");
+    assert_eq!(ask(world, secs(1)), Ok(()), "one a second is tried");
+    assert_eq!(ask(world, secs(1)), Err(Error::Busy), "the next one is refused at once");
+    assert_eq!((work.log().runs(), agv.counted(LinkCounter::RequestsTooLate)), (3, 1));
+    world.run_for(secs(2));
+    assert_eq!(ask(world, secs(1)), Ok(()), "what was slow once is tried again");
 }
 
 /// More calls than a unit on Linux has threads for.

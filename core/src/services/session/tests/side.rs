@@ -56,7 +56,6 @@ impl<const WHOLE: bool> Port for Tested<WHOLE> {
     type Cipher = Plain;
     type Endpoint = SocketAddr;
     const CALLS: bool = WHOLE;
-    const SCHEDULES: bool = WHOLE;
     const HAS_ACCESS: bool = WHOLE;
     const TAKES_DATAGRAM_REQUESTS: bool = WHOLE;
 }

@@ -1,0 +1,188 @@
+//! How long the unit's functions run: what admission ([`Scheduling::Admission`](crate::config::Scheduling::Admission)) goes by.
+
+use crate::ability::{Begins, SCHEDULING, State};
+use crate::distribution::function_list::{Generation, Slot};
+use crate::host::mailman::LinkId;
+use crate::services::calls::{CallHead, Ticket};
+use crate::time::{Duration, Instant};
+
+/// Functions whose average is kept; one more takes the place of the one that ran longest ago.
+const FUNCTIONS: usize = 8;
+/// So large a part of what a call took differs from the average moves it.
+const WEIGHT: u64 = 8;
+/// A call that cannot make its deadline begins all the same where none has for so long: the average can only fall by calls.
+const PROBE: Duration = Duration::from_secs(1);
+/// A measured call that has not ended for so long no longer keeps another one from being measured: its link may have ended.
+const MEASURED_FOR: Duration = Duration::from_secs(60);
+
+/// A call that runs, among those of all links.
+type Running = (LinkId, Ticket);
+
+/// What is known of one function.
+#[derive(Clone, Copy, Debug)]
+struct RunTime {
+    function: (Slot, Generation),
+    /// As of `ran`.
+    average: Duration,
+    /// When a measured call of it ended last.
+    ran: Instant,
+    /// When a call of it began last although its average said that it would be too late.
+    probed: Instant,
+    /// The call that is measured, and since when. One at a time, so that what each call keeps does not grow.
+    measured: Option<(Running, Instant)>,
+}
+
+impl RunTime {
+    /// Halved for each second without a run: what was slow once is tried again.
+    fn average(&self, now: Instant) -> Duration {
+        let seconds = now.since(self.ran).as_micros().checked_div(Duration::from_secs(1).as_micros()).unwrap_or(0);
+        let halved = self.average.as_micros().checked_shr(seconds.min(64) as u32);
+        Duration::from_micros(halved.unwrap_or(0))
+    }
+}
+
+type Table = [Option<RunTime>; FUNCTIONS];
+
+impl Begins for Table {
+    const BEGIN: &'static Self = &[None; FUNCTIONS];
+}
+
+/// The averages of a unit, measured with the calls of all its links. Where the build cannot schedule, it takes no room.
+#[derive(Default)]
+pub(crate) struct RunTimes(State<Table, { SCHEDULING as usize }>);
+
+impl RunTimes {
+    /// Whether a call that comes now, or is to begin now, cannot make its deadline as far as its function's average shows.
+    pub(crate) fn is_too_late(&self, now: Instant, call: &CallHead) -> bool {
+        let Some(times) = self.of((call.slot, call.generation)) else { return false };
+        times.average(now) > call.deadline.since(now) && now < times.probed + PROBE
+    }
+
+    /// A call begins, on a link, under a ticket.
+    pub(crate) fn began(&mut self, now: Instant, call: &CallHead, running: Running) {
+        let function = (call.slot, call.generation);
+        let is_new = self.of(function).is_none();
+        self.0.change(|table| {
+            let place = if is_new { oldest(table) } else { table.iter_mut().find(|place| is_of(place, function)) };
+            let Some(place) = place else { return };
+            let times = if is_new { None } else { *place };
+            let (average, ran, probed, measured) = (Duration::ZERO, now, Instant::START, None);
+            let mut times = times.unwrap_or(RunTime { function, average, ran, probed, measured });
+            if times.average(now) > call.deadline.since(now) {
+                times.probed = now;
+            }
+            if times.measured.is_none_or(|(_, since)| now >= since + MEASURED_FOR) {
+                times.measured = Some((running, now));
+            }
+            *place = Some(times);
+        });
+    }
+
+    /// A call has been answered, or has failed.
+    pub(crate) fn ended(&mut self, now: Instant, running: Running) {
+        self.0.change(|table| {
+            let is_measured = |times: &&mut RunTime| times.measured.is_some_and(|(measured, _)| measured == running);
+            let Some(times) = table.iter_mut().flatten().find(is_measured) else { return };
+            let Some((_, since)) = times.measured.take() else { return };
+            let (took, average) = (now.since(since), times.average(now));
+            times.average = if average == Duration::ZERO {
+                took
+            } else {
+                average - average.divided_by(WEIGHT) + took.divided_by(WEIGHT)
+            };
+            times.ran = now;
+        });
+    }
+
+    fn of(&self, function: (Slot, Generation)) -> Option<&RunTime> {
+        self.0.iter().flatten().find(|times| times.function == function)
+    }
+}
+
+fn is_of(place: &Option<RunTime>, function: (Slot, Generation)) -> bool {
+    place.is_some_and(|times| times.function == function)
+}
+
+/// A free place, or that of the function that ran longest ago.
+fn oldest(table: &mut Table) -> Option<&mut Option<RunTime>> {
+    table.iter_mut().min_by_key(|place| place.map_or(Instant::START, |times| times.ran))
+}
+
+#[cfg(all(test, feature = "scheduling"))]
+mod tests {
+    use super::*;
+    use crate::config::Priority;
+
+    const LINK: LinkId = LinkId(0);
+
+    /// A call of a function that is made at `now`.
+    fn call(id: u32, function: u16, now: Instant, timeout: Duration) -> CallHead {
+        CallHead {
+            id,
+            slot: Slot(function),
+            generation: Generation(0),
+            priority: Priority::Normal,
+            wants_reply: true,
+            wants_progress: false,
+            takes_over: false,
+            operator: false,
+            keeps_order: false,
+            deadline: now + timeout,
+            sent_at: now,
+            number: id,
+        }
+    }
+
+    /// Runs one from `now` on; when it has ended.
+    fn run(times: &mut RunTimes, now: Instant, function: u16, takes: Duration) -> Instant {
+        let running = (LINK, Ticket::of(0, 1));
+        times.began(now, &call(1, function, now, Duration::from_secs(9)), running);
+        times.ended(now + takes, running);
+        now + takes
+    }
+
+    fn is_too_late(times: &RunTimes, now: Instant, function: u16, millis: u64) -> bool {
+        times.is_too_late(now, &call(2, function, now, Duration::from_millis(millis)))
+    }
+
+    #[test]
+    fn a_call_is_too_late_where_its_functions_average_is_longer_than_what_it_has_left() {
+        let mut times = RunTimes::default();
+        let start = Instant::from_micros(60_000_000);
+        assert!(!is_too_late(&times, start, 1, 1), "nothing is known");
+        let mut now = run(&mut times, start, 1, Duration::from_millis(100));
+        // One call is let through: from there on the second counts.
+        times.began(now, &call(3, 1, now, Duration::from_millis(1)), (LINK, Ticket::of(1, 3)));
+        times.ended(now + Duration::from_millis(100), (LINK, Ticket::of(1, 3)));
+        now = now + Duration::from_millis(100);
+        assert!(is_too_late(&times, now, 1, 99) && !is_too_late(&times, now, 1, 101) && !is_too_late(&times, now, 2, 1));
+    }
+
+    #[test]
+    fn one_call_a_second_begins_whatever_the_average_says_and_without_runs_it_halves() {
+        let mut times = RunTimes::default();
+        let now = run(&mut times, Instant::from_micros(60_000_000), 1, Duration::from_millis(100));
+        assert!(!is_too_late(&times, now, 1, 60), "none was let through yet");
+        let late = call(3, 1, now, Duration::from_millis(60));
+        times.began(now, &late, (LINK, Ticket::of(1, 3)));
+        assert!(is_too_late(&times, now, 1, 60));
+        assert!(!is_too_late(&times, now + Duration::from_secs(1), 1, 60), "the next one after a second");
+        times.ended(now, (LINK, Ticket::of(1, 3)));
+        let halved = now + Duration::from_secs(1);
+        times.began(halved, &call(4, 1, halved, Duration::from_millis(1)), (LINK, Ticket::of(0, 4)));
+        assert!(is_too_late(&times, halved, 1, 40) && !is_too_late(&times, halved, 1, 51));
+    }
+
+    #[test]
+    fn a_fast_run_moves_the_average_by_an_eighth_and_the_function_that_ran_longest_ago_is_forgotten() {
+        let mut times = RunTimes::default();
+        let mut now = run(&mut times, Instant::from_micros(60_000_000), 1, Duration::from_millis(80));
+        now = run(&mut times, now, 1, Duration::ZERO);
+        assert_eq!(times.of((Slot(1), Generation(0))).unwrap().average(now), Duration::from_millis(70));
+        for function in 2..=FUNCTIONS as u16 + 1 {
+            now = run(&mut times, now, function, Duration::from_millis(1));
+        }
+        let known = |function: u16| times.of((Slot(function), Generation(0))).is_some();
+        assert!(!known(1) && (2..=FUNCTIONS as u16 + 1).all(known));
+    }
+}
