@@ -11,7 +11,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;
 use cara_core::services::lease::{Ended, Lease};
 use cara_core::time::Instant;
-use cara_core::typed::{AnyCall, Free, Functions, Interface, Method};
+use cara_core::typed::{AnyCall, Free, Functions, Interface, Method, Reader, ReaderFunctions};
 
 use crate::functions::MyFunctionList;
 use crate::handler::{Handler, Hook, Safe, Served, ServiceOptions};
@@ -181,5 +181,18 @@ impl<T: 'static> Functions<T> for MyFunctionList<T> {
         run: &'static Free<Served<T>>,
     ) -> Result<(), Error> {
         self.add(signature, attributes, actuator, Handler::free(run))
+    }
+}
+
+impl<T: 'static> ReaderFunctions<T> for MyFunctionList<T> {
+    fn add_reader(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Actuator<T>>,
+        _: &'static Reader<T, Served<T>>,
+        method: &'static Method<T, Served<T>>,
+    ) -> Result<(), Error> {
+        self.add_method(signature, attributes, actuator, method)
     }
 }

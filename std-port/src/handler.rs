@@ -19,6 +19,8 @@ use cara_core::time::{Duration, Instant};
 
 use crate::actuator::Actuator;
 use crate::engine::served::Serving;
+use crate::engine::state::State;
+use crate::engine::state_gate::Access;
 use crate::engine::streams::OwnStream;
 use crate::executor::Executor;
 use crate::growing::HandlerParameters;
@@ -115,6 +117,7 @@ impl Served {
     }
 }
 
+type Reader<T> = dyn Fn(&State<T>, &Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 type Free = dyn Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 type Method<T> = dyn Fn(&mut T, &Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 /// The rest of a handler that is a future: its results.
@@ -134,6 +137,8 @@ pub(crate) enum Run<T> {
     Free(Arc<Free>),
     /// With it, one at a time, in the order in which they began.
     Method(Arc<Method<T>>),
+    /// As a method, but beside others that read.
+    Reader(Arc<Reader<T>>),
     /// As a task, which holds neither the state nor a thread while it waits.
     #[cfg(feature = "async")]
     Task(Arc<Begin>),
@@ -144,6 +149,7 @@ impl<T> Clone for Run<T> {
         match self {
             Self::Free(run) => Self::Free(run.clone()),
             Self::Method(run) => Self::Method(run.clone()),
+            Self::Reader(run) => Self::Reader(run.clone()),
             #[cfg(feature = "async")]
             Self::Task(begin) => Self::Task(begin.clone()),
         }
@@ -151,9 +157,13 @@ impl<T> Clone for Run<T> {
 }
 
 impl<T> Run<T> {
-    /// It waits for the application's state.
-    pub(crate) const fn takes_state(&self) -> bool {
-        matches!(self, Self::Method(_))
+    /// For what it waits for the application's state, if it does.
+    pub(crate) const fn access(&self) -> Option<Access> {
+        match self {
+            Self::Method(_) => Some(Access::Change),
+            Self::Reader(_) => Some(Access::Read),
+            _ => None,
+        }
     }
 
     /// It may have to wait before it begins: for the state, or for an executor.
@@ -427,6 +437,18 @@ where
 {
     fn into_run(self) -> RunOf<T> {
         RunOf(Run::Method(Arc::new(self)))
+    }
+}
+
+/// A method of an interface that reads the state.
+pub(crate) struct Reads<T: 'static>(pub(crate) &'static cara_core::typed::Reader<T, Served>);
+
+impl<T: Send + Sync> IntoHandler<T, Reads<T>> for Reads<T> {
+    fn into_run(self) -> RunOf<T> {
+        let run = move |state: &State<T>, call: &Served, parameters: &mut ParametersView| {
+            state.read(|state| self.0(state, call, parameters)).unwrap_or(Err(ServiceError::NotReady))
+        };
+        RunOf(Run::Reader(Arc::new(run)))
     }
 }
 

@@ -14,14 +14,14 @@ use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Instant;
-use cara_core::typed::{AnyCall, Free, Functions, Interface, Method};
+use cara_core::typed::{AnyCall, Free, Functions, Interface, Method, Reader, ReaderFunctions};
 
 use crate::actuator::Actuator;
 use crate::engine::details::Canceller;
 use crate::engine::worker::room;
 use crate::engine::{Answered, Pending};
 use crate::error::{BoxedDetail, CallError};
-use crate::handler::{IntoHandler, Served, ServiceOptions};
+use crate::handler::{IntoHandler, Reads, Served, ServiceOptions};
 use crate::heart::Hold;
 use crate::lease::LeaseWatch;
 use crate::my_function_list::MyFunctionList;
@@ -153,6 +153,23 @@ impl<T: Send + 'static> Functions<T> for MyFunctionList<'_, T> {
         let run =
             move |call: &Served, parameters: &mut ParametersView| -> Result<(), ServiceError> { run(call, parameters) };
         self.add(signature, attributes, actuator, run)
+    }
+}
+
+impl<T: Send + Sync + 'static> ReaderFunctions<T> for MyFunctionList<'_, T> {
+    fn add_reader(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Actuator>,
+        read: &'static Reader<T, Served>,
+        method: &'static Method<T, Served>,
+    ) -> Result<(), Error> {
+        // Calls that move one thing never overtake each other, as readers might.
+        if actuator.is_some() || attributes.stop || attributes.reset {
+            return self.add_method(signature, attributes, actuator, method);
+        }
+        self.add(signature, attributes, None, Reads(read))
     }
 }
 

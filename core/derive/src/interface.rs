@@ -27,6 +27,8 @@ pub(crate) struct Function {
     /// Its name in the signature.
     pub(crate) name: String,
     pub(crate) takes_state: bool,
+    /// It takes it as `&self`.
+    pub(crate) only_reads: bool,
     pub(crate) is_async: bool,
     pub(crate) inputs: Vec<Input>,
     pub(crate) results: Results,
@@ -142,7 +144,7 @@ impl Function {
             }
         }
         let is_async = signature.asyncness.is_some();
-        let mut takes_state = false;
+        let (mut takes_state, mut only_reads) = (false, false);
         let mut inputs = Vec::new();
         for input in &mut signature.inputs {
             match input {
@@ -156,7 +158,7 @@ impl Function {
                     let wrong = "an `async fn` has the state for moments only: take `state: &impl AsyncState<Self>`";
                     return Err(Error::new_spanned(receiver, wrong));
                 }
-                FnArg::Receiver(_) => takes_state = true,
+                FnArg::Receiver(receiver) => (takes_state, only_reads) = (true, receiver.mutability.is_none()),
                 FnArg::Typed(argument) => inputs.push(Input::read(&argument.pat, &argument.ty, &mut argument.attrs)?),
             }
         }
@@ -176,7 +178,8 @@ impl Function {
         let about = first_line(&item.attrs);
         let help = help.unwrap_or_else(|| about.clone());
         let name = name.unwrap_or_else(|| plain(&ident));
-        let function = Self { ident, name, takes_state, is_async, inputs, results, can_fail, attributes, about, help };
+        let function =
+            Self { ident, name, takes_state, only_reads, is_async, inputs, results, can_fail, attributes, about, help };
         function.check(span)?;
         make_future(item);
         Ok(function)

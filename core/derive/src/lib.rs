@@ -146,9 +146,15 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 ///
 /// | a function | has the state |
 /// |---|---|
-/// | `fn go_to(&mut self, …)`, `fn pos_info(&self)` | while it runs, one such call at a time |
+/// | `fn go_to(&mut self, …)` | while it runs, alone |
+/// | `fn pos_info(&self)` | while it runs; on Linux beside others with `&self`, unless it has an `#[actuator]`, `#[stop]` or `#[reset]` |
 /// | `fn stop()` | never, as an emergency service |
 /// | `async fn fetch(state: &impl AsyncState<Self>, …)` | in `state.with(\|agv\| …).await?`, and not while it waits; on Linux, with the feature `async` |
+///
+/// On Linux a state with functions that take `&self` is `Sync`: what is not, as a serial port may be, goes into a `Mutex`, or the
+/// functions take `&mut self`. Those that wait for the state have it in the order in which they began. A function that waits or sleeps with
+/// `&mut self` keeps all others waiting, `&self` as well: it begins what takes long, and returns. One that has had the state for over a
+/// second is warned about in the log.
 ///
 /// An `async fn` becomes a `fn` that returns a future which is `Send`, so that any executor can run it; what implements the trait writes
 /// `async fn`. Attributes, `call` and clients are as of any other function.

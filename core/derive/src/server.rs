@@ -25,6 +25,7 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
     });
     let list =
         if functions.iter().any(|function| function.is_async) { quote!(AsyncFunctions) } else { quote!(Functions) };
+    let readers = functions.iter().any(|function| function.only_reads).then(|| quote!(+ #typed::ReaderFunctions<T>));
     let debug = if actuators.is_empty() { quote!() } else { quote!(<A>) };
     let text = server.to_string();
     let serving = functions.iter().map(|function| serve(interface, function, root));
@@ -41,6 +42,14 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         let (add, run) = match (function.is_async, function.takes_state) {
             (true, _) => {
                 (quote!(AsyncFunctions::<T>::add_task), quote!(#holder::#serve::<T, F::Call, F::State, F::Room>))
+            }
+            (false, true) if function.only_reads => {
+                let method = quote! {
+                    &|state: &mut T, call: &F::Call, parameters: &mut #parts::ParametersView| {
+                        #holder::#serve::<T, F::Call>(state, call, parameters)
+                    }
+                };
+                (quote!(ReaderFunctions::<T>::add_reader), quote!(&#holder::#serve::<T, F::Call>, #method))
             }
             (false, true) => (quote!(Functions::<T>::add_method), quote!(&#holder::#serve::<T, F::Call>)),
             (false, false) => (quote!(Functions::<T>::add_free), quote!(&#holder::#serve::<T, F::Call>)),
@@ -65,7 +74,7 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
         impl<T, F> #typed::Interface<T, F> for #of_port
         where
             T: #name + 'static,
-            F: #typed::#list<T> + ?::core::marker::Sized,
+            F: #typed::#list<T> #readers + ?::core::marker::Sized,
             #(#bounds)*
         {
             fn add_to(self, functions: &F) -> ::core::result::Result<(), #parts::Error> {
@@ -107,9 +116,10 @@ fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> Toke
             }
         };
     }
-    let (state, receiver) = match function.takes_state {
-        true => (quote!(state: &mut T,), quote!(state,)),
-        false => (quote!(), quote!()),
+    let (state, receiver) = match (function.takes_state, function.only_reads) {
+        (true, true) => (quote!(state: &T,), quote!(state,)),
+        (true, false) => (quote!(state: &mut T,), quote!(state,)),
+        (false, _) => (quote!(), quote!()),
     };
     quote! {
         #[allow(unused_variables, clippy::unit_arg, clippy::let_unit_value)]

@@ -17,7 +17,7 @@ use cara_core::services::lease::Ended;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_core::typed::{BAD_ARGUMENT, Free, Functions, Interface, Method, Mismatch};
+use cara_core::typed::{BAD_ARGUMENT, Free, Functions, Interface, Method, Mismatch, Reader, ReaderFunctions};
 use cara_core::{AnyCall, Error, Parameters, ParametersView, ServiceError, TypedCall, Variables, interface};
 
 #[derive(Variables, Clone, Copy, Debug, PartialEq)]
@@ -215,6 +215,7 @@ impl AnyCall for Report {
 
 enum Run {
     Method(&'static Method<Vehicle, Report>),
+    Reader(&'static Reader<Vehicle, Report>),
     Free(&'static Free<Report>),
 }
 
@@ -268,6 +269,21 @@ impl Functions<Vehicle> for Unit {
     }
 }
 
+impl ReaderFunctions<Vehicle> for Unit {
+    fn add_reader(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&&'static str>,
+        read: &'static Reader<Vehicle, Report>,
+        _: &'static Method<Vehicle, Report>,
+    ) -> Result<(), Error> {
+        let (actuator, run) = (actuator.copied(), Run::Reader(read));
+        self.listed.borrow_mut().push(Listed { signature, attributes, actuator, run });
+        Ok(())
+    }
+}
+
 impl Unit {
     /// Looks at what is published, as a port does, and calls.
     #[expect(clippy::result_large_err, reason = "it is the port's error")]
@@ -302,6 +318,7 @@ impl Unit {
         let call = Report(Identity::m_unit("manager", 1)?, self.ended, RefCell::default(), RefCell::default());
         let outcome = match listed.run {
             Run::Method(run) => run(&mut self.vehicle.borrow_mut(), &call, &mut served),
+            Run::Reader(run) => run(&self.vehicle.borrow(), &call, &mut served),
             Run::Free(run) => run(&call, &mut served),
         };
         *self.reported.borrow_mut() = call.2.take();

@@ -128,6 +128,8 @@ pub trait AsyncState<T: ?Sized>: Send + Sync {
     ) -> impl Future<Output = Result<R, ServiceError>> + Send;
 }
 
+/// A service that reads the application's state.
+pub type Reader<T, C> = dyn Fn(&T, &C, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 /// A service with the application's state.
 pub type Method<T, C> = dyn Fn(&mut T, &C, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 /// A service without it, as one of the emergency class is.
@@ -157,6 +159,25 @@ pub trait Functions<T: 'static> {
         attributes: Attributes,
         actuator: Option<&Self::Actuator>,
         run: &'static Free<Self::Call>,
+    ) -> Result<(), Error>;
+}
+
+/// A port's list whose services may read the state beside each other.
+#[diagnostic::on_unimplemented(
+    message = "`{Self}` takes no service with `&self`",
+    label = "this interface has a function with `&self`",
+    note = "on Linux functions with `&self` run side by side, and so the state must be `Sync`: put what is not into a `Mutex`, or take `&mut self`"
+)]
+pub trait ReaderFunctions<T: 'static>: Functions<T> {
+    /// Adds a service that reads the state: as `read` where readers run side by side, as `method` where one call at a time has the
+    /// state. One that moves, stops or resets something is always the latter.
+    fn add_reader(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Self::Actuator>,
+        read: &'static Reader<T, Self::Call>,
+        method: &'static Method<T, Self::Call>,
     ) -> Result<(), Error>;
 }
 

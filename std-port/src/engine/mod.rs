@@ -5,7 +5,7 @@
 //!
 //! | modules | what |
 //! |---|---|
-//! | `reader`, `watch`, `notices`, `details`, `streams`, `worker`, `state_gate`, `alarms`, `events` | state machines and memory, without any link |
+//! | `reader`, `watch`, `notices`, `details`, `streams`, `worker`, `state`, `state_gate`, `alarms`, `events` | state machines and memory, without any link |
 //! | `link`, `peer_cell`, `roster`, `pinging`, `served` | a link and its session, a node, a call as its handler has it |
 //! | `sockets`, `driving`, `hub`, `keys`, `peers`, `links` | sockets, threads and clock, the node, its keys, all nodes and all links |
 //! | `reading`, `tables`, `interfaces`, `presence`, `claims`, `access`, `noting`, `accounts`, `unjoined` | what is decided and counted with those |
@@ -53,7 +53,8 @@ mod services;
 mod serving;
 mod settling;
 mod sockets;
-mod state_gate;
+pub(crate) mod state;
+pub(crate) mod state_gate;
 pub(crate) mod streams;
 mod tables;
 #[cfg(feature = "async")]

@@ -14,6 +14,8 @@ use cara_core::time::Instant;
 use super::afterwards::{Afterwards, Pending};
 use super::driving::Driver;
 use super::link::LinkCell;
+#[cfg(feature = "async")]
+use super::state_gate::Access;
 use super::state_gate::{StateGate, Turn};
 #[cfg(feature = "async")]
 use super::tasks::Runner;
@@ -88,9 +90,9 @@ impl<T: Send + 'static> Services<T> {
 
     /// Runs `act` with the application's state, when its turn comes.
     pub(crate) fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
-        let result = self.state.enter().map(|mut state| act(&mut state));
+        let result = self.state.enter().map(|held| held.change(act));
         self.go_on_with_parked();
-        result
+        result?.ok_or(Error::NotRunning)
     }
 
     /// The same for a task, which no thread waits for.
@@ -103,11 +105,11 @@ impl<T: Send + 'static> Services<T> {
                 self.0.go_on_with_parked();
             }
         }
-        let place = Place(self, self.state.take_turn(None));
+        let place = Place(self, self.state.take_turn(None, Access::Change));
         let mut act = Some(act);
         std::future::poll_fn(|cx| {
             let entered = self.state.poll_enter(place.1, cx);
-            entered.map_ok(|mut state| act.take().map(|act| act(&mut state)))
+            entered.map_ok(|held| act.take().and_then(|act| held.change(act)))
         })
         .await?
         .ok_or(Error::NotRunning)

@@ -16,7 +16,7 @@ use super::Engine;
 use super::link::{LinkCell, LinkState};
 use super::served::{PAUSE, Reports, Serving};
 use super::services::Parked;
-use super::state_gate::{Entered, Turn};
+use super::state_gate::{Access, Entered, Held as StateHeld, Turn};
 #[cfg(feature = "async")]
 use super::tasks::Task;
 use super::worker::{Worker, arena};
@@ -50,8 +50,8 @@ impl<T: Send + 'static> Engine<T> {
         link: &LinkCell,
         call: Incoming,
     ) -> Started {
-        let takes_state = functions.function(call.slot).is_some_and(|function| function.handler.run.takes_state());
-        Started { call, turn: takes_state.then(|| self.services.state.take_turn(Some(link.id))) }
+        let access = functions.function(call.slot).and_then(|function| function.handler.run.access());
+        Started { call, turn: access.map(|access| self.services.state.take_turn(Some(link.id), access)) }
     }
 
     /// Runs a call and those that waited behind it.
@@ -231,16 +231,13 @@ impl<T: Send + 'static> Engine<T> {
                 self.services.give_up(turn);
                 Ran::Over(guarded(&reported, || run(&reported, arguments)))
             }
-            Run::Method(run) => {
-                let turn = turn.unwrap_or_else(|| self.services.state.take_turn(Some(link.id)));
-                let result = match self.services.state.enter_by(turn) {
-                    Entered::Held(mut state) => guarded(&reported, || run(&mut state, &reported, arguments)),
-                    Entered::NotYet => return Ran::NotYet(turn),
-                    Entered::Refused(error) => Err(error),
-                };
-                self.services.go_on_with_parked();
-                Ran::Over(result)
-            }
+            Run::Method(run) => self.run_with_state(link, turn, Access::Change, |held| {
+                let change = |state: &mut T| run(state, &reported, arguments);
+                guarded(&reported, || held.change(change).unwrap_or(Err(ServiceError::NotReady)))
+            }),
+            Run::Reader(run) => self.run_with_state(link, turn, Access::Read, |held| {
+                guarded(&reported, || run(held.state(), &reported, arguments))
+            }),
             #[cfg(feature = "async")]
             Run::Task(begin) => {
                 self.services.give_up(turn);
@@ -250,6 +247,24 @@ impl<T: Send + 'static> Engine<T> {
                 Ran::Apart(Box::new(reported), begin, to_its_end)
             }
         }
+    }
+
+    fn run_with_state(
+        &self,
+        link: &LinkCell,
+        turn: Option<Turn>,
+        access: Access,
+        run: impl FnOnce(&StateHeld<'_, T, Parked>) -> Result<(), Error>,
+    ) -> Ran {
+        // The function may have been replaced since the call began, by one that takes the state.
+        let turn = turn.unwrap_or_else(|| self.services.state.take_turn(Some(link.id), access));
+        let result = match self.services.state.enter_by(turn) {
+            Entered::Held(held) => run(&held),
+            Entered::NotYet => return Ran::NotYet(turn),
+            Entered::Refused(error) => Err(error),
+        };
+        self.services.go_on_with_parked();
+        Ran::Over(result)
     }
 
     /// How a call is run, and what its handler is told.

@@ -1,11 +1,15 @@
-//! The application's state, which calls take in turns, in the order in which they began.
+//! The application's state, which calls take in turns, in the order in which they began: one that changes it alone, those that
+//! only read it side by side.
 //!
 //! A call takes its turn when it begins, under the lock of its link, and the state when its turn comes. One that would
 //! wait for long gives its thread back and is parked here: it is given to the pool again when its turn has come. So
 //! however many calls wait for the state, none of them keeps a thread from the calls that do not need it.
 //!
-//! The gate also knows when waiting cannot end. A method holds the state while it runs. If it then makes a blocking
-//! request to a peer, and that peer needs the state for its answer, both would wait until the deadline; the second one is
+//! A call that reads joins those that read already only if nothing waits before it: however many readers come, one that changes
+//! the state waits for those before it alone.
+//!
+//! The gate also knows when waiting cannot end. A method has the state while it runs. If it then makes a blocking
+//! request to a peer, and that peer's call has to wait for its turn, both would wait until the deadline; the second one is
 //! told at once instead.
 
 use std::cell::Cell;
@@ -18,6 +22,7 @@ use std::task::{Context, Poll};
 use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
+use super::state::State;
 use crate::locks::lock;
 use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
@@ -30,10 +35,19 @@ thread_local! {
     static HOLDING: Cell<usize> = const { Cell::new(0) };
 }
 
+/// What a turn is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Access {
+    /// Beside others that read.
+    Read,
+    Change,
+}
+
 /// A place in the order of those that take the state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Turn {
     number: u64,
+    access: Access,
     /// The peer whose call it is.
     caller: Option<LinkId>,
 }
@@ -42,17 +56,14 @@ pub(crate) struct Turn {
 pub(crate) struct StateGate<T, W> {
     gate: Mutex<Gate<W>>,
     changed: Condvar,
-    state: Mutex<T>,
+    state: State<T>,
     /// Calls that were parked and are to go on; read without a lock.
     ready: AtomicUsize,
 }
 
 struct Gate<W> {
-    holder: Option<Holder>,
-    /// The holder waits for a reply of each of these peers.
-    waits_for: Vec<LinkId>,
-    /// How many have held the state until now: distinguishes the waits of one holder from those of a later one.
-    held: u64,
+    /// Whose turn it is: one that changes the state, or any number that read it.
+    holders: Vec<Holder>,
     /// Those that wait, in their order.
     queue: VecDeque<Waiting<W>>,
     /// What was parked and is to go on.
@@ -64,20 +75,21 @@ struct Gate<W> {
     stopped: bool,
 }
 
-/// Whose turn it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Holder {
-    /// It has yet to come.
-    Expected(Turn),
-    Here(ThreadId),
+/// One whose turn it is.
+struct Holder {
+    turn: Turn,
+    /// `None` until it has come.
+    thread: Option<ThreadId>,
+    /// It waits for a reply of each of these peers.
+    waits_for: Vec<LinkId>,
 }
 
-/// A mark that the holder of the state waits for a peer.
+/// That a holder waits for a peer.
 #[derive(Debug)]
 pub(crate) struct Mark {
     peer: LinkId,
     /// Which holder.
-    held: u64,
+    turn: Turn,
 }
 
 struct Waiting<W> {
@@ -86,7 +98,7 @@ struct Waiting<W> {
 }
 
 /// What waiting for a turn led to.
-pub(crate) enum Entered<'g, T, W> {
+pub(crate) enum Entered<'g, T: 'static, W> {
     Held(Held<'g, T, W>),
     /// It takes long: the call is to be parked.
     NotYet,
@@ -94,42 +106,38 @@ pub(crate) enum Entered<'g, T, W> {
 }
 
 /// The state, until it is dropped.
-pub(crate) struct Held<'g, T, W> {
+pub(crate) struct Held<'g, T: 'static, W> {
     gate: &'g StateGate<T, W>,
-    state: MutexGuard<'g, T>,
+    turn: Turn,
 }
 
-impl<T, W> StateGate<T, W> {
+impl<T: 'static, W> StateGate<T, W> {
     pub(crate) fn new(state: T) -> Self {
-        let (queue, ready) = (VecDeque::new(), VecDeque::new());
         let gate = Gate {
-            holder: None,
-            waits_for: Vec::new(),
-            held: 0,
-            queue,
-            ready,
+            holders: Vec::new(),
+            queue: VecDeque::new(),
+            ready: VecDeque::new(),
             turns: 0,
             tasks: Vec::new(),
             stopped: false,
         };
-        Self { gate: Mutex::new(gate), changed: Condvar::new(), state: Mutex::new(state), ready: AtomicUsize::new(0) }
+        let (gate, changed, state) = (Mutex::new(gate), Condvar::new(), State::new(state));
+        Self { gate, changed, state, ready: AtomicUsize::new(0) }
     }
 
     /// The next turn, for a call of `caller`, or for the application itself.
-    pub(crate) fn take_turn(&self, caller: Option<LinkId>) -> Turn {
+    pub(crate) fn take_turn(&self, caller: Option<LinkId>, access: Access) -> Turn {
         let mut gate = lock(&self.gate);
         gate.turns += 1;
-        let turn = Turn { number: gate.turns, caller };
-        match gate.holder {
-            None => gate.holder = Some(Holder::Expected(turn)),
-            Some(_) => gate.queue.push_back(Waiting { turn, parked: None }),
-        }
+        let turn = Turn { number: gate.turns, access, caller };
+        gate.queue.push_back(Waiting { turn, parked: None });
+        gate.admit();
         turn
     }
 
     /// The state for the application itself, however long that takes; [`Error::WouldDeadlock`] when this thread has it.
     pub(crate) fn enter(&self) -> Result<Held<'_, T, W>, Error> {
-        let turn = self.take_turn(None);
+        let turn = self.take_turn(None, Access::Change);
         match self.await_turn(turn, None) {
             Entered::Held(held) => Ok(held),
             Entered::NotYet => Err(Error::WouldDeadlock),
@@ -137,7 +145,7 @@ impl<T, W> StateGate<T, W> {
         }
     }
 
-    /// The state for a call that has its turn. [`Error::WouldDeadlock`] when its holder waits for that call's peer, or is
+    /// The state for a call that has its turn. [`Error::WouldDeadlock`] when a holder waits for that call's peer, or is
     /// this thread. [`Error::NotRunning`] when the unit has stopped. Refused, the turn is given up.
     pub(crate) fn enter_by(&self, turn: Turn) -> Entered<'_, T, W> {
         self.await_turn(turn, Some(PATIENCE))
@@ -148,20 +156,21 @@ impl<T, W> StateGate<T, W> {
         let mut end = None;
         let mut gate = lock(&self.gate);
         loop {
-            if gate.holder == Some(Holder::Expected(turn)) {
+            if gate.has_turn(turn) {
                 if gate.stopped && turn.caller.is_some() {
-                    gate.pass_on();
+                    gate.leave(turn);
                     self.notify(gate);
                     return Entered::Refused(Error::NotRunning);
                 }
-                return Entered::Held(self.hold(gate, this));
+                return Entered::Held(self.hold(gate, turn, this));
             }
-            let refusal = match gate.holder == Some(Holder::Here(this)) {
+            let refusal = match gate.held_by(this).is_some() {
                 true => Some(Error::WouldDeadlock),
                 false => gate.refusal(turn),
             };
             if let Some(error) = refusal {
-                gate.queue.retain(|waiting| waiting.turn != turn);
+                gate.leave(turn);
+                self.notify(gate);
                 return Entered::Refused(error);
             }
             let Some(patience) = patience else {
@@ -183,24 +192,23 @@ impl<T, W> StateGate<T, W> {
     pub(crate) fn poll_enter(&self, turn: Turn, cx: &Context<'_>) -> Poll<Result<Held<'_, T, W>, Error>> {
         let this = std::thread::current().id();
         let mut gate = lock(&self.gate);
-        match gate.holder {
-            Some(Holder::Expected(next)) if next == turn => Poll::Ready(Ok(self.hold(gate, this))),
-            Some(Holder::Here(holder)) if holder == this => Poll::Ready(Err(Error::WouldDeadlock)),
-            _ => {
-                if !gate.tasks.iter().any(|task| task.will_wake(cx.waker())) {
-                    gate.tasks.push(cx.waker().clone());
-                }
-                Poll::Pending
-            }
+        if gate.has_turn(turn) {
+            return Poll::Ready(Ok(self.hold(gate, turn, this)));
         }
+        if gate.held_by(this).is_some() {
+            return Poll::Ready(Err(Error::WouldDeadlock));
+        }
+        if !gate.tasks.iter().any(|task| task.will_wake(cx.waker())) {
+            gate.tasks.push(cx.waker().clone());
+        }
+        Poll::Pending
     }
 
-    fn hold(&self, mut gate: MutexGuard<'_, Gate<W>>, thread: ThreadId) -> Held<'_, T, W> {
-        gate.holder = Some(Holder::Here(thread));
-        gate.held += 1;
+    fn hold(&self, mut gate: MutexGuard<'_, Gate<W>>, turn: Turn, thread: ThreadId) -> Held<'_, T, W> {
+        gate.holders.iter_mut().filter(|holder| holder.turn == turn).for_each(|holder| holder.thread = Some(thread));
         drop(gate);
         HOLDING.with(|holding| holding.set(holding.get() + 1));
-        Held { gate: self, state: lock(&self.state) }
+        Held { gate: self, turn }
     }
 
     /// Something has changed: threads and tasks that wait look again.
@@ -215,17 +223,19 @@ impl<T, W> StateGate<T, W> {
     /// Leaves a call here until its turn comes; whether that is now, so that it is to be asked for at once.
     pub(crate) fn park(&self, turn: Turn, work: W) -> bool {
         let mut gate = lock(&self.gate);
-        let refusal = gate.refusal(turn);
-        if gate.holder == Some(Holder::Expected(turn)) || refusal.is_some() {
-            gate.queue.retain(|waiting| waiting.turn != turn);
-            gate.ready.push_back((work, refusal.map_or(Ok(turn), Err)));
-            self.count_ready(&gate);
-            return true;
+        if gate.has_turn(turn) {
+            gate.ready.push_back((work, Ok(turn)));
+        } else if let Some(error) = gate.refusal(turn) {
+            gate.leave(turn);
+            gate.ready.push_back((work, Err(error)));
+        } else {
+            if let Some(waiting) = gate.queue.iter_mut().find(|waiting| waiting.turn == turn) {
+                waiting.parked = Some(work);
+            }
+            return false;
         }
-        if let Some(waiting) = gate.queue.iter_mut().find(|waiting| waiting.turn == turn) {
-            waiting.parked = Some(work);
-        }
-        false
+        self.notify(gate);
+        true
     }
 
     /// A call that was parked, with its turn, or with why it gets none.
@@ -248,10 +258,7 @@ impl<T, W> StateGate<T, W> {
     /// A call that has begun is not run after all.
     pub(crate) fn give_up(&self, turn: Turn) {
         let mut gate = lock(&self.gate);
-        match gate.holder == Some(Holder::Expected(turn)) {
-            true => gate.pass_on(),
-            false => gate.queue.retain(|waiting| waiting.turn != turn),
-        }
+        gate.leave(turn);
         self.notify(gate);
     }
 
@@ -268,9 +275,9 @@ impl<T, W> StateGate<T, W> {
         if HOLDING.with(Cell::get) == 0 {
             return wait();
         }
-        // Removed however the wait ends: a mark that stays would refuse that peer's later calls.
-        struct Marked<'g, T, W>(&'g StateGate<T, W>, Option<Mark>);
-        impl<T, W> Drop for Marked<'_, T, W> {
+        // However the wait ends: a mark that stays would refuse that peer's later calls.
+        struct Marked<'g, T: 'static, W>(&'g StateGate<T, W>, Option<Mark>);
+        impl<T: 'static, W> Drop for Marked<'_, T, W> {
             fn drop(&mut self) {
                 self.1.take().into_iter().for_each(|mark| self.0.unmark(mark));
             }
@@ -285,44 +292,66 @@ impl<T, W> StateGate<T, W> {
             return None;
         }
         let mut gate = lock(&self.gate);
-        if gate.holder != Some(Holder::Here(std::thread::current().id())) {
-            return None;
-        }
-        gate.waits_for.push(peer);
+        let holder = gate.held_by(std::thread::current().id())?;
+        holder.waits_for.push(peer);
+        let turn = holder.turn;
         gate.refuse_parked();
-        let held = gate.held;
         self.notify(gate);
-        Some(Mark { peer, held })
+        Some(Mark { peer, turn })
     }
 
     /// That wait is over.
-    pub(crate) fn unmark(&self, mark: Mark) {
+    pub(crate) fn unmark(&self, Mark { peer, turn }: Mark) {
         let mut gate = lock(&self.gate);
-        let index = gate.waits_for.iter().position(|peer| *peer == mark.peer);
-        if let Some(index) = index.filter(|_| gate.held == mark.held) {
-            gate.waits_for.swap_remove(index);
+        let Some(holder) = gate.holders.iter_mut().find(|holder| holder.turn == turn) else { return };
+        if let Some(index) = holder.waits_for.iter().position(|waited_for| *waited_for == peer) {
+            holder.waits_for.swap_remove(index);
         }
     }
 }
 
 impl<W> Gate<W> {
+    /// It is its turn, and it has yet to come.
+    fn has_turn(&self, turn: Turn) -> bool {
+        self.holders.iter().any(|holder| holder.turn == turn && holder.thread.is_none())
+    }
+
+    fn held_by(&mut self, thread: ThreadId) -> Option<&mut Holder> {
+        self.holders.iter_mut().find(|holder| holder.thread == Some(thread))
+    }
+
     /// Why a turn that waits never comes, or comes too late for its caller.
     fn refusal(&self, turn: Turn) -> Option<Error> {
         match turn.caller {
             None => None,
             Some(_) if self.stopped => Some(Error::NotRunning),
-            Some(caller) => self.waits_for.contains(&caller).then_some(Error::WouldDeadlock),
+            Some(caller) => {
+                let is_waited_for = self.holders.iter().any(|holder| holder.waits_for.contains(&caller));
+                is_waited_for.then_some(Error::WouldDeadlock)
+            }
         }
     }
 
-    /// The next one has its turn.
-    fn pass_on(&mut self) {
-        self.waits_for.clear();
-        let next = self.queue.pop_front();
-        self.holder = next.as_ref().map(|waiting| Holder::Expected(waiting.turn));
-        if let Some(Waiting { turn, parked: Some(work), .. }) = next {
-            self.ready.push_back((work, Ok(turn)));
+    /// Gives those the state that are next.
+    fn admit(&mut self) {
+        while let Some(next) = self.queue.front() {
+            // Nothing overtakes what waits: a reader behind one that changes the state is not next.
+            let joins = next.turn.access == Access::Read
+                && self.holders.iter().all(|holder| holder.turn.access == Access::Read);
+            if !self.holders.is_empty() && !joins {
+                return;
+            }
+            let Some(Waiting { turn, parked }) = self.queue.pop_front() else { return };
+            self.holders.push(Holder { turn, thread: None, waits_for: Vec::new() });
+            self.ready.extend(parked.map(|work| (work, Ok(turn))));
         }
+    }
+
+    /// A turn is over, or will not be used.
+    fn leave(&mut self, turn: Turn) {
+        self.holders.retain(|holder| holder.turn != turn);
+        self.queue.retain(|waiting| waiting.turn != turn);
+        self.admit();
     }
 
     fn refuse_parked(&mut self) {
@@ -336,27 +365,26 @@ impl<W> Gate<W> {
             let refused = self.queue.remove(index).and_then(|waiting| waiting.parked);
             self.ready.extend(refused.map(|work| (work, Err(error))));
         }
+        self.admit();
     }
 }
 
-impl<T, W> std::ops::Deref for Held<'_, T, W> {
-    type Target = T;
-    fn deref(&self) -> &T {
-        &self.state
+impl<T: 'static, W> Held<'_, T, W> {
+    /// For a turn to change it; `None` never.
+    pub(crate) fn change<R>(&self, act: impl FnOnce(&mut T) -> R) -> Option<R> {
+        self.gate.state.change(act)
+    }
+
+    /// For a turn to read it.
+    pub(crate) const fn state(&self) -> &State<T> {
+        &self.gate.state
     }
 }
 
-impl<T, W> std::ops::DerefMut for Held<'_, T, W> {
-    fn deref_mut(&mut self) -> &mut T {
-        &mut self.state
-    }
-}
-
-impl<T, W> Drop for Held<'_, T, W> {
-    /// Passes the turn on; the lock itself is given up right after.
+impl<T: 'static, W> Drop for Held<'_, T, W> {
     fn drop(&mut self) {
         let mut gate = lock(&self.gate.gate);
-        gate.pass_on();
+        gate.leave(self.turn);
         HOLDING.with(|holding| holding.set(holding.get().saturating_sub(1)));
         self.gate.notify(gate);
     }
@@ -386,7 +414,17 @@ mod tests {
         gate: &'g StateGate<u32, &'static str>,
         caller: Option<LinkId>,
     ) -> Result<Held<'g, u32, &'static str>, Error> {
-        let turn = gate.take_turn(caller);
+        wait_for(gate, gate.take_turn(caller, Access::Change))
+    }
+
+    fn call_to_read<'g>(
+        gate: &'g StateGate<u32, &'static str>,
+        caller: Option<LinkId>,
+    ) -> Result<Held<'g, u32, &'static str>, Error> {
+        wait_for(gate, gate.take_turn(caller, Access::Read))
+    }
+
+    fn wait_for<'g>(gate: &'g StateGate<u32, &'static str>, turn: Turn) -> Result<Held<'g, u32, &'static str>, Error> {
         loop {
             match gate.enter_by(turn) {
                 Entered::NotYet => {}
@@ -396,7 +434,7 @@ mod tests {
     }
 
     fn assert_refused(gate: &StateGate<u32, &'static str>, caller: Option<LinkId>, error: Error) {
-        assert_eq!(call(gate, caller).map(|held| *held).unwrap_err(), error);
+        assert_eq!(call(gate, caller).map(drop).unwrap_err(), error);
     }
 
     /// Runs `act` on another thread while this one holds the state and waits for the peer of `HERE`.
@@ -412,11 +450,93 @@ mod tests {
         let threads: Vec<_> = (0..4)
             .map(|_| {
                 let gate = gate.clone();
-                std::thread::spawn(move || (0..500).for_each(|_| *call(&gate, HERE).unwrap() += 1))
+                std::thread::spawn(move || {
+                    (0..500).for_each(|_| call(&gate, HERE).unwrap().change(|state| *state += 1).unwrap())
+                })
             })
             .collect();
         threads.into_iter().for_each(|thread| thread.join().unwrap());
-        assert_eq!(*gate.enter().unwrap(), 2_000);
+        assert_eq!(gate.enter().unwrap().change(|state| *state), Some(2_000));
+    }
+
+    #[test]
+    fn readers_are_let_in_together_and_overtake_nobody() {
+        let gate = StateGate::new(0);
+        let [first, second] = [HERE, ELSEWHERE].map(|caller| gate.take_turn(caller, Access::Read));
+        let [changes, third] = [Access::Change, Access::Read].map(|access| gate.take_turn(HERE, access));
+        let reading = [first, second].map(|turn| entered(gate.enter_by(turn)).unwrap());
+        assert!(!gate.park(changes, "changes"));
+        assert!(!gate.park(third, "third"), "one that changes the state waits before it");
+        let [first, second] = reading;
+        drop(second);
+        assert!(!gate.has_ready(), "one still reads");
+        drop(first);
+        assert_eq!(gate.take_ready(), Some(("changes", Ok(changes))));
+        assert!(!gate.has_ready(), "no reader beside it");
+        drop(entered(gate.enter_by(changes)).unwrap());
+        assert_eq!(gate.take_ready(), Some(("third", Ok(third))));
+        drop(entered(gate.enter_by(third)).unwrap());
+        assert!(gate.enter().is_ok());
+    }
+
+    /// Each reader comes before the last one goes, so that the state is never free.
+    #[test]
+    fn readers_without_end_keep_no_change_from_its_turn() {
+        let gate = StateGate::new(0);
+        let mut reading = call_to_read(&gate, HERE).unwrap();
+        let changes = gate.take_turn(ELSEWHERE, Access::Change);
+        let mut later = Vec::new();
+        for _ in 0..100 {
+            let turn = gate.take_turn(HERE, Access::Read);
+            match lock(&gate.gate).has_turn(turn) {
+                true => reading = entered(gate.enter_by(turn)).unwrap(),
+                false => later.push(turn),
+            }
+        }
+        assert_eq!(later.len(), 100, "all of them came later");
+        drop(reading);
+        drop(entered(gate.enter_by(changes)).unwrap());
+        let _all: Vec<_> = later.into_iter().map(|turn| entered(gate.enter_by(turn)).unwrap()).collect();
+    }
+
+    #[test]
+    fn who_gives_up_a_change_lets_those_behind_it_read() {
+        let gate = StateGate::new(0);
+        let reading = call_to_read(&gate, HERE).unwrap();
+        let changes = gate.take_turn(HERE, Access::Change);
+        let behind = gate.take_turn(HERE, Access::Read);
+        assert!(!gate.park(behind, "behind"));
+        gate.give_up(changes);
+        assert_eq!(gate.take_ready(), Some(("behind", Ok(behind))));
+        drop(entered(gate.enter_by(behind)).unwrap());
+        drop(reading);
+        assert!(gate.enter().is_ok());
+    }
+
+    /// Two read, and both wait for the same peer, which calls back.
+    #[test]
+    fn a_peer_that_a_reader_waits_for_may_read_and_not_change() {
+        let gate = StateGate::new(0);
+        let one = call_to_read(&gate, ELSEWHERE).unwrap();
+        std::thread::scope(|scope| {
+            let other = scope.spawn(|| {
+                let _held = call_to_read(&gate, ELSEWHERE).unwrap();
+                gate.waiting_for(LinkId(1), || {});
+            });
+            gate.waiting_for(LinkId(1), || {
+                other.join().unwrap();
+                std::thread::scope(|scope| {
+                    scope.spawn(|| {
+                        assert!(call_to_read(&gate, HERE).is_ok());
+                        assert_refused(&gate, HERE, Error::WouldDeadlock);
+                        assert!(call_to_read(&gate, HERE).is_ok(), "what was refused keeps nobody waiting");
+                    });
+                });
+            });
+        });
+        assert_refused(&gate, None, Error::WouldDeadlock);
+        drop(one);
+        assert!(call(&gate, HERE).is_ok());
     }
 
     #[test]
@@ -445,11 +565,11 @@ mod tests {
         let held = gate.enter().unwrap();
         let other = {
             let gate = gate.clone();
-            std::thread::spawn(move || sender.send(*call(&gate, ELSEWHERE).unwrap()).unwrap())
+            std::thread::spawn(move || sender.send(call(&gate, ELSEWHERE).unwrap().change(|state| *state)).unwrap())
         };
         gate.waiting_for(LinkId(1), || assert!(receiver.recv_timeout(Duration::from_millis(20)).is_err()));
         drop(held);
-        assert_eq!(receiver.recv_timeout(Duration::from_secs(30)), Ok(1));
+        assert_eq!(receiver.recv_timeout(Duration::from_secs(30)), Ok(Some(1)));
         other.join().unwrap();
     }
 
@@ -476,7 +596,7 @@ mod tests {
         };
         barrier.wait();
         let _held = mine.enter().unwrap();
-        other.waiting_for(LinkId(1), || assert_eq!(lock(&other.gate).waits_for, []));
+        other.waiting_for(LinkId(1), || assert_eq!(lock(&other.gate).holders[0].waits_for, []));
         barrier.wait();
         holder.join().unwrap();
     }
@@ -485,8 +605,8 @@ mod tests {
     #[test]
     fn the_state_is_taken_in_the_order_in_which_calls_began() {
         let gate = StateGate::new(0);
-        let held = gate.take_turn(None);
-        let [first, second, third] = [HERE, ELSEWHERE, HERE].map(|caller| gate.take_turn(caller));
+        let held = gate.take_turn(None, Access::Change);
+        let [first, second, third] = [HERE, ELSEWHERE, HERE].map(|caller| gate.take_turn(caller, Access::Change));
         assert!(matches!(gate.enter_by(third), Entered::NotYet) && !gate.park(third, "third"));
         assert!(matches!(gate.enter_by(first), Entered::NotYet) && !gate.park(first, "first"));
         assert!(!gate.has_ready());
@@ -504,8 +624,8 @@ mod tests {
     #[test]
     fn a_turn_that_comes_while_its_call_is_being_parked_is_not_lost() {
         let gate = StateGate::new(0);
-        let held = gate.take_turn(None);
-        let turn = gate.take_turn(HERE);
+        let held = gate.take_turn(None, Access::Change);
+        let turn = gate.take_turn(HERE, Access::Change);
         assert!(matches!(gate.enter_by(turn), Entered::NotYet));
         gate.give_up(held);
         assert!(gate.park(turn, "late"));
@@ -515,7 +635,7 @@ mod tests {
     #[test]
     fn a_turn_that_is_given_up_passes_to_the_next_one() {
         let gate = StateGate::new(0);
-        let [first, second, third] = [HERE; 3].map(|caller| gate.take_turn(caller));
+        let [first, second, third] = [HERE; 3].map(|caller| gate.take_turn(caller, Access::Change));
         gate.give_up(second);
         gate.give_up(first);
         drop(entered(gate.enter_by(third)).unwrap());
@@ -528,7 +648,7 @@ mod tests {
         let gate = StateGate::new(0);
         let held = gate.enter().unwrap();
         let [here, there] = [(HERE, "here"), (ELSEWHERE, "there")].map(|(caller, name)| {
-            let turn = gate.take_turn(caller);
+            let turn = gate.take_turn(caller, Access::Change);
             assert!(!gate.park(turn, name));
             turn
         });
@@ -548,14 +668,14 @@ mod tests {
         let gate = StateGate::new(0);
         let held = gate.enter().unwrap();
         gate.waiting_for(LinkId(1), || {});
-        let turn = gate.take_turn(HERE);
+        let turn = gate.take_turn(HERE, Access::Change);
         assert!(!gate.park(turn, "here") && !gate.has_ready(), "it waits for its turn, and is not refused");
         let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
             gate.waiting_for(LinkId(1), || panic!("a request"));
         }));
         assert!(panicked.is_err());
         assert_eq!(gate.take_ready(), Some(("here", Err(Error::WouldDeadlock))), "while that one waited");
-        let turn = gate.take_turn(HERE);
+        let turn = gate.take_turn(HERE, Access::Change);
         assert!(!gate.park(turn, "here") && !gate.has_ready(), "and none after it");
         drop(held);
         assert_eq!(gate.take_ready(), Some(("here", Ok(turn))));

@@ -26,6 +26,7 @@ mod members;
 mod orders;
 mod outcomes;
 mod processes;
+mod readers;
 mod stopping;
 mod stuck;
 mod support;
