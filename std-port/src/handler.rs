@@ -6,6 +6,7 @@ use std::future::Future;
 #[cfg(feature = "async")]
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use cara_core::config::Priority;
 use cara_core::distribution::failure::Failure;
@@ -179,6 +180,8 @@ pub(crate) struct Handler<T> {
     pub(crate) actuator: Option<Actuator>,
     /// It moves it.
     pub(crate) moves: bool,
+    /// It has held the state for long, which has been warned about.
+    pub(crate) held_long: AtomicBool,
     /// Where its emergencies run, if it is a service for those.
     pub(crate) executor: Option<Arc<Executor>>,
     /// One that is a future is told that its call is given up, and not dropped.

@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use cara_core::config::Priority;
 use cara_core::distribution::function::{Attributes, Definition};
@@ -133,6 +134,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             run,
             actuator,
             moves: attributes.lease.is_some(),
+            held_long: AtomicBool::new(false),
             executor,
             #[cfg(feature = "async")]
             to_its_end: options.to_its_end,

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::marker::PhantomData;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 #[cfg(feature = "async")]
 use std::task::{Poll, Waker};
 
@@ -122,6 +123,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             run,
             actuator: None,
             moves: false,
+            held_long: AtomicBool::new(false),
             executor: None,
             stream: Some(own.clone()),
             #[cfg(feature = "async")]

@@ -2,10 +2,11 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use cara_core::config::Priority;
 use cara_core::distribution::failure::Failure;
-use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::Ticket;
@@ -24,6 +25,9 @@ use crate::handler::{self, Handler, Run};
 use crate::lease::LeaseWatch;
 use crate::locks::Locked;
 use crate::storage::Boxed;
+
+/// A service that holds the state for longer is warned about, since calls that need the state wait meanwhile.
+const LONG: Duration = Duration::from_secs(1);
 
 /// A call that has begun.
 #[derive(Clone, Copy)]
@@ -101,10 +105,30 @@ impl<T: Send + 'static> Engine<T> {
             }
         };
         let now = self.now();
+        let ran = now.since(began);
+        if started.turn.is_some() && ran > LONG {
+            self.warn_of_long(started.call.slot, ran);
+        }
         let mut state = link.lock();
-        state.reading.ran(now.since(began));
+        state.reading.ran(ran);
         state.backlog.moved(now);
         Some((self.answer(now, link, state, &started.call, result, &worker.arguments), now))
+    }
+
+    /// Warns of a service that has held the state for so long, once.
+    #[cold]
+    fn warn_of_long(&self, slot: Slot, held: Duration) {
+        let function = {
+            let functions = self.services.functions();
+            let Some(function) = functions.function(slot) else { return };
+            if function.handler.held_long.swap(true, Ordering::Relaxed) {
+                return;
+            }
+            function.name().to_owned()
+        };
+        let (unit, _) = self.hub.lock().identity();
+        let advice = "calls that need the state wait meanwhile: begin what takes long, and return";
+        tracing::warn!(%unit, function, held_ms = held.as_millis(), "a service held the unit's state for over a second; {advice}");
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.

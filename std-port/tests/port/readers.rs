@@ -1,10 +1,13 @@
 //! Services with `&self`: they run side by side, keep nothing that changes the state from its turn, and hold up no stop.
 
+use std::fmt::{Debug, Write};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::{Duration, Instant};
 
 use cara_std::{Peer, Renew, RequestOptions, Unit, interface};
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Metadata, Subscriber, span};
 
 use crate::support::{Gate, PATIENCE, fleet, meet, system, unit, until};
 
@@ -27,6 +30,8 @@ trait Crane {
 
     #[priority(emergency)]
     fn halt();
+
+    fn ponder(&mut self, times: i64);
 }
 
 #[derive(Default)]
@@ -61,6 +66,13 @@ impl Crane for Hook {
     }
 
     fn halt() {}
+
+    fn ponder(&mut self, times: i64) {
+        let began = Instant::now();
+        while times > 0 && began.elapsed() < Duration::from_millis(1_050) {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
 }
 
 /// A crane with its manager's view of it.
@@ -164,4 +176,60 @@ fn calls_that_move_run_one_at_a_time_though_they_only_read() {
     until("the second moves", || at_lift.came() == 2);
     assert_eq!(client.load().wait(), Ok(0));
     pair.stop();
+}
+
+#[test]
+fn who_waits_with_the_state_is_warned_about_once() {
+    let lines = warnings();
+    let pair = Pair::new(Hook::default());
+    let client = pair.client();
+    client.ponder(0).wait().unwrap();
+    let of_ponder = || {
+        lines.lock().unwrap().iter().filter(|line| line.contains("function=\"ponder\"")).cloned().collect::<Vec<_>>()
+    };
+    assert_eq!(of_ponder(), [""; 0]);
+    (0..2).for_each(|_| client.ponder(1).wait().unwrap());
+    let seen = of_ponder();
+    assert_eq!(seen.len(), 1, "{seen:?}");
+    assert!(seen[0].contains("unit=agv/7") && seen[0].contains("held_ms=1"), "{seen:?}");
+    pair.stop();
+}
+
+/// The warnings of all handlers of this process from here on.
+fn warnings() -> &'static Mutex<Vec<String>> {
+    static LINES: OnceLock<&'static Mutex<Vec<String>>> = OnceLock::new();
+    LINES.get_or_init(|| {
+        let lines: &'static Mutex<Vec<String>> = Box::leak(Box::default());
+        tracing::subscriber::set_global_default(Recorder(lines)).expect("nothing else records here");
+        lines
+    })
+}
+
+struct Recorder(&'static Mutex<Vec<String>>);
+
+impl Subscriber for Recorder {
+    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
+        *metadata.level() == Level::WARN && metadata.target() == "cara_std::engine::serving"
+    }
+
+    fn event(&self, event: &Event<'_>) {
+        struct Line(String);
+        impl Visit for Line {
+            fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+                let _ = write!(self.0, "{}={value:?} ", field.name());
+            }
+        }
+        let mut line = Line(String::new());
+        event.record(&mut line);
+        self.0.lock().unwrap().push(line.0);
+    }
+
+    fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
+        span::Id::from_u64(1)
+    }
+
+    fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
+    fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
+    fn enter(&self, _: &span::Id) {}
+    fn exit(&self, _: &span::Id) {}
 }
