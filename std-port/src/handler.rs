@@ -105,8 +105,8 @@ impl Served {
         self.serving.notify(values)
     }
 
-    /// Whether the caller has given the call up, waits no longer, or is gone: what the handler returns then reaches nothing. For
-    /// handlers that are futures there is `given_up`.
+    /// Whether the caller has given the call up, waits no longer, or is gone. What the handler returns then reaches
+    /// nothing, unless the caller wants it all the same. For handlers that are futures there is `given_up`.
     pub fn is_cancelled(&self) -> bool {
         self.serving.is_cancelled()
     }

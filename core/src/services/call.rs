@@ -376,6 +376,18 @@ impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
         self
     }
 
+    /// Once it is given up, by a [canceller](Self::cancelled_by) or by what [watches](Call::watch) it, it waits so long for the
+    /// service's answer, at most until its deadline, and ends with that: results, or its error with text and values. With
+    /// [`Error::Cancelled`] where none comes in time. What it moves stops at once all the same. A [`Reply`] that is dropped waits for
+    /// nothing. Where a call had not begun, the answer is [`Error::Expired`].
+    pub fn answer_within(mut self, wait: impl Into<Duration>) -> Self
+    where
+        C: BlockingCaller,
+    {
+        self.options.answer_within = wait.into();
+        self
+    }
+
     /// Sends it and waits for the results. What it started, or would start, stops on an error if its service has a lease.
     pub fn wait(mut self) -> Result<K::Output, CallError<Q::Failure, C::Details>>
     where

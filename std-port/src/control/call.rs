@@ -91,8 +91,8 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         renew: Renew::Never,
         take_over: question.take_over,
         operator: true,
-        made: None,
         progress: question.progress,
+        ..RequestOptions::new()
     })
 }
 

@@ -12,7 +12,7 @@ use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
-use super::calling::{PAUSE, worth_waiting};
+use super::calling::{PAUSE, of_given_up, worth_waiting};
 use super::details::Canceller;
 use super::driving::Alarm;
 use super::link::{LinkCell, Wake};
@@ -48,6 +48,8 @@ pub struct Pending<T: Send + 'static> {
     link: Arc<LinkCell>,
     stage: Stage,
     deadline: Instant,
+    /// It was given up, and its answer is waited for until then.
+    given_up: Option<Instant>,
     /// Its place among the calls that move the same thing, however long it waits for room.
     made: Made,
     alarm: Alarm,
@@ -84,6 +86,7 @@ impl<T: Send + 'static> Pending<T> {
         Self {
             engine: engine.clone(),
             stage: Stage::Unsent,
+            given_up: None,
             deadline: engine.now() + options.timeout.unwrap_or(usual),
             made,
             alarm: Alarm::new(engine.driver.clone()),
@@ -109,7 +112,8 @@ impl<T: Send + 'static> Pending<T> {
         };
         // There is one alarm: the pause before the next try may be longer than the time in which a canceller is heard.
         let look = outgoing.canceller.filter(|_| polled.is_pending()).map(|_| self.engine.now() + PAUSE);
-        if let Some(at) = again.into_iter().chain(look).min() {
+        let end = self.given_up.filter(|_| polled.is_pending());
+        if let Some(at) = again.into_iter().chain(look).chain(end).min() {
             self.alarm.set(at, cx.waker());
         }
         polled
@@ -174,15 +178,27 @@ impl<T: Send + 'static> Pending<T> {
         let Stage::Sent(id) = self.stage else { return Poll::Ready(Err(Error::Interrupted.into())) };
         let (engine, link) = (self.engine.clone(), self.link.clone());
         let mut state = link.lock();
+        let mut breaks = false;
         loop {
             if let Some(ended) = engine.take_ended(&link, &mut state, id, outgoing.parameters) {
                 engine.settle(&link, state);
-                return self.over(ended);
+                let is_given_up = self.given_up.is_some();
+                return self.over(ended.map_err(|error| of_given_up(is_given_up, error)));
             }
-            let is_cancelled = outgoing.canceller.is_some_and(Canceller::is_cancelled);
-            let news = state.take_progress(id).filter(|_| !is_cancelled);
+            let is_cancelled = breaks || outgoing.canceller.is_some_and(Canceller::is_cancelled);
+            if is_cancelled && self.given_up.is_none() {
+                self.given_up = engine.give_up_but_wait(engine.now(), &link, &mut state, id, outgoing.options);
+                if self.given_up.is_some() {
+                    engine.settle(&link, state);
+                    // The answer may have come meanwhile, and would wake nobody.
+                    state = link.lock();
+                    continue;
+                }
+            }
+            let is_over = self.given_up.map_or(is_cancelled, |end| engine.now() >= end);
+            let news = state.take_progress(id).filter(|_| !is_cancelled && self.given_up.is_none());
             let Some((news, hear)) = news.zip(outgoing.progress.as_mut()) else {
-                if is_cancelled {
+                if is_over {
                     drop(state);
                     return self.over(Err(Error::Cancelled.into()));
                 }
@@ -192,7 +208,8 @@ impl<T: Send + 'static> Pending<T> {
                 return if earlier.is_some() { Poll::Pending } else { self.over(Err(Error::Interrupted.into())) };
             };
             drop(state);
-            if hear(&news).is_break() {
+            breaks = hear(&news).is_break();
+            if breaks && outgoing.options.answer_within == Duration::ZERO {
                 return self.over(Err(Error::Cancelled.into()));
             }
             state = link.lock();

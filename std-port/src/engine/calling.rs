@@ -134,35 +134,36 @@ impl<T: Send + 'static> Engine<T> {
         started: Started<'_>,
         outgoing: &mut Outgoing<'_, Canceller>,
     ) -> Result<(), CallError> {
-        let Started { mut state, mut token, id, now: asked, deadline } = started;
-        let Outgoing { parameters, progress, canceller, .. } = outgoing;
+        let Started { mut state, mut token, id, now: asked, mut deadline } = started;
+        let Outgoing { parameters, options, progress, canceller, .. } = outgoing;
         let mut now = asked;
+        let (mut breaks, mut is_given_up) = (false, false);
         loop {
             // The reply may have come through another thread before this one got the token. Without this look it would block in
             // reading for a reply that is here.
-            if let Some(ended) = self.take_ended(link, &mut state, id, parameters) {
+            if !breaks && let Some(ended) = self.take_ended(link, &mut state, id, parameters) {
                 self.leave(link, state, token);
-                return ended;
+                return ended.map_err(|error| of_given_up(is_given_up, error));
             }
-            let is_cancelled = canceller.is_some_and(Canceller::is_cancelled);
-            if is_cancelled || now >= deadline {
+            let gives_up = !is_given_up && (breaks || canceller.is_some_and(Canceller::is_cancelled));
+            if gives_up && let Some(end) = self.give_up_but_wait(now, link, &mut state, id, options) {
+                (breaks, is_given_up, deadline) = (false, true, deadline.min(end));
+                continue;
+            }
+            if gives_up || now >= deadline {
                 self.cancel(now, link, &mut state, id);
                 self.leave(link, state, token);
-                return Err(if is_cancelled { Error::Cancelled } else { Error::TimedOut }.into());
+                return Err(if gives_up || is_given_up { Error::Cancelled } else { Error::TimedOut }.into());
             }
             if let Some(hear) = progress
+                && !is_given_up
                 && let Some(news) = state.take_progress(id)
             {
                 // What it does may take its time: others read the link meanwhile.
                 self.leave(link, state, token.take());
-                let flow = hear(&news);
+                breaks = hear(&news).is_break();
                 state = link.lock();
                 now = self.now();
-                if flow.is_break() {
-                    self.cancel(now, link, &mut state, id);
-                    self.leave(link, state, token);
-                    return Err(Error::Cancelled.into());
-                }
                 continue;
             }
             // Only arriving bytes wake a thread that reads, so a call with a canceller looks at it now and then.
@@ -178,7 +179,7 @@ impl<T: Send + 'static> Engine<T> {
                     }
                     let failure = state.forget(id);
                     self.leave_with_reply(asked, now, link, state, token);
-                    return result.map_err(|error| failed(error, failure));
+                    return result.map_err(|error| of_given_up(is_given_up, failed(error, failure)));
                 }
             } else {
                 self.settle_at(now, link, state);
@@ -370,6 +371,22 @@ impl<T: Send + 'static> Engine<T> {
         self.settle(link, state);
     }
 
+    /// Gives a call up whose answer is waited for all the same, and until when; `None` where its caller does not want that.
+    pub(super) fn give_up_but_wait(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        state: &mut LinkState,
+        id: CallId,
+        options: &RequestOptions,
+    ) -> Option<Instant> {
+        if options.answer_within == Duration::ZERO {
+            return None;
+        }
+        self.with_at(now, link, state, |session, cx| session.cancel_but_wait(cx, id));
+        Some(now + options.answer_within)
+    }
+
     fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
         self.with_at(now, link, state, |session, cx| session.cancel(cx, id));
         state.forget(id);
@@ -379,6 +396,11 @@ impl<T: Send + 'static> Engine<T> {
 /// Why a call has no results, with what its service has said.
 fn failed(error: Error, failure: Option<Box<Failure>>) -> CallError {
     CallError::new(error, failure.map(|failure| Detail::Service(*failure)))
+}
+
+/// A call that was given up before its deadline passed is a cancelled one.
+pub(super) fn of_given_up(is_given_up: bool, error: CallError) -> CallError {
+    if is_given_up && error.error == Error::TimedOut { Error::Cancelled.into() } else { error }
 }
 
 /// Where the peer's version of a function differs.

@@ -61,8 +61,8 @@ impl Serving {
     pub(crate) fn fail(&self, failure: Failure) {
         let Some(link) = self.link.upgrade() else { return };
         let mut state = link.lock();
-        // Of a call that has ended nothing would take it.
-        if !state.session.is_cancelled(self.ticket) {
+        // Of a call that has ended nothing would take it. One that was given up is answered: its caller may wait for that.
+        if !state.session.is_answered(self.ticket) {
             state.details.failed(self.ticket, failure);
         }
     }

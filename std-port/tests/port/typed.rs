@@ -11,7 +11,7 @@ use cara_std::{
     Parameters, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, TypedCall, Variables, interface,
 };
 
-use crate::support::{PATIENCE, fleet, meet, system, unit, until};
+use crate::support::{PATIENCE, fleet, held, meet, number, pair, system, unit, until};
 
 #[derive(Variables, Clone, Copy, Debug, Default, PartialEq)]
 enum Mode {
@@ -73,7 +73,7 @@ impl Dock for Gate {
             std::thread::sleep(std::time::Duration::from_millis(20));
             if call.is_cancelled() {
                 self.given_up += 1;
-                return Err(ServiceError::Failed(1));
+                return Err(call.fail_with(1, "given up", &Blocked { at: [5, 6] }));
             }
             if from == 11 && left < 9 {
                 return Err(call.fail_with(7, "the way is blocked", &Blocked { at: [3, -4] }));
@@ -118,6 +118,71 @@ fn progress_and_failures_come_typed() {
     let reported = NewestDockClient::at(&peer).dock(1).wait().unwrap_err();
     assert!(matches!(reported.mismatch(), Some(what) if what.part == Part::Failure), "{reported}");
     assert!(reported.to_string().contains("its failure's at is int[2] there and int[3] here"), "{reported}");
+    manager.stop();
+    agv.stop();
+}
+
+/// Given up by what watches it, and by another thread.
+#[test]
+fn a_call_that_is_given_up_gets_its_answer_where_it_asks_for_that() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    let gate = Gate::default();
+    let started = gate.started.clone();
+    let agv = unit("agv", 7, fleet).state(gate).build().unwrap();
+    agv.my_function_list().serve(DockServer).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let client = DockClient::at(&peer);
+    let mut heard = 0;
+    let breaks = |_: Left| {
+        heard += 1;
+        ControlFlow::Break(())
+    };
+    let watched = client.dock(1_500).watch(breaks).answer_within(PATIENCE).timeout(PATIENCE).wait().unwrap_err();
+    assert_eq!(heard, 1, "nothing is heard any more once it is given up");
+    let canceller = Canceller::new();
+    let call = client.dock(1_500).cancelled_by(&canceller).answer_within(PATIENCE).timeout(PATIENCE);
+    let cancelled = std::thread::scope(|scope| {
+        let waiting = scope.spawn(|| call.wait().unwrap_err());
+        until("it runs", || started.load(Ordering::SeqCst) == 2);
+        canceller.cancel();
+        waiting.join().unwrap()
+    });
+    for failed in [watched, cancelled] {
+        assert_eq!(failed.error, Error::Service(ServiceError::Failed(1)));
+        assert_eq!((failed.text(), failed.values()), ("given up", Some(Blocked { at: [5, 6] })));
+    }
+    assert_eq!(client.dock(0).wait(), Ok(()), "the link goes on");
+    manager.stop();
+    agv.stop();
+}
+
+#[test]
+fn an_answer_that_does_not_come_in_time_is_not_waited_for() {
+    let (manager, agv) = pair();
+    let at_gate = Arc::new(crate::support::Gate::default());
+    agv.my_function_list().add_function("held", &number(0), held(&at_gate)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let canceller = Canceller::new();
+    let ended = std::thread::scope(|scope| {
+        let (within, canceller, peer) = (Duration::from_millis(50), &canceller, &peer);
+        let waiting = scope.spawn(move || {
+            let mut number = number(4);
+            let call = peer.call("held", &mut number).timeout(PATIENCE).cancelled_by(canceller);
+            call.answer_within(within).wait().unwrap_err().error
+        });
+        until("it runs", || at_gate.came() == 1);
+        canceller.cancel();
+        waiting.join().unwrap()
+    });
+    assert_eq!(ended, Error::Cancelled);
+    at_gate.open();
+    until("its answer reaches no one", || manager.counted(LinkCounter::RepliesLate) == 1);
+    let canceller = Canceller::new();
+    canceller.cancel();
+    let mut seven = number(7);
+    let unsent = peer.call("held", &mut seven).cancelled_by(&canceller).answer_within(PATIENCE).wait();
+    assert_eq!(unsent, Err(Error::Cancelled.into()), "what was not sent has no answer");
     manager.stop();
     agv.stop();
 }

@@ -189,6 +189,11 @@ impl<P: Port> Session<P> {
         self.details.progress(&mut self.wire, &self.calls, cx, ticket, values)
     }
 
+    /// Whether a call has been answered, or its link has ended.
+    pub fn is_answered(&self, ticket: Ticket) -> bool {
+        self.calls.call(ticket).is_none()
+    }
+
     /// Whether the caller of a running call has given it up; also where the call has ended.
     pub fn is_cancelled(&self, ticket: Ticket) -> bool {
         self.calls.call(ticket).is_none_or(|head| head.cancelled != Cancelled::No)

@@ -1,7 +1,7 @@
 //! What is told of a call beside its results: why it failed, what it tells while it runs, and that its caller has given it up.
 //!
 //! Nothing of it is in the way of anything else. A failure loses its values and then its text where they do not fit, and never its
-//! code; progress is sent when nothing waits to be sent, or not at all; a cancellation is heard once and answered by nothing.
+//! code; progress is sent when nothing waits to be sent, or not at all; a cancellation is heard once, and has no answer but that of its call.
 
 use super::wire::{Phase, Wire};
 use super::{Event, Results, due};

@@ -215,6 +215,17 @@ impl<P: Port> Calling<P> {
         self.release_call(wire, cx, id, pending);
     }
 
+    /// As [`cancel`](Self::cancel), but the call stays open for its answer.
+    pub(super) fn cancel_but_wait(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId) {
+        let Some(&pending) = self.requests.waiting_for(id) else { return };
+        Self::send_cancel(wire, cx, &pending);
+        if let Some(class) = pending.leased {
+            // Not tried again: the cancellation releases as well, and nothing is renewed from here on.
+            self.stop_renewing(id);
+            Self::send_release(wire, cx, id, class);
+        }
+    }
+
     /// The peer is told that a call has no caller any more. In the stream alone, and at most once: what such a call moves is
     /// released as well, which is not lost.
     pub(super) fn send_cancel(wire: &mut Wire<P>, cx: &mut Context<'_, P>, pending: &Pending) {

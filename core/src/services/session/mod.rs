@@ -643,6 +643,12 @@ impl<P: Port> Session<P> {
         self.calling.cancel(&mut self.wire, cx, id);
     }
 
+    /// The caller gives a call up, and still wants to hear its answer: the handler is told and what it moves stops, as by
+    /// [`cancel`](Self::cancel), which ends the call where no answer comes in time.
+    pub fn cancel_but_wait(&mut self, cx: &mut Context<'_, P>, id: CallId) {
+        self.calling.cancel_but_wait(&mut self.wire, cx, id);
+    }
+
     /// Releases all calls of a function of the peer, those that are on their way as well: what they started stops.
     ///
     /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.

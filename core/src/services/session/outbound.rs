@@ -47,6 +47,8 @@ pub struct RequestOptions {
     pub made: Option<Made>,
     /// Tell what the call tells while it runs, if its function declares that.
     pub progress: bool,
+    /// Once it is given up its answer is still waited for, so long at most; zero for not at all. Only on Linux.
+    pub answer_within: Duration,
 }
 
 impl RequestOptions {
@@ -61,6 +63,7 @@ impl RequestOptions {
             operator: false,
             made: None,
             progress: false,
+            answer_within: Duration::ZERO,
         }
     }
 

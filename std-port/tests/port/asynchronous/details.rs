@@ -2,6 +2,7 @@
 
 use std::cell::Cell;
 use std::ops::ControlFlow;
+use std::sync::Arc;
 
 use cara_std::{
     Canceller, Constraints, Definition, Error, Failure, LinkCounter, Parameters, ParametersView, Served, ServiceError,
@@ -10,7 +11,7 @@ use cara_std::{
 
 use super::{once, patient, runtime};
 use crate::details::{assert_blocked, blocked, left, serve};
-use crate::support::{counter, fleet, meet, number, pair, system, unit, until, value};
+use crate::support::{PATIENCE, counter, fleet, held, meet, number, pair, system, unit, until, value};
 use crate::typed::{Blocked, DockClient, DockServer, Gate, Left, NewerDockClient};
 
 #[test]
@@ -55,11 +56,53 @@ fn a_task_awaits_what_a_typed_call_tells() {
         assert_eq!((failed.text(), failed.values()), ("the way is blocked", Some(Blocked { at: [3, -4] })));
         let failed = client.dock(500).watch(|_| ControlFlow::Break(())).await.unwrap_err();
         assert_eq!(failed, Error::Cancelled);
+        let mut heard = 0;
+        let breaks = |_| {
+            heard += 1;
+            ControlFlow::Break(())
+        };
+        let failed = client.dock(500).watch(breaks).answer_within(PATIENCE).await.unwrap_err();
+        assert_eq!((failed.text(), failed.values(), heard), ("given up", Some(Blocked { at: [5, 6] }), 1));
         let newer = NewerDockClient::at(&peer);
         let failed = newer.dock(1).watch(|_| unreachable!("nothing is sent")).await.unwrap_err();
         assert!(failed.to_string().contains("its progress left is int there and float here"), "{failed}");
     });
-    until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 1));
+    until("its service has been told", || agv.with_state(|gate| gate.given_up).is_ok_and(|count| count == 2));
+    manager.stop();
+    agv.stop();
+}
+
+/// By a canceller that no progress wakes; then of a service that does not answer.
+#[test]
+fn a_task_awaits_the_answer_of_a_call_that_is_given_up() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(Gate::default()).build().unwrap();
+    agv.my_function_list().serve(DockServer).unwrap();
+    let at_gate = Arc::new(crate::support::Gate::default());
+    agv.my_function_list().add_function("held", &number(0), held(&at_gate)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let canceller = Canceller::new();
+    let button = canceller.clone();
+    let pressed = std::thread::spawn({
+        let at_gate = at_gate.clone();
+        move || {
+            until("it runs", || at_gate.came() == 1);
+            button.cancel();
+        }
+    });
+    runtime().block_on(async {
+        let client = DockClient::at(&peer).with(patient());
+        let mut four = number(4);
+        let held = peer.call("held", &mut four).with(patient()).cancelled_by(&canceller);
+        let within = std::time::Duration::from_millis(50);
+        assert_eq!(held.answer_within(within).await.unwrap_err(), Error::Cancelled);
+        let failed = client.dock(500).cancelled_by(&canceller).answer_within(PATIENCE).await.unwrap_err();
+        assert_eq!(failed, Error::Cancelled, "it was not sent");
+    });
+    pressed.join().unwrap();
+    at_gate.open();
+    until("its answer reaches no one", || manager.counted(LinkCounter::RepliesLate) == 1);
     manager.stop();
     agv.stop();
 }

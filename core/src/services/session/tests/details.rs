@@ -35,6 +35,10 @@ impl Side {
         self.session.progress(context!(self), call.ticket, &x(value))
     }
 
+    fn cancel_but_wait(&mut self, id: CallId) {
+        self.session.cancel_but_wait(context!(self), id);
+    }
+
     /// Calls that were given up while they ran, as the port is told.
     fn cancelled(&self) -> usize {
         self.count(|event| matches!(event, Event::Cancelled(_)))
@@ -238,6 +242,25 @@ fn a_call_that_is_cancelled_is_told_to_its_handler_once_and_its_order_ends() {
     pair.agv.answer_held(Ok(&*none()));
     pair.run(LEASE);
     assert_eq!((pair.manager.outcome(id), pair.manager.counter(LinkCounter::RepliesLate)), (None, 1));
+    assert_eq!((pair.agv.cancelled(), pair.agv.stops()), (1, 1));
+}
+
+#[test]
+fn a_call_that_is_cancelled_stops_at_once_though_its_answer_is_waited_for() {
+    let (mut pair, slot) = moving();
+    let (id, call) = begin(&mut pair, "go");
+    pair.manager.cancel_but_wait(id);
+    pair.settle();
+    assert_eq!((pair.agv.cancelled(), pair.agv.stops()), (1, 1));
+    assert!(!pair.agv.is_live(slot) && pair.agv.session.is_cancelled(call.ticket));
+    pair.run(LEASE);
+    assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 0, "nothing is renewed any more");
+    assert!(!pair.agv.session.is_answered(call.ticket));
+    pair.agv.fail(&blocked("given up")).unwrap();
+    pair.settle();
+    assert!(pair.agv.session.is_answered(call.ticket));
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::Service(ServiceError::Failed(7)));
+    assert_eq!(pair.manager.counter(LinkCounter::RepliesLate), 0);
     assert_eq!((pair.agv.cancelled(), pair.agv.stops()), (1, 1));
 }
 
