@@ -10,7 +10,7 @@ use cara_core::error::Error;
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
-use super::protocol::{Answer, CallQuestion, Failure, Question};
+use super::protocol::{Answer, CallQuestion, Failure, Question, unix_ms};
 use super::stop::{self, Which};
 use super::{call, constraint, describe, everybody, hold, select, stream};
 use crate::{CommunicationSystem, Finding, Identity, Peer};
@@ -23,6 +23,8 @@ pub(super) type Lives<'l> = &'l dyn Fn() -> Option<Instant>;
 
 /// Events that wait to be written before some are lost.
 const EVENTS: usize = 1024;
+/// How long a refusal is shown. A node that still tries is refused again within [`LONGEST_SEARCH`](cara_core::config::LONGEST_SEARCH).
+const REFUSED: Duration = Duration::from_secs(300);
 /// Bytes of metrics in one answer.
 #[cfg(feature = "metrics")]
 const PIECE_BYTES: usize = 256 * 1024;
@@ -203,7 +205,8 @@ fn nodes<T: Send + 'static>(
         let peer = finding.identity.as_ref().and_then(|identity| system.node(identity));
         peer.and_then(|peer| peer.connected_for()).is_some_and(|connected| connected < system.age(finding))
     };
-    for finding in system.findings().into_iter().filter(|finding| !has_joined_since(finding)) {
+    let is_over = |finding: &Finding| system.age(finding) > REFUSED || has_joined_since(finding);
+    for finding in system.findings().into_iter().filter(|finding| !is_over(finding)) {
         send(sink, Answer::Refused(describe::refused(&finding, system.age(&finding))))?;
     }
     Ok(())
@@ -295,6 +298,7 @@ fn watch<T: Send + 'static>(
     let (events, lost) = system.events_with_losses(EVENTS);
     let notify = |event: &str, text: String| Answer::Event {
         at_ms: system.uptime().as_millis(),
+        unix_ms: unix_ms(),
         event: event.to_owned(),
         node: None,
         text,

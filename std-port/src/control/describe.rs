@@ -11,7 +11,7 @@ use cara_core::time::Duration;
 use super::failure::name_of;
 use super::protocol::{
     Answer, ConstraintsInfo, FunctionInfo, InhibitedInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo, OrderInfo,
-    RefusedInfo, SchedulingInfo, UnitInfo,
+    RefusedInfo, SchedulingInfo, UnitInfo, unix_ms,
 };
 use crate::keys::LiveRing;
 use crate::{CommunicationSystem, Interface, Limits, Peer, Refusal, TheirFunction, UnitEvent};
@@ -204,7 +204,8 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         }
         other => ("other", None, format!("{other:?}")),
     };
-    Answer::Event { at_ms: at.as_millis(), event: name.to_owned(), node: node.map(Identity::to_string), text }
+    let (event, node) = (name.to_owned(), node.map(Identity::to_string));
+    Answer::Event { at_ms: at.as_millis(), unix_ms: unix_ms(), event, node, text }
 }
 
 /// The class of a word.

@@ -5,6 +5,7 @@
 use cara_core::config::SHORT_SEGMENT;
 use cara_core::distribution::function::Attributes;
 use std::collections::BTreeMap;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -301,6 +302,9 @@ pub enum Answer {
     Event {
         /// Milliseconds since the unit's start.
         at_ms: u64,
+        /// Milliseconds since 1970, when this was reported. A unit that does not report it runs on the reader's host.
+        #[serde(default = "unix_ms")]
+        unix_ms: u64,
         /// Its name, as `joined` or `request_failed`.
         event: String,
         /// The node that it is about.
@@ -589,6 +593,11 @@ pub enum DatagramsInfo {
     ToNode,
     /// In neither.
     None,
+}
+
+/// Milliseconds since 1970 now.
+pub(super) fn unix_ms() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis() as u64
 }
 
 /// A refusal.

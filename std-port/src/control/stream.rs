@@ -1,7 +1,7 @@
 //! Values of a node's streams, for an operator. However many ask, the node's link has one subscription.
 
 use std::collections::HashMap;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::Instant;
 
 use cara_core::distribution::function::Definition;
 use cara_core::error::Error;
@@ -9,7 +9,7 @@ use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
 use super::answering::{End, LOOK, Sink, permit, send};
-use super::protocol::Answer;
+use super::protocol::{Answer, unix_ms};
 use super::{select, values};
 use crate::{CommunicationSystem, Identity, Peer, Sample, Subscription};
 
@@ -114,11 +114,10 @@ fn last_values<T: Send + 'static>(system: &CommunicationSystem<T>, peer: &Peer<T
 }
 
 fn answer<T: Send + 'static>(peer: &Peer<T>, stream: &Definition, sample: Result<&Sample, Error>) -> Answer {
-    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     Answer::Value {
         node: peer.identity().to_string(),
         stream: sample.map_or_else(|_| stream.to_string(), |sample| sample.signature().to_string()),
-        unix_ms: unix.as_millis() as u64,
+        unix_ms: unix_ms(),
         age_us: sample.ok().map(|sample| sample.age().as_micros()),
         values: sample
             .map_or_else(|_| Vec::new(), |sample| values::arguments(sample.signature().results(), &sample.values())),

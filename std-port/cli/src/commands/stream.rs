@@ -14,9 +14,9 @@ use crate::text::show_call;
 use cara_tools::exit::Exit;
 use cara_tools::global::Global;
 use cara_tools::output::{self, BAD, FAINT};
-use cara_tools::units::{parse_time, show_micros};
+use cara_tools::units::{parse_time, show_micros, show_time};
 
-/// Shows the values of a stream as they come, each with its age and the time of day (UTC); without a name, the last value of each
+/// Shows the values of a stream as they come, each with its age and the time (UTC); without a name, the last value of each
 /// stream of the node. Ctrl-C ends it. Of several that watch one stream through one unit the node sees one.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
@@ -83,27 +83,16 @@ fn show(
             output::line(format_args!("{BAD}{name}: {error}:{BAD:#} {}", Shown(text)))
         }
         (Some(age), None) => {
-            let (age, time) = (show_micros(age as f64), time_of_day(unix_ms));
+            let (age, time) = (show_micros(age as f64), show_time(unix_ms));
             output::line(format_args!("{FAINT}{time}{FAINT:#}  {}  {FAINT}{age} old{FAINT:#}", show_call(name, values)))
         }
         (None, None) => output::line(format_args!("{stream}  {FAINT}no value yet{FAINT:#}")),
     }
 }
 
-/// `14:03:59.123`, UTC.
-fn time_of_day(unix_ms: u64) -> String {
-    let (seconds, millis) = (unix_ms / 1000 % 86_400, unix_ms % 1000);
-    format!("{:02}:{:02}:{:02}.{millis:03}", seconds / 3600, seconds / 60 % 60, seconds % 60)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_time_is_shown_as_a_clock_does() {
-        assert_eq!(time_of_day(86_400_000 * 3 + 14 * 3_600_000 + 3 * 60_000 + 59_123), "14:03:59.123");
-    }
 
     #[test]
     fn a_rate_is_a_number_above_zero() {

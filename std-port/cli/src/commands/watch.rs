@@ -11,9 +11,10 @@ use crate::operator::{Need, Operator};
 use cara_tools::exit::Exit;
 use cara_tools::global::Global;
 use cara_tools::output::{self, BAD, FAINT, GOOD, PLAIN};
-use cara_tools::units::parse_time;
+use cara_tools::units::{parse_time, show_time};
 
-/// Shows what happens, as it happens: joined, left, refused, failed requests, leases that end. Ctrl-C ends it.
+/// Shows what happens, as it happens: joined, left, refused, failed requests, leases that end, each with its time (UTC). Ctrl-C
+/// ends it.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// End after this time.
@@ -28,10 +29,12 @@ pub(crate) fn run(Arguments { span, count }: Arguments, global: &Global) -> anyh
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let mut left = count.unwrap_or(u64::MAX);
     operator.watch(&Question::Watch, span, |answer| {
-        let Answer::Event { at_ms, event, node, text } = answer else { return Ok(true) };
+        let Answer::Event { at_ms, unix_ms, event, node, text } = answer else { return Ok(true) };
         match global.json {
-            true => output::object(&json!({ "at_ms": at_ms, "event": event, "node": node, "text": text }))?,
-            false => show(at_ms, &event, node.as_deref(), &text)?,
+            true => output::object(
+                &json!({ "at_ms": at_ms, "unix_ms": unix_ms, "event": event, "node": node, "text": text }),
+            )?,
+            false => show(unix_ms, &event, node.as_deref(), &text)?,
         }
         left -= u64::from(event != "watching");
         Ok(left > 0)
@@ -39,16 +42,12 @@ pub(crate) fn run(Arguments { span, count }: Arguments, global: &Global) -> anyh
     Ok(Exit::Done.into())
 }
 
-fn show(at_ms: u64, event: &str, node: Option<&str>, text: &str) -> std::io::Result<()> {
+fn show(unix_ms: u64, event: &str, node: Option<&str>, text: &str) -> std::io::Result<()> {
     let style = match event {
         "joined" => GOOD,
         "left" | "not_joined" | "request_failed" | "lease_expired" => BAD,
         _ => PLAIN,
     };
-    let (seconds, millis) = (at_ms / 1000, at_ms % 1000);
-    let node = node.unwrap_or("-");
-    output::line(format_args!(
-        "{FAINT}{seconds:>7}.{millis:03} s{FAINT:#}  {style}{event:<17}{style:#} {node:<20} {}",
-        Shown(text)
-    ))
+    let (time, node) = (show_time(unix_ms), node.unwrap_or("-"));
+    output::line(format_args!("{FAINT}{time}{FAINT:#}  {style}{event:<17}{style:#} {node:<20} {}", Shown(text)))
 }

@@ -49,6 +49,21 @@ pub fn show_micros(micros: f64) -> String {
     format!("{text} {unit}")
 }
 
+/// A time with its date (UTC), as logs have it: `2026-11-27 14:03:59.123Z`.
+pub fn show_time(unix_ms: u64) -> String {
+    let (seconds, millis) = (unix_ms / 1000, unix_ms % 1000);
+    // Years of 365.2425 days on average that begin in March, so that a leap day is the last of its year.
+    let days = seconds / 86_400 + 719_468;
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let of_year = day - (365 * year + year / 4 - year / 100);
+    let from_march = (5 * of_year + 2) / 153;
+    let of_month = of_year - (153 * from_march + 2) / 5 + 1;
+    let (month, next) = if from_march < 10 { (from_march + 3, 0) } else { (from_march - 9, 1) };
+    let (year, hour, minute, second) = (era * 400 + year + next, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60);
+    format!("{year:04}-{month:02}-{of_month:02} {hour:02}:{minute:02}:{second:02}.{millis:03}Z")
+}
+
 /// A number of bytes as people read it: `32 KiB`, `1000 B`.
 pub fn show_bytes(bytes: u64) -> String {
     match bytes {
@@ -73,6 +88,17 @@ mod tests {
         {
             assert!(parse_micros(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn a_time_has_its_date() {
+        let shown = |seconds: u64| show_time(seconds * 1000 + 7);
+        assert_eq!(shown(0), "1970-01-01 00:00:00.007Z");
+        assert_eq!(shown(951_782_399), "2000-02-28 23:59:59.007Z");
+        assert_eq!(shown(951_868_799), "2000-02-29 23:59:59.007Z");
+        assert_eq!(shown(4_107_542_400), "2100-03-01 00:00:00.007Z");
+        assert_eq!(shown(1_795_816_458), "2026-11-27 21:54:18.007Z");
+        assert_eq!(shown(1_798_761_599), "2026-12-31 23:59:59.007Z");
     }
 
     #[test]

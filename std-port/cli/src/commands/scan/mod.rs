@@ -103,7 +103,7 @@ fn joined(nodes: &[NodeInfo]) -> Rows {
                 node.role.clone(),
                 match node.link.and_then(|link| link.trouble()) {
                     Some(trouble) => format!("{state}, {trouble}"),
-                    None => state.into(),
+                    None => state,
                 },
                 or_dash(node.address.clone()),
                 or_dash(node.version.map(|version| version.to_string())),
@@ -115,13 +115,14 @@ fn joined(nodes: &[NodeInfo]) -> Rows {
     rows
 }
 
-fn state(node: &NodeInfo) -> (Style, &str) {
-    match (node.connected, node.expected, node.left_ms) {
-        (true, ..) => (PLAIN, "connected"),
-        _ if node.left_reason.as_deref() == Some("Fenced") => (BAD, node.left_text.as_deref().unwrap_or("left")),
-        (false, true, None) => (BAD, "absent"),
-        (false, true, Some(_)) => (BAD, "left"),
-        (false, false, _) => (FAINT, "left"),
+fn state(node: &NodeInfo) -> (Style, String) {
+    let left = |left_ms: u64| format!("left {}", ago(left_ms));
+    match (node.connected, node.expected, node.left_ms, &node.left_text) {
+        (true, ..) => (PLAIN, "connected".into()),
+        (.., Some(text)) if node.left_reason.as_deref() == Some("Fenced") => (BAD, text.clone()),
+        (false, true, None, _) => (BAD, "absent".into()),
+        (false, true, Some(left_ms), _) => (BAD, left(left_ms)),
+        (false, false, left_ms, _) => (FAINT, left_ms.map_or_else(|| "left".into(), left)),
     }
 }
 
@@ -155,12 +156,19 @@ fn limits(limits: &LimitsInfo) -> String {
     text
 }
 
+/// `3 s ago`.
+fn ago(ms: u64) -> String {
+    let whole = if ms < 60_000 { 1_000 } else { 60_000 };
+    format!("{} ago", show_micros((ms / whole * whole) as f64 * 1000.0))
+}
+
 fn turned_away(refused: &[RefusedInfo]) -> Rows {
     let mut rows = Rows::new(["REFUSED", "ADDRESS", "WHEN", "REASON", "WHAT TO DO"]);
     for RefusedInfo { address, node, reason, text, ago_ms } in refused {
-        let ago = format!("{} ago", show_micros(*ago_ms as f64 * 1000.0));
         let node = node.clone().unwrap_or_else(|| "-".into());
-        rows.add(BAD, [node, address.clone(), ago, reason.clone(), text.clone()]);
+        // A node that still tries is refused again sooner.
+        let style = if *ago_ms > 30_000 { FAINT } else { BAD };
+        rows.add(style, [node, address.clone(), ago(*ago_ms), reason.clone(), text.clone()]);
     }
     rows
 }

@@ -15,6 +15,8 @@ pub(super) type Now = Duration;
 
 /// What was told longer ago than this is old: the manager is asked twice a second.
 const OLD: Duration = Duration::from_secs(2);
+/// Values of a node that left longer ago are shown no more.
+const KEPT_MS: u64 = 60_000;
 /// Events that are kept.
 pub(super) const EVENTS: usize = 500;
 /// Commands whose outcomes are kept.
@@ -73,7 +75,7 @@ pub(super) struct Value {
 #[derive(Clone, Debug)]
 pub(super) struct Event {
     pub(super) number: u64,
-    pub(super) at_ms: Option<u64>,
+    pub(super) unix_ms: u64,
     pub(super) name: String,
     pub(super) node: Option<String>,
     pub(super) text: String,
@@ -87,7 +89,8 @@ pub(super) enum News {
     Gone(String),
     Probe(Probe),
     Event {
-        at_ms: Option<u64>,
+        /// Now if absent.
+        unix_ms: Option<u64>,
         name: String,
         node: Option<String>,
         text: String,
@@ -265,6 +268,8 @@ pub(super) enum Mode {
 pub(super) struct App {
     /// `NAME/ID` of the manager.
     pub(super) manager: String,
+    /// Milliseconds from 1970 to when [`Now`] was 0.
+    pub(super) started_ms: u64,
     pub(super) snapshot: Option<Snapshot>,
     /// When the snapshot came.
     pub(super) reported_at: Now,
@@ -360,7 +365,7 @@ impl App {
             News::Snapshot(snapshot) => self.snapshot_came(*snapshot, now),
             News::Gone(why) => {
                 if self.gone.is_none() {
-                    self.note(None, "manager_gone", None, why.clone());
+                    self.note(self.clock(now), "manager_gone", None, why.clone());
                 }
                 self.gone = Some((self.gone.as_ref().map_or(now, |(since, _)| *since), why));
             }
@@ -373,7 +378,9 @@ impl App {
                 }
                 self.settle(now);
             }
-            News::Event { at_ms, name, node, text } => self.note(at_ms, &name, node, text),
+            News::Event { unix_ms, name, node, text } => {
+                self.note(unix_ms.unwrap_or_else(|| self.clock(now)), &name, node, text);
+            }
             News::Functions { node, signatures } => _ = self.functions.insert(node, signatures),
             News::Line { task, is_bad, text } => {
                 if let Some(task) = self.tasks.iter_mut().find(|known| known.number == task)
@@ -388,12 +395,12 @@ impl App {
 
     fn snapshot_came(&mut self, mut snapshot: Snapshot, now: Now) {
         if self.gone.take().is_some() {
-            self.note(None, "manager_back", None, "the manager answers again".to_owned());
+            self.note(self.clock(now), "manager_back", None, "the manager answers again".to_owned());
         }
         if let Some(before) = &self.snapshot
             && before.unit.epoch != snapshot.unit.epoch
         {
-            self.note(None, "manager_restarted", None, "the manager was started again".to_owned());
+            self.note(self.clock(now), "manager_restarted", None, "the manager was started again".to_owned());
             self.counters.clear();
         }
         if let Some(counters) = snapshot.counters.take() {
@@ -405,16 +412,24 @@ impl App {
         let known: Vec<String> = snapshot.nodes.iter().map(selector).collect();
         let is_known = |node: &String| known.contains(node);
         self.round_trips.retain(|node, _| is_known(node));
-        self.values.retain(|node, _| is_known(node));
+        let gone =
+            snapshot.nodes.iter().filter(|node| !node.connected && node.left_ms.is_none_or(|left| left > KEPT_MS));
+        let gone: Vec<String> = gone.map(selector).collect();
+        self.values.retain(|node, _| is_known(node) && !gone.contains(node));
         self.functions.retain(|node, _| is_known(node));
         self.snapshot = Some(snapshot);
         self.settle(now);
     }
 
-    fn note(&mut self, at_ms: Option<u64>, name: &str, node: Option<String>, text: String) {
+    /// Milliseconds since 1970.
+    fn clock(&self, now: Now) -> u64 {
+        self.started_ms + now.as_millis() as u64
+    }
+
+    fn note(&mut self, unix_ms: u64, name: &str, node: Option<String>, text: String) {
         let number = self.next_event;
         self.next_event += 1;
-        self.events.push_front(Event { number, at_ms, name: name.to_owned(), node, text });
+        self.events.push_front(Event { number, unix_ms, name: name.to_owned(), node, text });
         self.events.truncate(EVENTS);
     }
 

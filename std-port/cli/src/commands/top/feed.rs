@@ -157,8 +157,8 @@ fn snapshot(operator: &mut Operator, with_counters: bool) -> anyhow::Result<Snap
 
 /// Tells events as they come, also after the manager was away.
 fn watch(way: &Way, out: &SyncSender<Message>) -> Result<(), Over> {
-    let event = |at_ms, name: String, node, text: &str| {
-        out.send(Message::News(News::Event { at_ms, name, node, text: cut(text) }))
+    let event = |unix_ms, name: String, node, text: &str| {
+        out.send(Message::News(News::Event { unix_ms, name, node, text: cut(text) }))
     };
     let mut watched = false;
     loop {
@@ -166,9 +166,9 @@ fn watch(way: &Way, out: &SyncSender<Message>) -> Result<(), Over> {
         // Why it has ended is told by who looks.
         let _ = way.open().and_then(|mut operator| {
             operator.watch(&Question::Watch, None, |answer| {
-                let Answer::Event { at_ms, event: name, node, text } = answer else { return Ok(true) };
+                let Answer::Event { unix_ms, event: name, node, text, .. } = answer else { return Ok(true) };
                 watched = true;
-                sent = event(Some(at_ms), name, node, &text);
+                sent = event(Some(unix_ms), name, node, &text);
                 Ok(sent.is_ok())
             })
         });

@@ -17,7 +17,7 @@ use std::io;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use ratatui::crossterm::event::{Event, KeyEventKind};
 
@@ -83,6 +83,7 @@ fn show(
     signal: &AtomicI32,
 ) -> io::Result<Exit> {
     let start = Instant::now();
+    app.started_ms = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis() as u64;
     let (mut drawn, mut due) = (start, start);
     loop {
         let now = Instant::now();

@@ -5,13 +5,15 @@ use std::time::Duration;
 
 use cara_std::control::protocol::{NodeInfo, OrderInfo, RefusedInfo};
 use cara_tools::name_and_id::full_name;
-use cara_tools::units::{show_bytes, show_micros};
+use cara_tools::units::{show_bytes, show_micros, show_time};
 
 use super::app::{App, Counted, Event, Now, Value, View, selector};
 use crate::nodes::without_role;
 
 /// A round trip that was measured longer ago is shown as old.
 const OLD_ROUND_TRIP: Duration = Duration::from_secs(10);
+/// A node that still tries is refused again sooner.
+const OLD_REFUSAL: Duration = Duration::from_secs(30);
 /// A value that is older is shown as old.
 const OLD_VALUE: Duration = Duration::from_secs(5);
 
@@ -61,7 +63,7 @@ const ORDERS: [Column; 6] = [
 ];
 const STREAMS: [Column; 3] = [column("NODE", 16), column("VALUE", 0), column("AGE", 8)];
 const COUNTERS: [Column; 4] = [column("OF", 0), column("COUNTER", 22), column("COUNT", 12), column("GROWN", 9)];
-const EVENTS: [Column; 4] = [column("AT", 11), column("EVENT", 17), column("NODE", 16), column("TEXT", 0)];
+const EVENTS: [Column; 4] = [column("AT (UTC)", 19), column("EVENT", 17), column("NODE", 16), column("TEXT", 0)];
 const NODE: [Column; 2] = [column("WHAT", 22), column("", 0)];
 
 /// Counters of what goes as it should; all others count what was refused, dropped, missed or late.
@@ -246,12 +248,13 @@ fn round_trip(app: &App, now: Now, node: &NodeInfo) -> Cell {
 }
 
 fn refused_row(refused: &RefusedInfo, age: Duration) -> Row {
+    let ago = ms(refused.ago_ms) + age;
     let cells = vec![
         cell(refused.node.as_deref().unwrap_or("?")),
         cell(""),
-        ranked("REFUSED", -1.0).toned(Tone::Bad),
+        ranked("REFUSED", -1.0).toned(if ago > OLD_REFUSAL { Tone::Faint } else { Tone::Bad }),
         cell(""),
-        cell(span(ms(refused.ago_ms) + age)),
+        cell(span(ago)),
         cell(""),
         cell(""),
         cell(""),
@@ -268,34 +271,41 @@ fn known(app: &App, name: &str) -> Option<String> {
     Some(selector(all.find(|node| node.role == "s_unit").unwrap_or(first)))
 }
 
+fn is_connected(app: &App, node: Option<&str>) -> bool {
+    app.nodes().iter().any(|known| known.connected && Some(selector(known).as_str()) == node)
+}
+
 fn orders(app: &App, now: Now, running_alone: bool) -> Vec<Row> {
     let all = app.snapshot.as_ref().map_or(&[][..], |snapshot| &snapshot.orders);
     let shown = all.iter().filter(|order| !running_alone || order.order == "runs" || order.inhibited.is_some());
     let row = |order: &OrderInfo| {
         let name = format!("{}/{}", order.node, order.id);
+        let node = known(app, &name);
+        let is_old = app.is_old(now) || !is_connected(app, node.as_deref());
         let tone = match (order.order.as_str(), order.inhibited) {
             (_, Some(_)) => Tone::Bad,
+            ("runs", None) if is_old => Tone::Faint,
             ("runs", None) => Tone::Good,
             _ => Tone::Plain,
         };
         let cells = vec![
             cell(&name),
             cell(&order.function),
-            cell(if app.is_old(now) { format!("was {}", order.order) } else { order.order.clone() }).toned(tone),
+            cell(if is_old { format!("was {}", order.order) } else { order.order.clone() }).toned(tone),
             cell(order.holder.map_or_else(|| "-".to_owned(), |holder| holder.to_string())),
-            left(app, now, order),
+            left(app, now, order, is_old),
             cell(inhibited(order)).toned(tone),
         ];
-        Row { key: format!("{name} {}", order.function), node: known(app, &name), cells }
+        Row { key: format!("{name} {}", order.function), node, cells }
     };
     shown.map(row).collect()
 }
 
 /// How long it goes on, counted down from when it was told.
-fn left(app: &App, now: Now, order: &OrderInfo) -> Cell {
+fn left(app: &App, now: Now, order: &OrderInfo, is_old: bool) -> Cell {
     match order.left_ms {
         None => ranked("-", f64::INFINITY),
-        Some(_) if app.is_old(now) => ranked("?", f64::INFINITY),
+        Some(_) if is_old => ranked("?", f64::INFINITY),
         Some(left) => {
             let left = ms(left).saturating_sub(app.age(now));
             ranked(span(left), left.as_secs_f64())
@@ -317,7 +327,8 @@ fn streams(app: &App, now: Now) -> Vec<Row> {
     let of_node = |(node, (at, values)): (&String, &(Now, Vec<Value>))| {
         let row = |value: &Value| {
             let age = value.age.map(|age| age + now.saturating_sub(*at));
-            let is_old = age.is_none_or(|age| age > OLD_VALUE) || app.is_old(now);
+            let is_gone = !is_connected(app, Some(node));
+            let is_old = is_gone || age.is_none_or(|age| age > OLD_VALUE) || app.is_old(now);
             let tone = if is_old { Tone::Faint } else { Tone::Plain };
             let cells = vec![
                 cell(without_role(node)),
@@ -359,7 +370,8 @@ fn counters(app: &App) -> Vec<Row> {
 pub(super) fn events(app: &App, of: Option<&str>) -> Vec<Row> {
     let shown = app.events.iter().filter(|event| of.is_none_or(|of| event.node.as_deref() == Some(of)));
     let row = |event: &Event| {
-        let at = event.at_ms.map_or_else(|| "-".to_owned(), |at| format!("{}.{:03} s", at / 1000, at % 1000));
+        // To the second, which leaves more of a terminal to the text.
+        let at = show_time(event.unix_ms)[..19].to_owned();
         let tone = event_tone(&event.name);
         let cells = vec![
             ranked(at, event.number as f64),

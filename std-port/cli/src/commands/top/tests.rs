@@ -136,7 +136,7 @@ fn probe(node: &str) -> News {
 }
 
 fn event(name: &str, node: &str, text: &str) -> News {
-    News::Event { at_ms: Some(12_345), name: name.into(), node: Some(node.into()), text: text.into() }
+    News::Event { unix_ms: Some(1_795_816_458_345), name: name.into(), node: Some(node.into()), text: text.into() }
 }
 
 /// Everything at second 10.
@@ -221,14 +221,32 @@ cara top  depot/1  fleet 7  secured  up 3 min
   agv/2          go_to         stopped      1       -       by unit 4
 
 ── Events, newest first: 2 ─────────────────────────────────────────────────────
-  12.345 s    left              lift/3           nothing was heard of it
-  12.345 s    joined            agv/1            is connected
+  2026-11-27 21:54:18 left              lift/3           nothing was heard of it
+  2026-11-27 21:54:18 joined            agv/1            is connected
 
 
 
 S STOP ALL  s stop  c call  r reset  Enter watch  / filter  ? help  q quit
 ",
     );
+}
+
+#[test]
+fn nothing_of_a_node_that_is_gone_looks_live() {
+    let mut app = app();
+    let mut later = snapshot();
+    later.nodes.retain(|node| node.id != 1);
+    later.nodes.push(NodeInfo { left_ms: Some(3_000), ..lost("agv", 1) });
+    later.refused[0].ago_ms = 31_000;
+    app.reported(News::Snapshot(Box::new(later.clone())), at(10_000));
+    letter(&mut app, '2');
+    let shown = screen(&app, at(10_100));
+    assert!(shown.contains("agv/1          go_to         was runs     1       ?"), "{shown}");
+    letter(&mut app, '3');
+    assert!(screen(&app, at(10_100)).contains("pose(x: 7)"));
+    later.nodes.last_mut().unwrap().left_ms = Some(61_000);
+    app.reported(News::Snapshot(Box::new(later)), at(10_000));
+    assert!(!screen(&app, at(10_100)).contains("pose(x: 7)"), "it has been gone for a minute");
 }
 
 #[test]
@@ -264,9 +282,9 @@ fn each_other_view_is_a_table_of_its_own() {
         (
             '5',
             "
-  AT          EVENT             NODE             TEXT
-  12.345 s    left              lift/3           nothing was heard of it
-  12.345 s    joined            agv/1            is connected
+  AT (UTC)            EVENT             NODE             TEXT
+  2026-11-27 21:54:18 left              lift/3           nothing was heard of it
+  2026-11-27 21:54:18 joined            agv/1            is connected
 ",
         ),
     ] {
@@ -305,7 +323,7 @@ cara top  depot/1  fleet 7  secured  up 3 min
   stream                 battery: no value yet  - old
   function               go_to(position: int[2])
   RequestsBusy           3
-  12.345 s               joined: is connected
+  2026-11-27 21:54:18    joined: is connected
 
 
 
