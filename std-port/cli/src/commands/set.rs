@@ -77,6 +77,11 @@ pub(crate) fn run(Arguments { node, constraint, value }: Arguments, global: &Glo
     Ok(Exit::Done.into())
 }
 
+/// The names of all constraints.
+pub(super) fn names() -> impl Iterator<Item = &'static str> {
+    CONSTRAINTS.iter().map(|(name, ..)| *name)
+}
+
 fn find(wanted: &str) -> anyhow::Result<Known> {
     let wanted = wanted.replace('-', "_");
     let found = CONSTRAINTS.into_iter().find(|(name, ..)| *name == wanted);

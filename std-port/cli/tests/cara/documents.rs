@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::support::Stage;
+use crate::support::{Stage, until};
 
 const REFERENCE: &str = "../../docs/cara.md";
 
@@ -61,6 +61,31 @@ fn the_bash_completion_is_read_by_bash() {
     let ran = std::process::Command::new("bash").args(["-c", &format!("{script}\n{complete}")]).output();
     let Ok(ran) = ran else { return println!("skipped: no bash here") };
     assert_eq!(String::from_utf8_lossy(&ran.stdout).trim(), "scan", "{}", String::from_utf8_lossy(&ran.stderr));
+}
+
+#[test]
+fn names_of_the_running_unit_are_completed() {
+    let stage = Stage::with(&["agv-1"]);
+    let names = |words: &[&str]| stage.ends(0, &[&["completions", "--line", "--"], words].concat()).out;
+    // A busy host may not answer in the time that a shell waits.
+    until("its nodes are completed", || names(&["ping", "a"]) == "agv-1\n");
+    until("and their functions", || names(&["call", "agv-1", "g"]).contains("go_to\n"));
+    assert_eq!(names(&["call", "agv-1", "zz"]), "");
+    assert_eq!(names(&["set", ".", "chunk"]), "chunk_size\n");
+    let script = stage.ends(0, &["completions", "bash"]).out;
+    let complete = "COMP_WORDS=(cara ping agv); COMP_CWORD=2; _cara_names cara agv ping; echo \"${COMPREPLY[@]}\"";
+    let folder = Path::new(env!("CARGO_BIN_EXE_cara")).parent().unwrap().display();
+    let path = format!("{folder}:{}", std::env::var("PATH").unwrap_or_default());
+    let mut bash = std::process::Command::new("bash");
+    bash.args(["-c", &format!("{script}\n{complete}")]).env("CARA_CONTROL_DIR", stage.control()).env("PATH", path);
+    match bash.output() {
+        Ok(_) => until("bash asks", || String::from_utf8_lossy(&bash.output().unwrap().stdout).trim() == "agv-1"),
+        Err(_) => println!("skipped: no bash here"),
+    }
+    // Nobody answers, and nobody is there.
+    stage.freeze_manager();
+    assert_eq!(stage.ends(0, &["completions", "--line", "--", "ping", ""]).everything(), "");
+    assert_eq!(Stage::empty().ends(0, &["completions", "--line", "--", "ping", ""]).everything(), "");
 }
 
 #[test]
