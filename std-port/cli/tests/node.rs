@@ -160,6 +160,29 @@ fn all_mistakes_of_form_are_told_at_once() {
 }
 
 #[test]
+fn a_check_refuses_what_could_not_start() {
+    let folder = TempDir::new().unwrap();
+    let keys = cara_test_keys::KeyFolder::draw(3, &["depot/1@m_unit", "agv/2"]).unwrap();
+    let file = |node: &str| keys.path().join(format!("{node}-3.keys")).display().to_string();
+    let check = |more: &str| {
+        std::fs::write(folder.path().join("a.toml"), format!("name = \"depot\"\nid = 1\nfleet = 3\n{more}\n")).unwrap();
+        let checked = outcome(folder.path(), &["--check", "a.toml"]);
+        (checked.status.code(), text(&checked.stderr))
+    };
+    assert_eq!(check(&format!("keys = {:?}", file("depot-1-m_unit"))).0, Some(0));
+    for (more, part) in [
+        (format!("keys = {:?}", file("agv-2-s_unit")), "has the keys of agv/2"),
+        ("keys = \"/etc/passwd\"".to_owned(), "is no file of `cara keys`"),
+        ("m_units = [\"hall/2\", \"depot/1\"]".to_owned(), "is this node itself"),
+    ] {
+        let (code, reported) = check(&more);
+        assert!(code == Some(2) && reported.contains(part) && !reported.contains("chmod"), "{reported}");
+    }
+    std::fs::write(folder.path().join("a.toml"), [0xFF, 0xFE, b'n', 0]).unwrap();
+    assert!(text(&outcome(folder.path(), &["--check", "a.toml"]).stderr).contains("is UTF-16"));
+}
+
+#[test]
 fn the_example_is_correct() {
     let folder = TempDir::new().unwrap();
     let example = outcome(folder.path(), &["--example"]).stdout;

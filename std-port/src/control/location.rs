@@ -36,7 +36,9 @@ pub(super) enum LocationError {
     NoDirectory(PathBuf),
     #[error("{path} belongs to user {owner}: remove it, or set CARA_CONTROL_DIR to a directory of your own")]
     Foreign { path: PathBuf, owner: u32 },
-    #[error("others can enter {path} (mode {mode:o}): `chmod 700` it, or set CARA_CONTROL_DIR to one of your own")]
+    #[error(
+        "others can enter {path} (mode {mode:o}): set CARA_CONTROL_DIR to a directory of your own, or, if nothing but control sockets is in this one, `chmod 700` it"
+    )]
     Open { path: PathBuf, mode: u32 },
     #[error("another process answers on {0}: does a unit of the same name, id and fleet run already?")]
     InUse(PathBuf),

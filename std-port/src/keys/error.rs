@@ -43,7 +43,7 @@ pub enum KeyError {
     },
     /// Others than the owner can read or write the file.
     #[error(
-        "others can read or write {} (mode {mode:o}): `{}`. {}", path.display(),
+        "others can read or write {} (mode {mode:o}), as a copy or an editor leaves it: `{}`. {}", path.display(),
         command(&["chmod", "600", &path.to_string_lossy()]), Kind::of(path).if_read()
     )]
     Open {
@@ -65,6 +65,9 @@ pub enum KeyError {
         /// The user of this process.
         own: u32,
     },
+    /// A file of something else, whose owner and permissions are right as they are.
+    #[error("{} is no file of `cara keys`: name the file with a node's keys, as `cara keys show` lists it", .0.display())]
+    NotOurs(PathBuf),
     /// A folder, a pipe or a device.
     #[error(
         "{} is no file: name the file with the keys, or the folder that it is in; where this is in the place of one, move \
@@ -245,6 +248,16 @@ pub enum FleetError {
     /// Generations have an end.
     #[error("there are no more generations: make new keys for the fleet with `{} NODE...`", keys(*.0, &["new-fleet"]))]
     Exhausted(Fleet),
+}
+
+impl KeyError {
+    /// The same of a file that is none of `cara keys`: nothing about it is to be changed.
+    pub(super) fn of_another_file(self) -> Self {
+        match self {
+            Self::Open { path, .. } | Self::Foreign { path, .. } => Self::NotOurs(path),
+            other => other,
+        }
+    }
 }
 
 impl FleetError {

@@ -2,7 +2,7 @@
 
 use std::fs::{DirBuilder, File, Metadata, OpenOptions};
 use std::io::{self, Read, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, FileExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
@@ -50,7 +50,7 @@ pub(super) fn form(path: &Path, FormError { line, what }: FormError) -> KeyError
 pub(super) fn read(path: &Path) -> Result<(Zeroizing<String>, Mark), KeyError> {
     let mut file = open(path)?;
     let found = file.metadata().map_err(|error| system(path, error))?;
-    check(path, &found)?;
+    check(path, &found).map_err(|error| if is_ours(path, Some(&file)) { error } else { error.of_another_file() })?;
     // All of it at once: a buffer that grows leaves pieces behind.
     let mut bytes = Zeroizing::new(vec![0; found.len() as usize]);
     file.read_exact(&mut bytes).map_err(|error| system(path, error))?;
@@ -87,7 +87,10 @@ fn open(path: &Path) -> Result<File, KeyError> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);
     opened.map_err(|error| match (error.kind(), path.metadata()) {
-        (io::ErrorKind::PermissionDenied, Ok(found)) if found.uid() != own() => foreign(path, found.uid()),
+        (io::ErrorKind::PermissionDenied, Ok(found)) if found.uid() != own() => match is_ours(path, None) {
+            true => foreign(path, found.uid()),
+            false => foreign(path, found.uid()).of_another_file(),
+        },
         _ => system(path, error),
     })
 }
@@ -106,6 +109,17 @@ fn check(path: &Path, found: &Metadata) -> Result<(), KeyError> {
         return Err(form(path, FormError { line: 1, what: "the file is longer than any with keys" }));
     }
     Ok(())
+}
+
+/// Whether `cara keys` made the file, by its name or by what it begins with.
+fn is_ours(path: &Path, file: Option<&File>) -> bool {
+    let is_named = path.extension().is_some_and(|end| ["keys", "root", "nodes"].iter().any(|known| end == *known));
+    let mut head = Zeroizing::new([0; 512]);
+    let length = file.and_then(|file| file.read_at(&mut *head, 0).ok()).unwrap_or(0);
+    is_named
+        || String::from_utf8_lossy(&head[..length])
+            .lines()
+            .any(|line| line.trim_start_matches('\u{feff}').starts_with("cara-"))
 }
 
 fn own() -> u32 {
@@ -221,6 +235,8 @@ mod tests {
     use std::fs::{Permissions, set_permissions};
     use std::os::unix::fs::PermissionsExt;
 
+    const SECRET: &str = "cara-ring 1\n";
+
     fn create(path: &Path, text: &str) -> Result<(), KeyError> {
         Staged::write(path, text.as_bytes())?.put_new()
     }
@@ -296,7 +312,12 @@ mod tests {
     fn every_permission_of_others_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("it's keys");
-        create(&path, "secret").unwrap();
+        let others = folder.path().join("passwd");
+        std::fs::write(&others, "root:x:0:0").unwrap();
+        set_permissions(&others, Permissions::from_mode(0o644)).unwrap();
+        let text = read(&others).unwrap_err().to_string();
+        assert!(text.contains("is no file of `cara keys`") && !text.contains("chmod"), "{text}");
+        create(&path, SECRET).unwrap();
         for bit in 0..6 {
             set_permissions(&path, Permissions::from_mode(0o600 | 1 << bit)).unwrap();
             let error = read(&path).unwrap_err();
@@ -306,7 +327,7 @@ mod tests {
         }
         for mode in [0o600, 0o400, 0o700] {
             set_permissions(&path, Permissions::from_mode(mode)).unwrap();
-            assert_eq!(*read(&path).unwrap().0, "secret");
+            assert_eq!(*read(&path).unwrap().0, SECRET);
         }
     }
 
@@ -325,6 +346,10 @@ mod tests {
         if own() == 0 {
             std::os::unix::fs::chown(&bytes, Some(1), None).unwrap();
             let text = read(&bytes).unwrap_err().to_string();
+            assert!(text.contains("is no file of `cara keys`") && !text.contains("chown"), "{text}");
+            let named = folder.path().join("a.keys");
+            std::fs::rename(&bytes, &named).unwrap();
+            let text = read(&named).unwrap_err().to_string();
             assert!(text.contains("belongs to user 1") && text.contains("sudo chown 0 "), "{text}");
         }
     }

@@ -21,12 +21,14 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use cara_std::Interfaces;
+use cara_std::keys::KeyRing;
+use cara_std::{Fleet, Identity, Interfaces};
 use serde_json::json;
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::files;
 use cara_tools::global::Global;
+use cara_tools::keys::Keys;
 use cara_tools::name_and_id::NameAndId;
 use cara_tools::output;
 use mistake::{Mistakes, Source};
@@ -97,6 +99,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         return Err(Ended::usage("--take-over is for an m_unit: an s_unit takes nothing over"));
     }
     if arguments.check {
+        check_start(&settings)?;
         report_correct(&settings, global)?;
         return Ok(Exit::Done.into());
     }
@@ -119,6 +122,9 @@ fn read(path: Option<&Path>) -> anyhow::Result<Source> {
     let (bytes, is_longer) = files::read(path, LONGEST_FILE).map_err(|error| wrong(&error))?;
     if is_longer {
         return Err(Ended::usage(format!("{shown} has more than {LONGEST_FILE} bytes: is it a configuration?")));
+    }
+    if matches!(bytes.as_slice(), [0xFF, 0xFE, ..] | [0xFE, 0xFF, ..]) {
+        return Err(Ended::usage(format!("{shown} is UTF-16, as PowerShell writes it: save it as UTF-8")));
     }
     let text = String::from_utf8(bytes.to_vec()).map_err(|error| wrong(&error.utf8_error()))?;
     Ok(Source { name: shown.to_string(), text })
@@ -171,6 +177,21 @@ fn address(text: &str) -> Result<SocketAddr, String> {
         ));
     }
     text.parse().map_err(|_| "write an IP address and a port, as 127.0.0.1:9464; names are not looked up".to_owned())
+}
+
+/// What the file names and what is elsewhere, which shows only when the node starts. Keys that it does not name may come later.
+fn check_start(settings: &Settings) -> anyhow::Result<()> {
+    let Settings { name, id, .. } = settings;
+    let wrong = |text: String| Ended::usage(format!("{}: {text}", settings.source.name));
+    let own = if settings.manager.is_some() { Identity::s_unit(name, *id) } else { Identity::m_unit(name, *id) };
+    if let (Keys::File(path), Ok(own)) = (&settings.keys, own) {
+        KeyRing::load_of(path, &own, Fleet(settings.fleet)).map_err(|error| wrong(format!("keys: {error}")))?;
+    }
+    let is_own = |m_unit: &NameAndId| m_unit.name == *name && m_unit.id == *id;
+    match settings.m_units.iter().flatten().any(is_own) {
+        true => Err(wrong(format!("m_units: {name}/{id} is this node itself: take it out"))),
+        false => Ok(()),
+    }
 }
 
 fn report_correct(settings: &Settings, global: &Global) -> anyhow::Result<()> {

@@ -91,15 +91,14 @@ pub(crate) fn prepare(arguments: Arguments) -> anyhow::Result<Prepared> {
     Ok(Prepared { listener, tls, guard, map, address, drawn, outside: origin.into_iter().next() })
 }
 
-/// A file that nobody but its owner may read.
-fn secret(path: &Path) -> anyhow::Result<Vec<u8>> {
+/// Checks that nobody but its owner may read a file. Of one that is a secret: what is none is left as it is.
+fn private_file(path: &Path) -> anyhow::Result<()> {
     let shown = path.display();
-    let unreadable = |error| Ended::usage(format!("cannot read {shown}: {error}"));
-    let mode = path.metadata().map_err(unreadable)?.mode();
-    if mode & 0o077 != 0 {
-        return Err(Ended::usage(format!("others than its owner may read {shown}: `chmod 600 {shown}`")));
+    let mode = path.metadata().map_err(|error| Ended::usage(format!("cannot read {shown}: {error}")))?.mode();
+    match mode & 0o077 {
+        0 => Ok(()),
+        _ => Err(Ended::usage(format!("others than its owner may read {shown}: `chmod 600 {shown}`"))),
     }
-    bytes(path)
 }
 
 fn bytes(path: &Path) -> anyhow::Result<Vec<u8>> {
@@ -113,7 +112,7 @@ fn bytes(path: &Path) -> anyhow::Result<Vec<u8>> {
 }
 
 fn token(path: &Path) -> anyhow::Result<String> {
-    let text = String::from_utf8(secret(path)?).unwrap_or_default();
+    let text = String::from_utf8(bytes(path)?).unwrap_or_default();
     let token = text.trim();
     let is_plain = token.bytes().all(|byte| byte.is_ascii_graphic());
     if token.len() < TOKEN_LEAST || !is_plain {
@@ -122,6 +121,7 @@ fn token(path: &Path) -> anyhow::Result<String> {
             path.display()
         )));
     }
+    private_file(path)?;
     Ok(token.to_owned())
 }
 
@@ -130,8 +130,9 @@ fn tls(cert: &Path, key: &Path) -> anyhow::Result<TlsAcceptor> {
         CertificateDer::pem_slice_iter(&bytes(cert)?)
             .collect::<Result<_, _>>()
             .map_err(|error| Ended::usage(format!("{} has no certificate as PEM: {error}", cert.display())))?;
-    let private = PrivateKeyDer::from_pem_slice(&secret(key)?)
+    let private = PrivateKeyDer::from_pem_slice(&bytes(key)?)
         .map_err(|error| Ended::usage(format!("{} has no private key as PEM: {error}", key.display())))?;
+    private_file(key)?;
     let config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()?
         .with_no_client_auth()
