@@ -135,7 +135,8 @@ fn managers_know_each_other_and_their_own_vehicles() {
         hall.pair(&named("depot/1@m_unit")).unwrap().expose()
     );
     assert!(depot.pair(&named("agv/3")).is_none());
-    home.done(&["derive", "agv/3", "--manager", "hall/2", "--manager", "depot/1"]);
+    home.refused(&["derive", "agv/3", "--manager", "hal"], 2, "no m_unit of the fleet has this name");
+    home.done(&["derive", "agv/3", "--manager", "hall", "--manager", "depot/1"]);
     assert!(home.ring("depot/1@m_unit").pair(&named("agv/3")).is_some());
 }
 
@@ -143,6 +144,8 @@ fn managers_know_each_other_and_their_own_vehicles() {
 fn a_name_that_one_node_has_is_enough_to_revoke_it() {
     let home = Home::with_fleet();
     home.refused(&["revoke", "agv"], 2, "write agv/1 or agv/2");
+    assert!(home.done(&["show", "depot"]).starts_with("depot/1@m_unit in fleet 7"));
+    assert!(home.done(&["show", "agv/1"]).starts_with("agv/1 in fleet 7"));
     home.refused(&["revoke", "agw"], 2, "no node of the fleet is called `agw`");
     home.done(&["derive", "lift/3"]);
     assert!(home.done(&["revoke", "lift"]).contains("lift/3"));
@@ -287,10 +290,12 @@ fn every_mistake_is_reported() {
     );
     home.refused(&["derive", "agv/3", "--manager", "agv/1"], 2, "agv/1 is no m_unit of the fleet");
     home.refused(&["show", "--fleet", "8"], 1, "`cara keys new-fleet --fleet 8`");
-    home.refused(&["show", "agv/1"], 2, "is no file");
+    home.refused(&["show", "agv/11"], 2, "is no file");
     home.refused(&["show", "absent.keys"], 1, "absent.keys");
     home.done(&["new-fleet", "--fleet", "9"]);
     home.refused(&["show"], 2, "say --fleet 7 or --fleet 9");
+    let said = String::from_utf8(home.cara(&["show", "/etc/passwd"]).stderr).unwrap();
+    assert!(said.contains("is no file of `cara keys`") && !said.contains("chmod") && !said.contains("chown"), "{said}");
     fs::set_permissions(home.file("agv/1"), fs::Permissions::from_mode(0o640)).unwrap();
     let text = format!("chmod 600 {}", home.file("agv/1").display());
     home.refused(&["show", home.file("agv/1").to_str().unwrap()], 1, &text);

@@ -6,10 +6,11 @@ mod show;
 
 use report::Done;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
 use cara_std::keys::location::own_folder;
 use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, full_name, parse_node};
 
@@ -48,7 +49,7 @@ enum Action {
     Derive(Nodes),
     /// Shows the fleet's nodes, or what is in the file of one; fingerprints and never keys.
     Show {
-        /// The file of a node.
+        /// The file of a node, or the node as for `revoke`.
         file: Option<PathBuf>,
     },
     /// Takes nodes out: begins a generation of keys that they have nothing of.
@@ -74,9 +75,10 @@ struct Nodes {
     /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
     #[arg(value_name = "NODE", value_parser = parse_new)]
     nodes: Vec<Identity>,
-    /// The m_unit that these s_units belong to; may be repeated. Unless told, the only one of the fleet.
-    #[arg(long, value_name = "NAME/ID")]
-    manager: Vec<NameAndId>,
+    /// The m_unit that these s_units belong to, NAME where no other has it; may be repeated. Unless told, the only one of the
+    /// fleet.
+    #[arg(long, value_name = "NAME[/ID]")]
+    manager: Vec<String>,
 }
 
 /// A name that looks like another node's NAME/ID would hide that one.
@@ -94,7 +96,7 @@ pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     match &arguments.action {
         Action::NewFleet(nodes) => new_fleet(nodes, folder()?, global)?,
         Action::Derive(nodes) => derive(nodes, folder()?, global)?,
-        Action::Show { file: Some(file) } => show::ring(file, global)?,
+        Action::Show { file: Some(file) } => show::ring(&file_of(file, global, folder), global)?,
         Action::Show { file: None } => show::fleet(&open(folder()?, global)?, global)?,
         Action::Revoke { nodes } => revoke(nodes, folder()?, global)?,
         Action::Rotate { switch: true, .. } => Step::Switch.make(folder()?, global)?,
@@ -112,7 +114,7 @@ impl Nodes {
             command += &format!(" --dir {}", quoted(&folder.display().to_string()));
         }
         self.nodes.iter().for_each(|node| command += &format!(" {}", quoted(&full_name(node))));
-        self.manager.iter().for_each(|manager| command += &format!(" --manager {}", quoted(&manager.to_string())));
+        self.manager.iter().for_each(|manager| command += &format!(" --manager {}", quoted(manager)));
         let root = folder.join(format!("fleet-{}.root", fleet.0));
         format!(
             "fleet {} is there already: `{command}` adds nodes to it, and another --fleet makes another one. If its root has \
@@ -122,13 +124,27 @@ impl Nodes {
         )
     }
 
-    fn managers(&self) -> anyhow::Result<Vec<Identity>> {
-        self.manager.iter().map(m_unit).collect()
+    /// By name among the nodes that are added and those of the fleet.
+    fn managers(&self, members: &Members) -> anyhow::Result<Vec<Identity>> {
+        let known = members.nodes().iter().map(|member| &member.identity).chain(&self.nodes);
+        let known: BTreeSet<_> =
+            known.filter(|node| node.role() == Role::MUnit).map(|node| (node.name(), node.id())).collect();
+        let named = |text: &String| {
+            let wrong = |why: String| Ended::usage(format!("--manager {text}: {why}"));
+            let of_name: Vec<_> = known.iter().filter(|(name, _)| name == text).collect();
+            let (name, id) = match (text.parse::<NameAndId>(), of_name.as_slice()) {
+                (Ok(NameAndId { name, id }), _) => (name, id),
+                (Err(_), [(name, id)]) => ((*name).to_owned(), *id),
+                (Err(error), []) => return Err(wrong(format!("no m_unit of the fleet has this name: {error}"))),
+                (Err(_), several) => {
+                    let names: Vec<_> = several.iter().map(|(name, id)| format!("{name}/{id}")).collect();
+                    return Err(wrong(format!("write {}", names.join(" or "))));
+                }
+            };
+            Identity::m_unit(&name, id).map_err(|error| wrong(error.to_string()))
+        };
+        self.manager.iter().map(named).collect()
     }
-}
-
-fn m_unit(NameAndId { name, id }: &NameAndId) -> anyhow::Result<Identity> {
-    Identity::m_unit(name, *id).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
 }
 
 fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
@@ -138,7 +154,8 @@ fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<
         return Err(Ended::failed("Keys", nodes.of_fleet_that_is_there(fleet, &folder)));
     }
     let mut keys = FleetKeys::draw(fleet).map_err(failed)?;
-    let added = keys.add_all(&nodes.nodes, &nodes.managers()?);
+    let managers = nodes.managers(keys.members())?;
+    let added = keys.add_all(&nodes.nodes, &managers);
     added.map_err(|error| wrong(error.of_new_fleet()))?;
     let asked = Asked::catch()?;
     let made = Store::create_unless(&folder, keys, &|| asked.came());
@@ -148,7 +165,8 @@ fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<
 
 fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
     let mut store = open(folder, global)?;
-    store.keys_mut().add_all(&nodes.nodes, &nodes.managers()?).map_err(wrong)?;
+    let managers = nodes.managers(store.keys().members())?;
+    store.keys_mut().add_all(&nodes.nodes, &managers).map_err(wrong)?;
     save(Done::Derived, &store, global)
 }
 
@@ -178,6 +196,20 @@ fn member(members: &Members, meant: &str) -> anyhow::Result<Identity> {
             let names: Vec<_> = several.iter().map(|node| full_name(node)).collect();
             Err(Ended::usage(format!("several nodes are called `{meant}`: write {}", names.join(" or "))))
         }
+    }
+}
+
+/// The file itself, or that of the node of this name where there is no such file.
+fn file_of(named: &Path, global: &Global, folder: impl Fn() -> anyhow::Result<PathBuf>) -> PathBuf {
+    let of_node = || {
+        let store = open(folder().ok()?, global).ok()?;
+        let node = member(store.keys().members(), named.to_str()?).ok()?;
+        Some(store.file_of(&node))
+    };
+    if named.exists() {
+        named.to_owned()
+    } else {
+        of_node().filter(|file| file.exists()).unwrap_or_else(|| named.to_owned())
     }
 }
 
