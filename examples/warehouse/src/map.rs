@@ -1,7 +1,8 @@
-//! The floor: a grid in the `.map` format of the MovingAI benchmarks (Sturtevant, "Benchmarks for Grid-Based Pathfinding",
-//! 2012), and charging stations from a file of their own, so that the map stays in the format that others read.
+//! The floor: a grid that `cara web` reads as well, and charging stations from a file of their own, so that the map stays in the
+//! format that others read.
 
 pub use cara_apps::warehouse::Cell;
+use cara_map::{FREE, Grid, Wrong};
 
 use crate::text::{Line, Mistake};
 
@@ -20,41 +21,24 @@ pub struct Map {
 }
 
 impl Map {
-    /// Reads a `.map` file: `type octile`, `height` and `width` in either order, `map`, and the rows. Passable are `.`, `G` and
-    /// `S`; `@`, `O`, `T` and `W` are not. Vehicles drive along the four directions, whatever the type says.
+    /// Reads a `.map` file as [`Grid`] does. Vehicles drive along the four directions, whatever the type says, and count in cells,
+    /// also where the map is in metres.
     pub fn parse(file: &str, text: &str) -> Result<Self, Mistake> {
-        let mut lines = Line::all(file, text);
-        let end = Line { file, number: text.lines().count() + 1, text: "" };
-        let mut next = |wanted: &str| lines.next().ok_or_else(|| end.mistake(1, format!("the file ends: {wanted}")));
-        let first = next("write `type octile`")?;
-        if first.words().first().map(|word| word.text) != Some("type") {
-            return Err(first.mistake(1, "a map begins with `type octile`"));
-        }
-        let (mut width, mut height) = (None, None);
-        for _ in 0..2 {
-            let line = next("write `height` and `width`, each with a number")?;
-            size(&line, &mut width, &mut height)?;
-        }
-        let (Some(width), Some(height)) = (width, height) else {
-            return Err(first.mistake(1, "write `height` once and `width` once below this line"));
+        let mistake = |line, column, what| {
+            let text = text.lines().nth(line - 1).unwrap_or_default();
+            Line { file, number: line, text }.mistake(column, what)
         };
-        let line = next("write `map`")?;
-        if line.text.trim() != "map" {
-            return Err(line.mistake(1, "write `map` between the sizes and the rows"));
-        }
-        let mut free = Vec::with_capacity(usize::from(width) * usize::from(height));
-        for row in 0..height {
-            let missing = format!("{row} rows are there: write {height} of them, or change `height`");
-            read_row(&next(&missing)?, width, &mut free)?;
-        }
-        if let Some(line) = lines.find(|line| !line.text.trim().is_empty()) {
-            return Err(line.mistake(1, format!("{height} rows have come: remove this one, or change `height`")));
-        }
+        let longest = usize::from(LARGEST);
+        let grid = Grid::parse(text, longest, longest * longest)
+            .map_err(|Wrong { line, column, what }| mistake(line, column, what))?;
+        // Both are at most `LARGEST`.
+        let (width, height) = (grid.width as u16, grid.rows.len() as u16);
+        let free = grid.rows.iter().flat_map(|row| row.chars().map(|cell| FREE.contains(cell))).collect();
         let mut map = Self { width, height, free, reachable: Vec::new(), stations: Vec::new() };
         map.reachable = map.largest_part();
         match map.reachable.contains(&true) {
             true => Ok(map),
-            false => Err(first.mistake(1, "no cell of this map is passable: write `.` where vehicles can be")),
+            false => Err(mistake(1, 1, "no cell of this map is passable: write `.` where vehicles can be".to_owned())),
         }
     }
 
@@ -172,49 +156,6 @@ impl Map {
         largest.into_iter().for_each(|index| reachable[index] = true);
         reachable
     }
-}
-
-fn size(line: &Line<'_>, width: &mut Option<u16>, height: &mut Option<u16>) -> Result<(), Mistake> {
-    let words = line.words();
-    let wrong = || line.mistake(1, "write `height` or `width`, a space, and a number");
-    let [name, number] = words[..] else { return Err(wrong()) };
-    let place = match name.text {
-        "width" => width,
-        "height" => height,
-        _ => return Err(wrong()),
-    };
-    let bad = || line.mistake(number.column, format!("write a number from 1 to {LARGEST}"));
-    let value = number.text.parse().ok().filter(|value| (1..=LARGEST).contains(value)).ok_or_else(bad)?;
-    match place.replace(value) {
-        None => Ok(()),
-        Some(_) => Err(line.mistake(1, format!("`{}` is there twice: write `height` and `width`", name.text))),
-    }
-}
-
-fn read_row(line: &Line<'_>, width: u16, free: &mut Vec<bool>) -> Result<(), Mistake> {
-    let mut cells = 0;
-    for (index, sign) in line.text.trim_end().chars().enumerate() {
-        let column = index + 1;
-        if column > usize::from(width) {
-            return Err(line.mistake(column, format!("this row is longer than {width}: cut it, or change `width`")));
-        }
-        free.push(match sign {
-            '.' | 'G' | 'S' => true,
-            '@' | 'O' | 'T' | 'W' => false,
-            _ => {
-                let what = format!(
-                    "`{}` is no cell: write `.` where vehicles can be and `@` elsewhere",
-                    sign.escape_default()
-                );
-                return Err(line.mistake(column, what));
-            }
-        });
-        cells = column;
-    }
-    if cells < usize::from(width) {
-        return Err(line.mistake(cells + 1, format!("this row has {cells} cells: write {width}, or change `width`")));
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -27,7 +27,7 @@ pub(crate) const STREAMS: usize = 4096;
 /// Events that are kept for pages that come later.
 pub(crate) const EVENTS: usize = 200;
 /// Cells of a map.
-pub(crate) const CELLS: usize = 1024 * 1024;
+pub(crate) const CELLS: usize = 4 * 1024 * 1024;
 
 /// One limit.
 #[derive(Debug)]

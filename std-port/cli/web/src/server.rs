@@ -9,6 +9,7 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Router, middleware};
+use cara_map::Grid;
 use tokio::sync::Semaphore;
 
 use crate::asking::Hold;
@@ -16,10 +17,9 @@ use crate::door::Door;
 use crate::guard::{self, Guard};
 use crate::limits::{Limits, STOPS_OF_ALL, STOPS_OF_ONE};
 use crate::lines::Caller;
-use crate::map::Map;
 use crate::picture::Picture;
 use crate::start::Prepared;
-use crate::{Unit, asking, page, push, watching};
+use crate::{Unit, asking, map, page, push, watching};
 
 /// What all requests share.
 pub(crate) struct Shared {
@@ -27,7 +27,7 @@ pub(crate) struct Shared {
     pub(crate) guard: Guard,
     pub(crate) limits: Arc<Limits>,
     pub(crate) picture: Mutex<Picture>,
-    pub(crate) map: Option<Map>,
+    pub(crate) map: Option<Grid>,
     pub(crate) holds: Mutex<HashMap<u64, Hold>>,
     pub(crate) next_hold: AtomicU64,
     pub(crate) stops_of_all: Arc<Semaphore>,
@@ -38,7 +38,7 @@ pub(crate) struct Shared {
 }
 
 impl Shared {
-    pub(crate) fn new(unit: Arc<dyn Unit>, guard: Guard, map: Option<Map>) -> Arc<Self> {
+    pub(crate) fn new(unit: Arc<dyn Unit>, guard: Guard, map: Option<Grid>) -> Arc<Self> {
         Arc::new(Self {
             unit,
             guard,
@@ -88,6 +88,6 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
 
 /// The map, or null.
 async fn background(State(shared): State<Arc<Shared>>) -> Response {
-    let map = shared.map.as_ref().map_or(serde_json::Value::Null, Map::json);
+    let map = shared.map.as_ref().map_or(serde_json::Value::Null, map::json);
     ([(header::CONTENT_TYPE, "application/json")], map.to_string()).into_response()
 }

@@ -6,6 +6,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Arc;
 
+use cara_map::Grid;
 use cara_tools::exit::Ended;
 use cara_tools::files;
 use tokio_rustls::TlsAcceptor;
@@ -16,7 +17,7 @@ use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 
 use crate::Arguments;
 use crate::guard::{Guard, Outside};
-use crate::map::{self, Map};
+use crate::map;
 
 /// Fewest characters of a token: fewer could be found by trying.
 const TOKEN_LEAST: usize = 16;
@@ -30,7 +31,7 @@ pub(crate) struct Prepared {
     pub(crate) listener: TcpListener,
     pub(crate) tls: Option<TlsAcceptor>,
     pub(crate) guard: Guard,
-    pub(crate) map: Option<Map>,
+    pub(crate) map: Option<Grid>,
     address: SocketAddr,
     drawn: Option<String>,
     outside: Option<Outside>,
@@ -141,7 +142,7 @@ fn tls(cert: &Path, key: &Path) -> anyhow::Result<TlsAcceptor> {
     Ok(TlsAcceptor::from(Arc::new(config)))
 }
 
-fn background_of(path: &Path) -> anyhow::Result<Map> {
+fn background_of(path: &Path) -> anyhow::Result<Grid> {
     let shown = path.display();
     let (bytes, is_longer) =
         files::read(path, map::LONGEST).map_err(|error| Ended::usage(format!("cannot read {shown}: {error}")))?;
@@ -149,5 +150,5 @@ fn background_of(path: &Path) -> anyhow::Result<Map> {
         return Err(Ended::usage(format!("{shown} is longer than {} bytes: cut the map", map::LONGEST)));
     }
     let text = String::from_utf8_lossy(&bytes);
-    Map::parse(&text).map_err(|mistake| Ended::usage(format!("{shown}: {mistake}")))
+    map::read(&text).map_err(|mistake| Ended::usage(format!("{shown}: {mistake}")))
 }

@@ -488,7 +488,7 @@ fn files_that_cannot_be_used_are_told() {
         Arguments { cert: file.clone(), key: file, ..arguments() }
     });
     assert!(nonsense.contains("certificate") || nonsense.contains("PEM"), "{nonsense}");
-    let map = refused(|folder| Arguments { background: Some(secret(folder, "x.map", "type tile\n")), ..arguments() });
+    let map = refused(|folder| Arguments { background: Some(secret(folder, "x.map", "type hex\n")), ..arguments() });
     assert!(map.contains("x.map: line 1") && map.contains("octile"), "{map}");
     assert!(
         refused(|folder| Arguments { background: Some(folder.join("none")), ..arguments() }).contains("cannot read")
