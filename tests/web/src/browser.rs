@@ -41,6 +41,16 @@ pub(crate) struct Browser {
 
 impl Browser {
     pub(crate) async fn start(shots: Option<&Path>) -> Result<Self> {
+        Self::start_with(shots, json!({})).await
+    }
+
+    /// As wide as a telephone, which no window can be.
+    pub(crate) async fn start_narrow(width: u32) -> Result<Self> {
+        let screen = json!({ "width": width, "height": 800, "pixelRatio": 1, "touch": false });
+        Self::start_with(None, json!({ "mobileEmulation": { "deviceMetrics": screen } })).await
+    }
+
+    async fn start_with(shots: Option<&Path>, mut options: Value) -> Result<Self> {
         let mut driver = Process::start("chromedriver", Path::new("chromedriver"), ["--port=0"])?;
         let line = driver.expect("started successfully on port ", PATIENCE)?.text;
         let port = line.rsplit(' ').next().unwrap_or_default().trim_end_matches('.');
@@ -48,7 +58,7 @@ impl Browser {
         let mut arguments: Vec<String> = ARGUMENTS.map(str::to_owned).into();
         arguments.push(format!("--user-data-dir={}", profile.path().display()));
         arguments.push(format!("--window-size={},{}", DESKTOP.0, DESKTOP.1));
-        let options = json!({ "args": arguments });
+        options["args"] = json!(arguments);
         let wanted =
             [("browserName", json!("chrome")), ("goog:chromeOptions", options), ("acceptInsecureCerts", json!(true))];
         let wanted = wanted.map(|(name, value)| (name.to_owned(), value));

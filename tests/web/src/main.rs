@@ -54,6 +54,7 @@ fn main() -> Result<()> {
         command(&browser).await?;
         pictures(&browser).await?;
         tablet(&browser).await?;
+        widths(&browser, &url).await?;
         stop(&browser).await?;
         crowd(&browser, &url).await?;
         let (_, key) = url.split_once('#').context("the address has a key")?;
@@ -247,6 +248,27 @@ async fn tablet(browser: &Browser) -> Result<()> {
     browser.resize(DESKTOP).await
 }
 
+/// Nothing scrolls sideways, whatever is open.
+async fn widths(browser: &Browser, url: &str) -> Result<()> {
+    const OPEN: &str = "document.querySelectorAll('details').forEach((one) => { one.open = true; })";
+    const FITS: &str = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
+    let narrow = Browser::start_narrow(400).await?;
+    narrow.open(url).await?;
+    narrow.says("#nodes", "agv-1/11").await?;
+    narrow.run("document.querySelector('#nodes tr button').click()").await?;
+    narrow.wait("functions are shown", "document.querySelector('#functions summary')").await?;
+    narrow.run(OPEN).await?;
+    narrow.wait("400 pixels suffice", &format!("innerWidth === 400 && {FITS}")).await?;
+    narrow.close().await?;
+    browser.run(&format!("window.were = [...document.querySelectorAll('details[open]')]; {OPEN}")).await?;
+    for width in [500, 640, 900, 1080, 1440, 1920] {
+        browser.resize((width, 1180)).await?;
+        browser.wait(&format!("{width} pixels suffice"), FITS).await?;
+    }
+    browser.run("document.querySelectorAll('details').forEach((one) => { one.open = were.includes(one); })").await?;
+    browser.resize(DESKTOP).await
+}
+
 /// A stop of all by a click, a reset, and a stop by the keyboard.
 async fn stop(browser: &Browser) -> Result<()> {
     let count = AGVS.len();
@@ -327,6 +349,14 @@ async fn lose(browser: &Browser, stage: &mut Stage) -> Result<()> {
     stage.kill_a_vehicle()?;
     browser.says("#nodes tr.lost .state", "LOST").await?;
     browser.says("#count.bad", "4 of 5 connected").await?;
+    browser.says("#alarms li", "agv-5/15 is lost").await?;
+    browser.click("#alarms-all").await?;
+    browser
+        .wait(
+            "it stays until it has ended",
+            "/agv-5.15 is lost[^]*acknowledged 20/.test(document.querySelector('#alarms').innerText)",
+        )
+        .await?;
     browser.click("#stop-all").await?;
     browser.says("#stop-summary.bad", "4 of 5 acknowledged").await?;
     browser.says("#stop-list li.bad", "NOT REACHED").await?;
@@ -334,6 +364,12 @@ async fn lose(browser: &Browser, stage: &mut Stage) -> Result<()> {
     browser.says("#banner", "The manager does not answer. What is shown is old.").await?;
     stage.thaw_manager()?;
     browser.wait("a manager that goes on is live", "document.querySelector('#banner').hidden").await?;
+    let ended = "/The manager does not answer[^]*until 20/.test(document.querySelector('#alarms').innerText)";
+    browser.wait("its alarm has an end, and is to be acknowledged", ended).await?;
+    browser.click("#alarms-all").await?;
+    browser
+        .wait("what has ended and was seen goes", "!document.querySelector('#alarms').innerText.includes('manager')")
+        .await?;
     stage.kill_manager()?;
     browser.says("#banner", "The manager is lost. What is shown is old.").await?;
     browser.wait("old data is grey and has its age", "document.body.classList.contains('stale') && document.querySelector('#map-stale').innerText.startsWith('as it was')").await?;

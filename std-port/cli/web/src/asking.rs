@@ -278,7 +278,12 @@ fn ask(shared: &Shared, for_a_stop: bool, question: &Question, mut each: impl Fn
 fn shown(answer: &Answer) -> Value {
     let mut reported = json!(answer);
     match answer {
-        Answer::Called { results, .. } => reported["results"] = results.iter().map(form::shown).collect(),
+        Answer::Called { results, error, .. } => {
+            reported["results"] = results.iter().map(form::shown).collect();
+            if let Some(said) = error.as_ref().and_then(|error| error.said.as_ref()) {
+                reported["error"]["values"] = said.values.iter().map(form::shown).collect();
+            }
+        }
         Answer::Function(info) => reported["function"] = form::function(info),
         _ => {}
     }
@@ -330,5 +335,19 @@ impl Shared {
 
     fn holds(&self) -> MutexGuard<'_, HashMap<u64, Hold>> {
         self.holds.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_of_a_failure_keep_all_their_digits() {
+        let at = json!({ "name": "at", "size": 1, "type": "int", "value": [9_007_199_254_740_993_i64] });
+        let error = json!({ "cause": "peer", "error": "Service", "text": "", "reason": "", "values": [at] });
+        let called = json!({ "answer": "called", "node": "a", "id": 1, "results": [], "error": error, "took_us": 1 });
+        let reported = shown(&serde_json::from_value(called).unwrap());
+        assert_eq!(reported["error"]["values"][0]["value"], json!(["9007199254740993"]));
     }
 }

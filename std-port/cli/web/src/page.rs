@@ -9,7 +9,7 @@ const STYLE: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// Each file with its type.
-pub(crate) const FILES: [(&str, &str, &str); 12] = [
+pub(crate) const FILES: [(&str, &str, &str); 13] = [
     ("", HTML, include_str!("page/index.html")),
     ("style.css", STYLE, include_str!("page/style.css")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
@@ -21,6 +21,7 @@ pub(crate) const FILES: [(&str, &str, &str); 12] = [
     ("nodes.js", SCRIPT, include_str!("page/nodes.js")),
     ("forms.js", SCRIPT, include_str!("page/forms.js")),
     ("stop.js", SCRIPT, include_str!("page/stop.js")),
+    ("alarms.js", SCRIPT, include_str!("page/alarms.js")),
     ("charts.js", SCRIPT, include_str!("page/charts.js")),
 ];
 

@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet};
 use std::ops::ControlFlow;
 use std::sync::{Arc, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, NodeInfo, Question};
 use serde_json::{Map, Value, json};
@@ -85,7 +85,11 @@ fn look(shared: &Shared, way: &mut dyn Connection) -> anyhow::Result<()> {
         let mut picture = shared.picture();
         picture.answered();
         let now = picture.now();
-        let (unit, nodes, refused) = (of_unit(unit), of_nodes(&nodes, now, &mut joined), of_refused(&nodes));
+        let (unit, nodes, refused) =
+            (of_unit(unit), of_nodes(&nodes, now, &mut joined), of_refused(&nodes, now, &mut joined));
+        // What is known of others would grow with each address that was refused.
+        let known: HashSet<&str> = nodes.iter().chain(&refused).map(|(key, _)| key.as_str()).collect();
+        joined.retain(|key, _| known.contains(key.as_str()));
         picture.put(Section::Unit, "", &unit);
         let names: HashSet<&str> = nodes.iter().filter_map(|(key, _)| Some(key.rsplit_once('@')?.0)).collect();
         picture.only_streams_of(|node| names.contains(node));
@@ -119,11 +123,7 @@ fn of_nodes(answers: &[Answer], now: u64, since: &mut Map<String, Value>) -> Vec
         .map(|node| {
             let NodeInfo { name, id, role, .. } = node;
             let key = format!("{name}/{id}@{role}");
-            let ago = if node.connected { node.connected_ms } else { node.left_ms };
-            let at = ago.map(|ago| i128::from(now) - i128::from(ago)).and_then(|at| i64::try_from(at).ok());
-            let kept = since.get(&key).and_then(Value::as_i64);
-            let at = kept.filter(|kept| at.is_some_and(|at| at.abs_diff(*kept) < SAME)).or(at);
-            since.insert(key.clone(), at.into());
+            let at = steady(now, if node.connected { node.connected_ms } else { node.left_ms }, &key, since);
             let mut reported = json!(node);
             if let Some(reported) = reported.as_object_mut() {
                 ["connected_ms", "left_ms"].iter().for_each(|name| drop(reported.remove(*name)));
@@ -134,10 +134,22 @@ fn of_nodes(answers: &[Answer], now: u64, since: &mut Map<String, Value>) -> Vec
         .collect()
 }
 
-fn of_refused(answers: &[Answer]) -> Vec<(String, Value)> {
+/// The time that was so long ago, as it was reported before where that is about the same.
+fn steady(now: u64, ago: Option<u64>, key: &str, since: &mut Map<String, Value>) -> Option<i64> {
+    let at = ago.map(|ago| i128::from(now) - i128::from(ago)).and_then(|at| i64::try_from(at).ok());
+    let kept = since.get(key).and_then(Value::as_i64);
+    let at = kept.filter(|kept| at.is_some_and(|at| at.abs_diff(*kept) < SAME)).or(at);
+    since.insert(key.to_owned(), at.into());
+    at
+}
+
+fn of_refused(answers: &[Answer], now: u64, since: &mut Map<String, Value>) -> Vec<(String, Value)> {
     let refused = answers.iter().filter_map(|answer| if let Answer::Refused(one) = answer { Some(one) } else { None });
     refused
-        .map(|one| (one.address.clone(), json!({ "node": one.node, "reason": one.reason, "text": one.text })))
+        .map(|one| {
+            let at = steady(now, Some(one.ago_ms), &one.address, since);
+            (one.address.clone(), json!({ "node": one.node, "reason": one.reason, "text": one.text, "at": at }))
+        })
         .collect()
 }
 
@@ -177,9 +189,9 @@ fn of_counters(answers: Vec<Answer>) -> Vec<(String, Value)> {
 
 fn events(shared: &Shared, way: &mut dyn Connection) -> anyhow::Result<()> {
     way.ask(&Question::Watch, &mut |answer| {
-        if let Answer::Event { event, node, text, .. } = answer {
-            let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis() as u64;
-            let kept = shared.picture().event(&json!({ "unix_ms": unix, "event": event, "node": node, "text": text }));
+        if let Answer::Event { unix_ms, event, node, text, .. } = answer {
+            let kept =
+                shared.picture().event(&json!({ "unix_ms": unix_ms, "event": event, "node": node, "text": text }));
             shared.limits.events.uses(kept);
         }
         ControlFlow::Continue(())

@@ -103,9 +103,9 @@ async function run(question, { call, outcome, running, info }) {
   text(call, `Call ${info.name}`);
 }
 
-export const failure = ({ error, kind, code, text: why }) => {
+export const failure = ({ error, kind, code, text: why, values = [] }) => {
   const more = [kind, code === null || code === undefined ? null : `code ${code}`].filter(Boolean).join(", ");
-  return `${error}${more ? ` (${more})` : ""}: ${why}`;
+  return `${error}${more ? ` (${more})` : ""}: ${why}${values.map((value) => `\n${value.name} = ${shown(value)}`).join("")}`;
 };
 
 function called(outcome, { results, call, error, took_us }, question, info) {

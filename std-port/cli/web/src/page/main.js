@@ -1,6 +1,7 @@
 // Joins the parts: messages of the server, the theme, the keyboard, and the banner that says when nothing is new.
 
 import { $, flag, forgetColours, span, text } from "./dom.js";
+import * as alarms from "./alarms.js";
 import * as api from "./api.js";
 import * as charts from "./charts.js";
 import * as map from "./map.js";
@@ -179,6 +180,7 @@ $("confirm-yes").onclick = () => { $("confirm").close(); stopAll("reset"); };
 $("help-open").onclick = () => $("help").showModal();
 $("help-close").onclick = () => $("help").close();
 $("doctor").onclick = doctor;
+$("alarms-all").onclick = () => alarms.acknowledge();
 $("filter").oninput = () => nodes.draw();
 // A token is not to be passed by: without it nothing is shown.
 $("login").addEventListener("cancel", (event) => event.preventDefault());
@@ -189,6 +191,6 @@ document.addEventListener("visibilitychange", () => {
 // An address with a key, opened where the page is already.
 addEventListener("hashchange", () => location.reload());
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
-setInterval(() => { drawLink(); if (state.heard !== null) nodes.draw(); }, DRAW);
+setInterval(() => { drawLink(); if (state.heard !== null) { alarms.look(); nodes.draw(); } }, DRAW);
 setInterval(charts.sample, 1000);
 listen();

@@ -38,11 +38,18 @@ function frame() {
   requestAnimationFrame(frame);
 }
 
-// y points down on a map, as its rows do, and up without one.
-const down = () => (background ? 1 : -1);
+// y points down on a map of cells, as its rows do, and up on one in metres, and without one.
+const down = () => (background && !background.metres ? 1 : -1);
+
+// How far it is from cell to cell, and where the map's left and lowest, or topmost, edges are.
+const cell = () => background.metres ?? 1;
+const corner = () => (background.metres ? background.origin : [-0.5, -0.5]);
 
 function bounds(all) {
-  if (background) return [-0.5, -0.5, background.width - 0.5, background.height - 0.5];
+  if (background) {
+    const [x, y] = corner();
+    return [x, y, x + background.width * cell(), y + background.height * cell()];
+  }
   const xs = all.map((one) => one.pose.x);
   const ys = all.map((one) => one.pose.y);
   if (!xs.length) return [-5, -5, 5, 5];
@@ -75,6 +82,7 @@ function draw() {
   [labels, taken] = [[], []];
   // The chosen one last, so that it lies above the others; its name has precedence over theirs.
   all.sort((a, b) => (a.key === state.chosen) - (b.key === state.chosen));
+  for (const one of all) drawPlan(drawing, one, all.length);
   for (const one of all) moves = drawNode(drawing, one, all.length) || moves;
   labels.reverse().forEach((write) => write());
   for (const key of shown.keys()) if (!all.some((one) => one.key === key)) shown.delete(key);
@@ -85,7 +93,7 @@ function draw() {
 function about(all) {
   const lost = all.filter((one) => one.isOld).length;
   const [x, y] = toWorld(last.width / 2, last.height / 2).map(Math.round);
-  const size = background ? `${background.width} × ${background.height} cells` : `a line each ${gridStep()} units`;
+  const size = background ? `${background.width} × ${background.height} cells${background.metres ? ` of ${background.metres} m` : ""}` : `a line each ${gridStep()} units`;
   text($("map-about"), `${all.length} vehicle${all.length === 1 ? "" : "s"}, ${size}`);
   canvas.setAttribute("aria-label", `Map of ${all.length} vehicles, ${lost} of them lost or old, around ${x}, ${y}. The table of nodes has their positions.`);
   const wrong = trouble();
@@ -98,31 +106,31 @@ const gridStep = () => [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 5000].find((st
 function drawBackground(drawing) {
   if (background) {
     cells ??= paintCells();
-    const [x, y] = toScreen(-0.5, -0.5);
+    const [x, y] = topLeft();
     drawing.imageSmoothingEnabled = false;
-    drawing.drawImage(cells, x, y, background.width * last.scale, background.height * last.scale);
-    if (last.scale < 10) return;
+    drawing.drawImage(cells, x, y, background.width * cell() * last.scale, background.height * cell() * last.scale);
+    if (last.scale * cell() < 10) return;
   }
-  const step = background ? 1 : gridStep();
-  const shift = background ? 0.5 : 0;
+  const step = background ? cell() : gridStep();
+  // Lines lie between cells.
+  const [left, low] = background ? corner() : [0, 0];
   const [x0, y0] = toWorld(0, 0);
   const [x1, y1] = toWorld(last.width, last.height);
   drawing.save();
   if (background) {
-    const [left, top] = toScreen(-0.5, -0.5);
     drawing.beginPath();
-    drawing.rect(left, top, background.width * last.scale, background.height * last.scale);
+    drawing.rect(...topLeft(), background.width * step * last.scale, background.height * step * last.scale);
     drawing.clip();
   }
   drawing.strokeStyle = colour("line");
   drawing.lineWidth = 1;
   drawing.beginPath();
-  for (let x = Math.ceil(x0 / step) * step - shift; x <= x1; x += step) {
+  for (let x = left + Math.ceil((x0 - left) / step) * step; x <= x1; x += step) {
     const at = Math.round(toScreen(x, 0)[0]) + 0.5;
     drawing.moveTo(at, 0);
     drawing.lineTo(at, last.height);
   }
-  for (let y = Math.ceil(Math.min(y0, y1) / step) * step - shift; y <= Math.max(y0, y1); y += step) {
+  for (let y = low + Math.ceil((Math.min(y0, y1) - low) / step) * step; y <= Math.max(y0, y1); y += step) {
     const at = Math.round(toScreen(0, y)[1]) + 0.5;
     drawing.moveTo(0, at);
     drawing.lineTo(last.width, at);
@@ -130,6 +138,11 @@ function drawBackground(drawing) {
   drawing.stroke();
   drawing.restore();
   if (!background) drawNumbers(drawing, step, x0, x1, y0, y1);
+}
+
+function topLeft() {
+  const [x, y] = corner();
+  return toScreen(x, background.metres ? y + background.height * background.metres : y);
 }
 
 function drawNumbers(drawing, step, x0, x1, y0, y1) {
@@ -146,7 +159,7 @@ function paintCells() {
   drawing.fillRect(0, 0, background.width, background.height);
   drawing.fillStyle = colour("wall");
   background.rows.forEach((row, y) => [...row].forEach((cell, x) => {
-    if (!".GS".includes(cell)) drawing.fillRect(x, y, 1, 1);
+    if (!".GSE".includes(cell)) drawing.fillRect(x, y, 1, 1);
   }));
   return painted;
 }
@@ -166,6 +179,21 @@ function glide(one) {
 function at({ from, to, begun }, time) {
   const part = calm.matches ? 1 : Math.min(1, (time - begun) / GLIDE);
   return { x: from.x + (to.x - from.x) * part, y: from.y + (to.y - from.y) * part };
+}
+
+// The route and the stations that a vehicle publishes. Those of one that is gone are no plan any more.
+function drawPlan(drawing, one, count) {
+  if (one.isOld) return;
+  drawing.strokeStyle = colour(one.key === state.chosen ? "accent" : "faint");
+  drawing.lineWidth = one.key === state.chosen ? 2.5 : 1.2;
+  drawing.beginPath();
+  for (const [index, { x, y }] of (one.route ?? []).entries()) drawing[index ? "lineTo" : "moveTo"](...toScreen(x, y));
+  drawing.stroke();
+  for (const { x, y, name } of one.stations ?? []) {
+    const [px, py] = toScreen(x, y);
+    drawing.strokeRect(px - 5, py - 5, 10, 10);
+    if (name && count <= 40) labels.unshift(() => write(drawing, name, px, py, 5, "faint"));
+  }
 }
 
 function drawNode(drawing, one, count) {
@@ -217,16 +245,25 @@ let [labels, taken] = [[], []];
 function label(drawing, one, px, py, radius) {
   const age = now() - one.pose.at;
   const said = one.isOld && age > OLD ? `${one.node.name}, ${span(age)} ago` : one.node.name;
+  write(drawing, said, px, py, radius, one.isOld ? "faint" : "text");
+}
+
+// Above its place, else below it or beside it, where nothing is written yet.
+function write(drawing, said, px, py, radius, tint) {
   drawing.font = "600 12px system-ui, sans-serif";
   const long = drawing.measureText(said).width;
-  const x = Math.min(Math.max(2, px - long / 2), last.width - long - 2);
-  const y = py - radius - 8 < 12 ? py + radius + 16 : py - radius - 8;
-  if (taken.some(([left, right, base]) => x < right + 4 && x + long + 4 > left && Math.abs(base - y) < 14)) return;
+  const inside = (x) => Math.min(Math.max(2, x), last.width - long - 2);
+  const spots = [[inside(px - long / 2), py - radius - 8], [inside(px - long / 2), py + radius + 16], [px + radius + 6, py + 4], [px - radius - 6 - long, py + 4]];
+  const isFree = ([x, y]) => x >= 2 && x + long + 2 <= last.width && y >= 12 && y <= last.height - 4
+    && !taken.some(([left, right, base]) => x < right + 4 && x + long + 4 > left && Math.abs(base - y) < 14);
+  const spot = spots.find(isFree);
+  if (!spot) return;
+  const [x, y] = spot;
   taken.push([x, x + long, y]);
   drawing.lineWidth = 3;
   drawing.strokeStyle = colour("floor");
   drawing.strokeText(said, x, y);
-  drawing.fillStyle = colour(one.isOld ? "faint" : "text");
+  drawing.fillStyle = colour(tint);
   drawing.fillText(said, x, y);
 }
 

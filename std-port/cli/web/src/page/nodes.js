@@ -1,10 +1,11 @@
 // The table of nodes, the chosen one, orders, events, what the doctor found, and limits.
 
 import { $, facts, flag, make, rows, span, text, words } from "./dom.js";
-import { chosen, natural, nodes, now, state, trouble } from "./state.js";
+import { chosen, clock, natural, nodes, now, state, trouble } from "./state.js";
+import * as alarms from "./alarms.js";
 import * as forms from "./forms.js";
 
-const about = (one) => (one.inhibited ? "stopped" : one.runs ? one.runs.function : "–");
+const about = (one) => (one.inhibited ? "stopped" : one.runs ? `${one.node.connected ? "" : "was running "}${one.runs.function}` : "–");
 const since = (node) => (node.since === null ? "" : span(now() - node.since));
 
 function stateOf({ node }) {
@@ -33,7 +34,7 @@ export function step(by) {
 function filtered() {
   const wanted = $("filter").value.trim().toLowerCase().split(/\s+/).filter(Boolean);
   return nodes().filter((one) => {
-    const words = `${one.name} ${one.node.role} ${stateOf(one)} ${about(one)} ${one.trouble.join(" ")} ${one.node.address ?? ""}`.toLowerCase();
+    const words = `${one.name} ${one.node.role} ${stateOf(one)} ${about(one)} ${alarms.of(one.name).join(" ")} ${one.node.address ?? ""}`.toLowerCase();
     return wanted.every((word) => words.includes(word));
   });
 }
@@ -72,7 +73,7 @@ function updateRow(row, one) {
   text(place, one.pose ? `${one.pose.x.toFixed(2)}, ${one.pose.y.toFixed(2)}${one.isOld ? ` (${span(now() - one.pose.at)} ago)` : ""}` : "–");
   text(order, about(one));
   flag(order, "warn", one.inhibited);
-  text(counted, one.trouble.join(", "));
+  text(counted, alarms.of(one.name).join(", "));
 }
 
 function drawChosen() {
@@ -89,7 +90,7 @@ function drawChosen() {
   facts($("node-facts"), told);
   facts($("streams"), Object.entries(state.streams).filter(([, stream]) => stream.node === one.name).map(([number, stream]) => {
     const value = state.values[number];
-    return [stream.name, value ? `${show(value[2])}  ·  ${span(now() - value[1])} old` : "no value yet"];
+    return [stream.name, value ? `${node.connected ? "" : "was "}${show(value[2])}  ·  ${span(now() - value[1])} old` : "no value yet"];
   }).sort(([a], [b]) => natural(a, b)));
   facts($("counters"), Object.entries(state.counters[one.name] ?? {}).map(([name, count]) => [words(name), count.toLocaleString("en")]));
   forms.refresh(one);
@@ -116,10 +117,10 @@ function drawOrders() {
     text(node, `${order.node}/${order.id}`);
     text(name, order.function);
     const inhibited = order.inhibited && (order.inhibited.by ? `stopped by unit ${order.inhibited.by}` : `stopped by itself, reason ${order.inhibited.reason}`);
-    text(what, order.order === "runs" ? "runs" : inhibited);
+    text(what, order.order === "runs" ? (connected ? "runs" : "was running") : inhibited);
     flag(what, "warn", order.inhibited);
     text(holder, order.holder === null ? "–" : String(order.holder));
-    if (order.ends === undefined || order.order !== "runs") return left.replaceChildren("–");
+    if (order.ends === undefined || order.order !== "runs" || !connected) return left.replaceChildren("–");
     if (!left.firstElementChild) left.replaceChildren(make("meter", { min: 0 }), make("span", { className: "number" }));
     const ms = Math.max(0, order.ends - now());
     longest = Math.max(longest, ms);
@@ -136,20 +137,19 @@ let told = null;
 function drawEvents() {
   if (told === state.events[0]) return;
   told = state.events[0];
-  const time = (ms) => new Date(ms).toLocaleTimeString("en-GB");
   $("events").replaceChildren(...state.events.slice(0, 100).map((event) => make("li", {},
-    make("time", { dateTime: new Date(event.unix_ms).toISOString() }, time(event.unix_ms)), make("strong", {}, words(event.event)), " ", event.node ? `${event.node} ` : "", event.text)));
+    make("time", { dateTime: new Date(event.unix_ms).toISOString() }, clock(event.unix_ms)), make("strong", {}, words(event.event)), " ", event.node ? `${event.node} ` : "", event.text)));
 }
 
 let found = null;
 function drawDoctor() {
   const doctor = state.doctor[""];
   const refused = Object.entries(state.refused);
-  if (doctor) text($("doctor-about"), `looked ${span(now() - doctor.at)} ago`);
+  if (doctor) text($("doctor-about"), `looked ${span(now() - doctor.at)} ago, at ${clock(Date.now() - (now() - doctor.at))}`);
   const key = JSON.stringify([doctor, refused]);
   if (key === found) return;
   found = key;
-  const items = refused.map(([address, { node, reason, text: why }]) => finding("error", `refused ${node ?? address}: ${reason}`, "", why));
+  const items = refused.map(([address, { node, reason, text: why, at }]) => finding("error", `refused ${node ?? address}: ${reason}`, `${clock(Date.now() - (now() - at))}`, why));
   for (const { severity, id, about, found: seen, advice } of doctor?.findings ?? []) items.push(finding(severity, id + (about ? `, ${about}` : ""), seen, advice));
   if (doctor && !items.length) items.push(make("li", { className: "good" }, "Nothing strange was found."));
   $("findings").replaceChildren(...items);

@@ -48,14 +48,24 @@ export function trouble() {
 export const fullName = (node) => `${node.name}/${node.id}`;
 export const natural = new Intl.Collator("en", { numeric: true }).compare;
 
+// The points of the first list in a value: records with x and y, or two numbers each.
+function places(values) {
+  const list = values.map(([, value, isText]) => isText && JSON.parse(value)).find(Array.isArray) ?? [];
+  const all = list.map((one) => ({ x: Number(one?.x ?? one?.[0]), y: Number(one?.y ?? one?.[1]), name: String(one?.name ?? one?.id ?? "") }));
+  return all.filter(({ x, y }) => Number.isFinite(x) && Number.isFinite(y));
+}
+
 // What is known of each node, in one place.
 export function nodes() {
-  const poses = new Map();
+  const [poses, plans] = [new Map(), new Map()];
   for (const [number, stream] of Object.entries(state.streams)) {
     const value = state.values[number];
+    if (value && (stream.name === "route" || stream.name === "stations")) {
+      plans.set(stream.node, { ...plans.get(stream.node), [stream.name]: places(value[2]) });
+    }
     if (stream.name === "pose" && value) {
       const [x, y] = value[2].flatMap(([, numbers]) => numbers).map(Number);
-      const heading = Number(value[2].find(([name]) => name === "heading")?.[1]);
+      const heading = Number(value[2].find(([name]) => name === "heading" || name === "theta")?.[1]);
       if (Number.isFinite(x) && Number.isFinite(y)) poses.set(stream.node, { x, y, heading, at: value[1] });
     }
   }
@@ -72,23 +82,14 @@ export function nodes() {
     const { runs, inhibited } = orders.get(name) ?? {};
     const pose = poses.get(name) ?? null;
     return {
-      key, node, name, pose, runs, inhibited,
+      key, node, name, pose, runs, inhibited, ...plans.get(name),
       isOld: !node.connected || (pose !== null && now() - pose.at > OLD),
-      ping: state.pings[name], trouble: troubles(state.counters[name]),
+      ping: state.pings[name],
     };
   }).sort((a, b) => natural(a.name, b.name));
 }
 
-// Counters of a link that an operator should know of, in words.
-const MATTER = {
-  KeepAlivesMissed: "keep-alives missed", CallsTimedOut: "calls timed out", LeasesExpired: "leases expired",
-  RequestsBusy: "refused as busy", RequestsForbidden: "forbidden", RequestsExpired: "too old", SendRefused: "sends refused",
-  RepliesLate: "late replies", RepliesDropped: "replies lost", DatagramsForged: "forged datagrams", ProofsFailed: "proofs failed",
-  FramesRefused: "frames refused", RequestsRejected: "requests rejected", SubscriptionsRefused: "subscriptions refused",
-};
-
-function troubles(counters) {
-  return Object.entries(counters ?? {}).filter(([name]) => name in MATTER).map(([name, count]) => `${count} ${MATTER[name]}`);
-}
+// A time of the clock on the wall, with its date.
+export const clock = (ms) => new Date(ms).toLocaleString("sv");
 
 export const chosen = () => nodes().find((one) => one.key === state.chosen) ?? null;
