@@ -1,4 +1,4 @@
-//! `cara completions`: a script that lets a shell complete verbs and options, and what it asks for while somebody types: nodes,
+//! `cara completions`: a script that lets a shell complete verbs and options, and what it asks for while a line is typed: nodes,
 //! functions and streams of the unit that runs on this host, and constraints.
 
 use std::process::ExitCode;
@@ -147,7 +147,8 @@ fn wanted(command: &Command, before: &[String]) -> Option<(Wanted, Vec<String>)>
         for_all |= name == "all";
         let mut value = value.map(str::to_owned);
         if value.is_none() && known.is_some_and(|arg| arg.get_action().takes_values()) {
-            match words.next() {
+            // Bash parts a word at its `=`.
+            match words.by_ref().find(|word| *word != "=") {
                 Some(next) => value = Some(next.clone()),
                 // The value is what is typed.
                 None if name == "offering" => return Some((Wanted::Function(None), shared)),
@@ -221,7 +222,8 @@ mod tests {
             assert_eq!(of(line), Some((expected, Vec::new())), "{line}");
         }
         let shared = vec!["--fleet=7".to_owned(), "--unit=depot".to_owned()];
-        assert_eq!(of("--fleet 7 ping --unit=depot"), Some((Wanted::Node, shared)));
+        assert_eq!(of("--fleet 7 ping --unit=depot"), Some((Wanted::Node, shared.clone())));
+        assert_eq!(of("--fleet = 7 ping --unit = depot"), Some((Wanted::Node, shared)));
         for nothing in
             ["", "call --timeout", "--as me/1 call", "scan", "call agv-1 go_to", "nonsense", "set . chunk_size"]
         {

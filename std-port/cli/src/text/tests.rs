@@ -48,6 +48,18 @@ fn lists_and_records_are_read_in_either_form() {
 }
 
 #[test]
+fn whole_numbers_are_exact_and_members_in_their_order_at_every_depth() {
+    let signature = "load(l: {id: int, at: {x: int, n: int[2]}[..2], kg: float})";
+    let typed = "load(l: {kg: 1, at: [{n: [9007199254740993, -1], x: -9223372036854775808}], id: 1460549358372198212})";
+    let shown =
+        "load(l: {id: 1460549358372198212, at: [{x: -9223372036854775808, n: [9007199254740993, -1]}], kg: 1.0})";
+    let arguments = parse(typed, signature).unwrap();
+    // As on the control socket.
+    let sent: Vec<Argument> = serde_json::from_str(&serde_json::to_string(&arguments).unwrap()).unwrap();
+    assert_eq!(show_call("load", &sent), shown);
+}
+
+#[test]
 fn a_mistake_in_a_list_is_told_with_its_path() {
     let node = r#"{id: "a", x: 1, marks: [true, true], data: []}"#;
     let reported = |last: &str, at: &str, what: &str| {
