@@ -67,27 +67,19 @@ impl Grid {
                 ["map"] => break number,
                 ["width", size] => width.replace(side(size, longest, number, column)?).is_none(),
                 ["height", size] => height.replace(side(size, longest, number, column)?).is_none(),
-                ["metres_per_cell", metres] => match metres.parse() {
-                    Ok(metres) if f64::is_finite(metres) && metres > 0.0 => metres_per_cell.replace(metres).is_none(),
+                ["metres_per_cell", metres] => match place(metres) {
+                    Some(metres) if metres > 0.0 => metres_per_cell.replace(metres).is_none(),
                     _ => return wrong(number, column, "write a length above 0 in metres, as 0.05"),
                 },
-                ["origin", x, y] => {
-                    match [x, y].map(|place| place.parse().ok().filter(|place: &f64| place.is_finite())) {
-                        [Some(x), Some(y)] => origin.replace([x, y]).is_none(),
-                        _ => {
-                            return wrong(
-                                number,
-                                column,
-                                "write x and y of the lower left corner in metres, as -3.5 12",
-                            );
-                        }
-                    }
-                }
+                ["origin", x, y] => match (place(x), place(y)) {
+                    (Some(x), Some(y)) => origin.replace([x, y]).is_none(),
+                    _ => return wrong(number, column, "write x and y in metres, as -3.5 12"),
+                },
                 _ => {
                     return wrong(
                         number,
                         1,
-                        "write `map` between the sizes and the rows; sizes are `height` and `width`, each with a number",
+                        "write `map` before the rows, and before it `height` and `width` with a number",
                     );
                 }
             };
@@ -104,24 +96,40 @@ impl Grid {
         if width * height > most {
             return wrong(map, 1, format!("{width} x {height} cells are more than {most}: cut the map"));
         }
-        let mut rows = Vec::with_capacity(height);
-        for (line, number) in lines {
-            if rows.len() == height {
-                return wrong(number, 1, format!("{height} rows have come: remove this one, or change `height`"));
-            }
-            rows.push(row(line, number, width)?);
-        }
-        if rows.len() < height {
-            return wrong(end, 1, format!("{} rows are there: write {height} of them, or change `height`", rows.len()));
-        }
+        let rows = rows(lines, end, width, height)?;
         Ok(Self { width, rows, metres_per_cell, origin: origin.unwrap_or_default() })
     }
+}
+
+fn place(text: &str) -> Option<f64> {
+    text.parse().ok().filter(|place: &f64| place.is_finite())
 }
 
 fn side(text: &str, longest: usize, line: usize, column: usize) -> Result<usize, Wrong> {
     match text.parse() {
         Ok(side) if (1..=longest).contains(&side) => Ok(side),
         _ => wrong(line, column, format!("write a number from 1 to {longest}")),
+    }
+}
+
+fn rows<'t>(
+    lines: impl Iterator<Item = (&'t str, usize)>,
+    end: usize,
+    width: usize,
+    height: usize,
+) -> Result<Vec<String>, Wrong> {
+    let mut rows = Vec::with_capacity(height);
+    for (line, number) in lines {
+        if rows.len() == height {
+            return wrong(number, 1, format!("{height} rows have come: remove this one, or change `height`"));
+        }
+        rows.push(row(line, number, width)?);
+    }
+    match rows.len() {
+        count if count < height => {
+            wrong(end, 1, format!("{count} rows are there: write {height} of them, or change `height`"))
+        }
+        _ => Ok(rows),
     }
 }
 
