@@ -3,7 +3,8 @@
 //!
 //! [`provision`] has a board's settings, and the keys that prove its identity. [`vehicle`] makes the unit and its
 //! services. A board then runs three tasks beside that of its network: the unit's [`Runner`], [`drive`] and
-//! [`call_mechanic`]. [`led`] is the status LED; [`echo`] is a program without CARA to compare with.
+//! [`call_mechanic`]. [`led`] is the status LED; `slip` is a network over a serial line; [`echo`] is a program without
+//! CARA to compare with.
 
 #![no_std]
 
@@ -19,6 +20,8 @@ mod log;
 #[cfg(feature = "agv")]
 mod mechanic;
 pub mod provision;
+#[cfg(any(test, feature = "slip"))]
+pub mod slip;
 #[cfg(feature = "streams")]
 mod streams;
 #[cfg(feature = "tasks")]

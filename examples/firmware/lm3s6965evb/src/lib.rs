@@ -1,4 +1,4 @@
-//! What the board lm3s6965evb needs below embassy: Ethernet controller, clock, executor, stack paint, faults, watchdog,
+//! What the board lm3s6965evb needs below embassy: Ethernet controller, serial line, clock, executor, stack paint, faults, watchdog,
 //! motors, and its settings. The board exists for QEMU's sake: an emulated Cortex-M3 on which firmware is tested.
 //!
 //! "Data sheet" is Texas Instruments, *Stellaris LM3S6965 Microcontroller*, DS-LM3S6965; register names are as there.
@@ -22,6 +22,8 @@ pub mod motor;
 mod register;
 pub mod reset;
 pub mod stack;
+#[cfg(feature = "slip")]
+pub mod uart;
 pub mod watchdog;
 pub mod wiring;
 

@@ -18,6 +18,12 @@ pub(crate) struct Block(usize);
 
 /// Ethernet controller.
 pub(crate) const ETHERNET: Block = Block(0x4004_8000);
+/// Serial line 0.
+#[cfg(feature = "slip")]
+pub(crate) const UART_0: Block = Block(0x4000_C000);
+/// General-purpose inputs and outputs, port A.
+#[cfg(feature = "slip")]
+pub(crate) const PORT_A: Block = Block(0x4000_4000);
 /// General-purpose timer 0.
 pub(crate) const TIMER_0: Block = Block(0x4003_0000);
 /// General-purpose timer 1.

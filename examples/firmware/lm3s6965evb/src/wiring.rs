@@ -4,9 +4,11 @@ use cara_settings::Settings;
 pub use cara_vehicle::tasks::NO_ROOM;
 use embassy_executor::Spawner;
 use embassy_net::{Runner, Stack, StackResources};
-use static_cell::ConstStaticCell;
 
-use crate::ethernet::Ethernet;
+#[cfg(not(feature = "slip"))]
+use ethernet::{Driver, start};
+#[cfg(feature = "slip")]
+use serial::{Driver, start};
 
 /// Starts the controller and the network of the settings. Once per image.
 pub fn network<const SOCKETS: usize>(
@@ -15,15 +17,60 @@ pub fn network<const SOCKETS: usize>(
     sockets: &'static mut StackResources<SOCKETS>,
     noise: u64,
 ) -> Result<Stack<'static>, &'static str> {
-    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
-    let ethernet = ETHERNET.take();
-    ethernet.start();
-    let (stack, runner) = embassy_net::new(ethernet, cara_vehicle::network(settings), sockets, noise);
+    let (stack, runner) = embassy_net::new(start(spawner)?, cara_vehicle::network(settings), sockets, noise);
     spawner.spawn(run(runner).map_err(|_| NO_ROOM)?);
     Ok(stack)
 }
 
 #[embassy_executor::task]
-async fn run(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
+async fn run(mut runner: Runner<'static, Driver>) -> ! {
     runner.run().await
+}
+
+#[cfg(not(feature = "slip"))]
+mod ethernet {
+    use embassy_executor::Spawner;
+    use static_cell::ConstStaticCell;
+
+    use crate::ethernet::Ethernet;
+
+    pub(super) type Driver = &'static mut Ethernet;
+
+    pub(super) fn start(_: Spawner) -> Result<Driver, &'static str> {
+        static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
+        let ethernet = ETHERNET.take();
+        ethernet.start();
+        Ok(ethernet)
+    }
+}
+
+#[cfg(feature = "slip")]
+mod serial {
+    use cara_vehicle::slip::{self, Incoming, Memory, Outgoing};
+    use embassy_executor::Spawner;
+    use static_cell::ConstStaticCell;
+
+    use super::NO_ROOM;
+    use crate::uart::{self, Receiver, Sender};
+
+    pub(super) type Driver = slip::Slip;
+
+    pub(super) fn start(spawner: Spawner) -> Result<Driver, &'static str> {
+        static MEMORY: ConstStaticCell<Memory> = ConstStaticCell::new(Memory::new());
+        let (slip, incoming, outgoing) = slip::new(MEMORY.take());
+        let (receiver, sender) = uart::start();
+        spawner.spawn(receive(incoming, receiver).map_err(|_| NO_ROOM)?);
+        spawner.spawn(send(outgoing, sender).map_err(|_| NO_ROOM)?);
+        Ok(slip)
+    }
+
+    #[embassy_executor::task]
+    async fn receive(line: Incoming, uart: Receiver) -> ! {
+        line.run(uart).await
+    }
+
+    #[embassy_executor::task]
+    async fn send(line: Outgoing, uart: Sender) -> ! {
+        line.run(uart).await
+    }
 }
