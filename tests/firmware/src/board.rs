@@ -15,6 +15,7 @@ use defmt_decoder::{DecodeError, Table};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::keys::{Keys, MANAGER as DEPOT};
+use crate::line::{self, Line};
 use crate::trace::Trace;
 
 /// Long enough for the slowest machine.
@@ -102,9 +103,21 @@ impl Bench {
         Ok((board, Trace::read(output)))
     }
 
+    /// Puts power on a board whose network is a serial line.
+    pub(crate) fn board_on_line(&self, line: &Line, who: &Who) -> Result<Board> {
+        let uart = format!("unix:{}", line.socket().display());
+        let network = ["-serial", &uart, "-nic", "none"];
+        self.start(self.emulator_with(&network, line::BOARD, who)?.stderr(Stdio::null()), who)
+    }
+
     fn emulator(&self, cable: &Cable, who: &Who) -> Result<Command> {
-        let number = cable.number;
-        let (reported, boots) = self.keys.reported(who, &format!("{}/24", address(cable)))?;
+        let Cable { name, number } = cable;
+        let nic = format!("tap,ifname={name},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}");
+        self.emulator_with(&["-serial", "none", "-nic", &nic], &format!("{}/24", address(cable)), who)
+    }
+
+    fn emulator_with(&self, network: &[&str], address: &str, who: &Who) -> Result<Command> {
+        let (reported, boots) = self.keys.reported(who, address)?;
         let seed = who.seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
         let reported = format!("file={} boots={}{seed}", reported.display(), boots.display());
         // Ahead of what else the host runs, where that is allowed: a clock that counts instructions loses the time in which the
@@ -112,17 +125,13 @@ impl Bench {
         let mut command = Command::new("nice");
         command
             .args(["-n", "-10", "qemu-system-arm"])
-            .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none"])
+            .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none"])
             .arg("-semihosting-config")
             .arg(format!("enable=on,target=native,arg=agv,arg={reported}"))
             .arg("-kernel")
             .arg(&self.image)
             .args(self.counts.then(|| ["-icount".to_owned(), format!("shift={INSTRUCTION}")]).into_iter().flatten())
-            .arg("-nic")
-            .arg(format!(
-                "tap,ifname={},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}",
-                cable.name
-            ));
+            .args(network);
         Ok(command)
     }
 

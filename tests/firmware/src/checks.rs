@@ -3,7 +3,7 @@
 mod calls;
 mod limits;
 mod lists;
-mod losses;
+pub(crate) mod losses;
 mod restarts;
 mod security;
 mod terms;

@@ -10,10 +10,12 @@ mod count;
 mod faults;
 mod kept_away;
 mod keys;
+mod line;
 mod load;
 mod manager;
 mod places;
 mod security;
+mod serial;
 mod session;
 mod signals;
 mod streams;
@@ -103,6 +105,8 @@ enum Part {
     },
     /// Calls a board that publishes values meanwhile; for an image with streams.
     Streams(streams::Streams),
+    /// Runs a board on a serial line; for an image with SLIP.
+    Serial(serial::Serial),
     /// Starts a session: a board, its manager and a prompt for `cara`.
     Session(session::Session),
 }
@@ -153,6 +157,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
         Some(Part::KeptAway(options)) => kept_away::run(&bench(arguments)?, options),
         Some(Part::Streams(options)) => streams::run(&bench(arguments)?, options),
+        Some(Part::Serial(options)) => serial::run(&bench(arguments)?, options),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),
     }

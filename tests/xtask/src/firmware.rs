@@ -82,7 +82,12 @@ fn tested() -> Result<Option<i32>> {
         return Ok(checked);
     }
     let streams = boards::find(TESTED)?.build(&boards::STREAMS)?;
-    tests(&streams)?.args(["streams", "--rounds", "1"]).code()
+    let streamed = tests(&streams)?.args(["streams", "--rounds", "1"]).code()?;
+    if streamed != Some(0) {
+        return Ok(streamed);
+    }
+    let slip = boards::find(TESTED)?.build(&boards::SLIP)?;
+    tests(&slip)?.args(["serial"]).code()
 }
 
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.

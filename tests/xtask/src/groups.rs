@@ -251,8 +251,8 @@ pub(crate) const GROUPS: [Group; 27] = [
     },
     Group {
         name: "firmware",
-        what: "firmware in QEMU against the Linux manager: calls, cables, losses of power",
-        budget: 310,
+        what: "firmware in QEMU against the Linux manager: calls, cables, losses of power, a serial line",
+        budget: 360,
         quick: None,
         by_default: true,
         waits: true,

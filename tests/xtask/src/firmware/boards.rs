@@ -99,6 +99,8 @@ pub(crate) const WAREHOUSE: Image =
 pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
 /// The AGV of the emulated board with random numbers that are the same in each life, and with a service that takes lists.
 pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random,lists"), ..AGV };
+/// The AGV of the emulated board on a serial line.
+pub(crate) const SLIP: Image = Image { name: "agv-slip", feature: Some("slip"), ..AGV };
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
