@@ -22,8 +22,9 @@ const DEVICE: &str = "tun0";
 /// This end's address, and the board's.
 const ADDRESS: &str = "10.78.0.1/24";
 pub(crate) const BOARD: &str = "10.78.0.2/24";
-/// As the image has it. Few packets wait in the device: they would delay what comes behind them.
+/// As the image has it.
 const MTU: u32 = 576;
+/// Packets that wait in the device, as many as in the kernel's own SLIP. Where fewer do, what comes at once gets lost.
 const WAITING: u32 = 10;
 /// How often bytes are passed on, and the line is looked at.
 const TICK: Duration = Duration::from_millis(1);

@@ -2,7 +2,7 @@
 //! namespace that the program makes for itself.
 //!
 //! Everything is checked from what the manager sees and from what the board logs; waits are bounded generously, and
-//! nothing is timed.
+//! nothing is judged by its time.
 
 mod board;
 mod checks;
