@@ -155,7 +155,9 @@ mod tests {
         times.began(now, &call(3, 1, now, Duration::from_millis(1)), (LINK, Ticket::of(1, 3)));
         times.ended(now + Duration::from_millis(100), (LINK, Ticket::of(1, 3)));
         now = now + Duration::from_millis(100);
-        assert!(is_too_late(&times, now, 1, 99) && !is_too_late(&times, now, 1, 101) && !is_too_late(&times, now, 2, 1));
+        assert!(
+            is_too_late(&times, now, 1, 99) && !is_too_late(&times, now, 1, 101) && !is_too_late(&times, now, 2, 1)
+        );
     }
 
     #[test]
