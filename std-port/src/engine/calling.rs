@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::thread;
 
+use cara_core::config::Priority;
 use cara_core::distribution::failure::Failure;
+use cara_core::distribution::function_list::Function;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Limit};
 use cara_core::services::call::{Callee, Detail, Outgoing};
@@ -15,6 +17,7 @@ use super::Engine;
 use super::details::Canceller;
 use super::inbound::OwnCall;
 use super::link::{LinkCell, LinkState, Wake};
+use super::nested;
 use super::pinging::{self, Turn};
 use super::reader::{Cause, Token};
 use super::settling::RETRY;
@@ -90,6 +93,11 @@ impl<T: Send + 'static> Engine<T> {
         let mut now = self.now();
         let mut state = link.lock();
         let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
+        // What a handler asks for its caller is of no use once that waits no longer; a stop is sent all the same.
+        let timeout = match nested::left(self.driver.clock(), now) {
+            Some(left) if !is_urgent(&state, callee, options) => timeout.min(left),
+            _ => timeout,
+        };
         let deadline = now + timeout;
         // It keeps its place among the calls that move the same thing, however long it waits for room.
         let made = Some(state.session.make());
@@ -409,6 +417,15 @@ fn mismatch(state: &LinkState, callee: Callee<'_>, error: Error) -> CallError {
     let published = state.session.their_function_list().named(callee.name());
     let found = published.and_then(|published| callee.check(published.signature).err());
     CallError::new(error, found.map(Detail::Version))
+}
+
+/// Whether a call is an emergency, or stops something.
+fn is_urgent(state: &LinkState, callee: &Callee<'_>, options: &RequestOptions) -> bool {
+    let function = state.session.their_function_list().named(callee.name());
+    function.is_some_and(|Function { attributes, .. }| {
+        let class = options.priority.unwrap_or(attributes.priority);
+        class == Priority::Emergency || attributes.is_urgent(class)
+    })
 }
 
 /// For the audit log.

@@ -39,6 +39,7 @@ mod keys;
 pub(crate) mod link;
 mod links;
 mod membership;
+mod nested;
 pub(crate) mod notices;
 mod noting;
 pub(crate) mod peer_cell;

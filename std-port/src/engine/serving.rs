@@ -15,6 +15,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
+use super::nested;
 use super::served::{PAUSE, Reports, Serving};
 use super::services::Parked;
 use super::state_gate::{Access, Entered, Held as StateHeld, Turn};
@@ -250,17 +251,20 @@ impl<T: Send + 'static> Engine<T> {
                 return Ran::Over(Err(error));
             }
         };
+        // An order goes on when its caller waits no longer.
+        let waited_for = call.wants_reply && call.order.is_none();
+        let end = waited_for.then(|| self.driver.clock().boot_time_of(call.deadline));
         match run {
             Run::Free(run) => {
                 self.services.give_up(turn);
-                Ran::Over(guarded(&reported, || run(&reported, arguments)))
+                Ran::Over(guarded(&reported, end, || run(&reported, arguments)))
             }
             Run::Method(run) => self.run_with_state(link, turn, Access::Change, |held| {
                 let change = |state: &mut T| run(state, &reported, arguments);
-                guarded(&reported, || held.change(change).unwrap_or(Err(ServiceError::NotReady)))
+                guarded(&reported, end, || held.change(change).unwrap_or(Err(ServiceError::NotReady)))
             }),
             Run::Reader(run) => self.run_with_state(link, turn, Access::Read, |held| {
-                guarded(&reported, || run(held.state(), &reported, arguments))
+                guarded(&reported, end, || run(held.state(), &reported, arguments))
             }),
             #[cfg(feature = "async")]
             Run::Task(begin) => {
@@ -383,11 +387,15 @@ impl<T: Send + 'static> Reports for Engine<T> {
 }
 
 /// Runs a handler, which may panic. Not for an order that ended while its call waited for a thread or for its turn.
-pub(super) fn guarded(reported: &handler::Served, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
+pub(super) fn guarded(
+    reported: &handler::Served,
+    end: Option<Duration>,
+    run: impl FnOnce() -> Result<(), ServiceError>,
+) -> Result<(), Error> {
     if reported.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
         return Err(Error::Expired);
     }
-    catch_unwind(AssertUnwindSafe(run)).map_or_else(
+    nested::until(end, || catch_unwind(AssertUnwindSafe(run))).map_or_else(
         |_| {
             tracing::error!(caller = %reported.caller, "a handler panicked");
             Err(Error::Service(ServiceError::Panicked))

@@ -183,7 +183,7 @@ fn no_handler_runs_for_an_order_that_has_ended() {
     let reported = reported.recv().unwrap();
     let runs = AtomicUsize::new(0);
     let run = || {
-        serving::guarded(&reported, || {
+        serving::guarded(&reported, None, || {
             runs.fetch_add(1, Ordering::Relaxed);
             Ok(())
         })

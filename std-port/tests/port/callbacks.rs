@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 use std::sync::OnceLock;
+use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use cara_std::{Error, Parameters, ParametersView, Peer, Served, ServiceError};
 
-use crate::support::{Gate, ask, fleet, held, meet, number, pair, service, system, unit, value};
+use crate::support::{Gate, PATIENCE, ask, fleet, held, meet, number, pair, service, system, unit, value};
 
 /// What a handler needs to call back, known when both have met.
 type Back<T> = Arc<OnceLock<Peer<T>>>;
@@ -51,6 +52,28 @@ fn a_handler_with_the_state_calls_back_a_service_without_it() {
     }
     assert_eq!(agv.with_state(|state| *state), Ok(49));
     agv.stop();
+}
+
+/// The callback is let go by nobody, and has an hour by itself.
+#[test]
+fn a_call_that_a_handler_makes_ends_with_its_callers_deadline() {
+    let (manager, agv) = pair();
+    let (gate, back): (Arc<Gate>, Back<()>) = Default::default();
+    let (there, (told, outcomes)) = (back.clone(), channel());
+    let asks_back = service(move |number| {
+        let hour = Duration::from_secs(3_600);
+        let asked = there.get().unwrap().call("mine", &mut self::number(number)).timeout(hour).wait();
+        let _ = told.send(asked.map_err(Error::from));
+        number
+    });
+    agv.my_function_list().add_function("asks_back", &number(0), asks_back).unwrap();
+    manager.my_function_list().add_function("mine", &number(0), held(&gate)).unwrap();
+    let (peer, to_manager) = meet(&manager, &agv);
+    assert!(back.set(to_manager).is_ok());
+    let asked = peer.call("asks_back", &mut number(1)).timeout(Duration::from_millis(500)).wait();
+    assert_eq!(asked.map_err(Error::from), Err(Error::TimedOut));
+    assert_eq!(outcomes.recv_timeout(PATIENCE / 2), Ok(Err(Error::TimedOut)), "it goes on without its caller");
+    gate.open();
 }
 
 /// The manager holds its state and asks the vehicle's method, whose answer needs the manager's state: no time-out is

@@ -1,6 +1,7 @@
 //! Many nodes: on shared threads, with long lists, called all at the same time, told of in order.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use cara_std::{CallError, Capacities, Constraints, Error, RequestOptions, Threads, Unit, UnitEvent};
@@ -11,6 +12,8 @@ use crate::support::{
 };
 
 const NODES: u32 = 40;
+/// More calls than a manager has threads for.
+const CALLERS: usize = 60;
 
 /// A manager for so many nodes, and s_units that share threads, none of them started.
 fn many(fleet: u32) -> (cara_std::CommunicationSystem, Threads, Vec<Unit>) {
@@ -30,6 +33,34 @@ fn many(fleet: u32) -> (cara_std::CommunicationSystem, Threads, Vec<Unit>) {
 
 fn all_joined(manager: &cara_std::CommunicationSystem) -> bool {
     manager.number_of_s_units() == NODES as usize
+}
+
+/// One node keeps more calls waiting than there are threads to run them, for as long as another one asks.
+#[test]
+fn a_node_that_keeps_all_threads_busy_keeps_no_other_node_waiting() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    let work = service(|number| {
+        std::thread::sleep(Duration::from_millis(5));
+        number
+    });
+    manager.my_function_list().add_function("work", &number(0), work).unwrap();
+    let (busy, patient) = (unit("first", 1, fleet).build().unwrap(), unit("second", 2, fleet).build().unwrap());
+    let (_, flood) = meet(&manager, &busy);
+    let (_, asks) = meet(&manager, &patient);
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        for _ in 0..CALLERS {
+            scope.spawn(|| {
+                while !over.load(Ordering::SeqCst) {
+                    let _ = ask(&flood, "work", 1);
+                }
+            });
+        }
+        let asked: Vec<_> = (0..20).map(|round| ask(&asks, "work", round)).collect();
+        over.store(true, Ordering::SeqCst);
+        assert_eq!(asked, (0..20).map(Ok).collect::<Vec<_>>());
+    });
 }
 
 #[test]
