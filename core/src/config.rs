@@ -55,6 +55,15 @@ pub const DATAGRAM_BYTES: usize = 1400;
 /// The buffer that each link owns: partial frames and handshakes up to this length need no buffer of the pool.
 pub const LINK_BUFFER_BYTES: usize = 512;
 
+/// Longest frame on a serial line, delimiters included: what an emergency waits for at most, 67 ms at 19,200 baud.
+pub const LINE_FRAME_BYTES: usize = 128;
+/// Longest datagram on a serial line, as long as the longest search. A longer one is refused, and counted. Costs a line four times as much.
+pub const LINE_DATAGRAM_BYTES: usize = 512;
+/// Frames of a serial line's stream that may be unacknowledged; a power of two. Costs a line 232 bytes each.
+pub const LINE_WINDOW: u8 = 4;
+/// How long a serial line's stream may go unanswered before it ends. An idle one is watched by keep-alives alone.
+pub const LINE_LOST: Duration = Duration::from_secs(4);
+
 /// Managers whose highest claim a unit keeps. Costs 104 bytes each on a board; that of a further one is not kept, which is counted.
 pub const OBEYED_MANAGERS: usize = 4;
 

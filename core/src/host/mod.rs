@@ -13,6 +13,7 @@
 pub mod connections;
 pub mod endpoint;
 pub mod frame;
+pub mod line;
 pub mod mailman;
 pub mod port;
 pub mod secure;
