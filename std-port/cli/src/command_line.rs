@@ -37,6 +37,7 @@ pub(crate) enum Verb {
     Ping(commands::ping::Arguments),
     Web(cara_web::Arguments),
     Node(node::Arguments),
+    Line(cara_line::Arguments),
     Doctor(cara_doctor::Arguments),
     Keys(cara_keys::Arguments),
     Access(commands::access::Arguments),
@@ -49,7 +50,7 @@ pub(crate) enum Verb {
 const GROUPS: [(&str, &[&str]); 5] = [
     ("See", &["scan", "functions", "orders", "watch", "top", "stream", "counters", "ping", "doctor"]),
     ("Command", &["call", "stop", "reset", "publish", "set", "retire"]),
-    ("Run", &["node", "web"]),
+    ("Run", &["node", "web", "line"]),
     ("Set up", &["keys", "access", "provision", "forget-claim"]),
     ("Shell and manual", &["completions", "man"]),
 ];

@@ -46,6 +46,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Ping(arguments) => commands::ping::run(arguments, global),
         Verb::Web(arguments) => commands::web::run(arguments, global),
         Verb::Node(arguments) => node::run(arguments, global),
+        Verb::Line(arguments) => cara_line::run(arguments, global),
         Verb::Doctor(arguments) => cara_doctor::run(arguments, global),
         Verb::Keys(arguments) => cara_keys::run(arguments, global),
         Verb::Access(arguments) => commands::access::run(arguments, global),

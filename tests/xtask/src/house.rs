@@ -27,6 +27,7 @@ const PARTS: [(&str, &[&str]); 4] = [
             "std-port/cli/tools/src",
             "std-port/cli/doctor/src",
             "std-port/cli/keys/src",
+            "std-port/cli/line/src",
             "std-port/cli/provision/src",
             "std-port/cli/web/src",
             "std-port/map/src",
