@@ -12,6 +12,7 @@ mod calls;
 mod distribution;
 mod foundation;
 mod host;
+mod line;
 mod messages;
 mod nested;
 mod node;
