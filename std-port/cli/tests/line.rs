@@ -4,6 +4,7 @@
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::Path;
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -238,6 +239,13 @@ fn a_vehicle_whose_line_is_pulled_stops_with_its_lease_and_comes_back() {
     until("it is back", || fleet.agv.is_connected() && fleet.peer.is_connected());
     until("it is called again", || fleet.call("echo", &mut text(1), Renew::Never).is_ok());
     assert_eq!((fleet.speed(), fleet.stops.load(Ordering::SeqCst)), (0, 1));
+}
+
+#[test]
+fn a_device_that_cannot_be_opened_is_named() {
+    let ran = Command::new(env!("CARGO_BIN_EXE_cara")).args(["line", "/nowhere/tty"]).output().unwrap();
+    let said = String::from_utf8(ran.stderr).unwrap();
+    assert!(ran.status.code() == Some(1) && said.contains("/nowhere/tty cannot be used at 115200 baud"), "{said}");
 }
 
 /// How long calls take, alone and an emergency beside a long message, and which of the two is done first.

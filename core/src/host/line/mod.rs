@@ -2,13 +2,14 @@
 //!
 //! A [`Line`] is one end. It takes what the wire brought and gives what the wire is to carry; it reads no clock, so that a
 //! port polls it as it polls a session. It does not encrypt, and does not address: both are the business of what runs on
-//! it, and a bus with more than two ends is none of its business. The format is in `docs/serial-native.md`.
+//! it. A bus with more than two stations is out of its scope. `frame.rs` has the format of frames.
 //!
 //! # What a port does
 //! - Lend what has come to [`receive`](Line::receive) until all of it is consumed, and take a datagram after each call.
 //! - Whenever the wire is free, send what [`transmit`](Line::transmit) gives. Ask for a frame only when the one before is
 //!   out: what lies in a queue below is not overtaken by an emergency.
-//! - Call `transmit` also at the [`deadline`](Line::deadline), and after anything else was done to the line.
+//! - Call `transmit` also at the [`deadline`](Line::deadline), if the wire is free then, and after anything else was done to
+//!   the line.
 //! - When [`state`](Line::state) is [`State::Offered`], [`accept`](Line::accept) or [`close`](Line::close); when it is
 //!   [`State::Ended`], read the rest with [`peek`](Line::peek) and [`take`](Line::take), and close.
 //!
