@@ -1,6 +1,6 @@
 //! The rows of each view, of what was told.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
 use cara_std::control::protocol::{NodeInfo, OrderInfo, RefusedInfo};
@@ -271,17 +271,13 @@ fn known(app: &App, name: &str) -> Option<String> {
     Some(selector(all.find(|node| node.role == "s_unit").unwrap_or(first)))
 }
 
-fn is_connected(app: &App, node: Option<&str>) -> bool {
-    app.nodes().iter().any(|known| known.connected && Some(selector(known).as_str()) == node)
-}
-
 fn orders(app: &App, now: Now, running_alone: bool) -> Vec<Row> {
     let all = app.snapshot.as_ref().map_or(&[][..], |snapshot| &snapshot.orders);
     let shown = all.iter().filter(|order| !running_alone || order.order == "runs" || order.inhibited.is_some());
     let row = |order: &OrderInfo| {
         let name = format!("{}/{}", order.node, order.id);
-        let node = known(app, &name);
-        let is_old = app.is_old(now) || !is_connected(app, node.as_deref());
+        let is_it = |node: &NodeInfo| node.connected && node.id == order.id && node.name == order.node;
+        let is_old = app.is_old(now) || !app.nodes().iter().any(is_it);
         let tone = match (order.order.as_str(), order.inhibited) {
             (_, Some(_)) => Tone::Bad,
             ("runs", None) if is_old => Tone::Faint,
@@ -296,7 +292,7 @@ fn orders(app: &App, now: Now, running_alone: bool) -> Vec<Row> {
             left(app, now, order, is_old),
             cell(inhibited(order)).toned(tone),
         ];
-        Row { key: format!("{name} {}", order.function), node, cells }
+        Row { key: format!("{name} {}", order.function), node: known(app, &name), cells }
     };
     shown.map(row).collect()
 }
@@ -322,12 +318,13 @@ fn inhibited(order: &OrderInfo) -> String {
 }
 
 fn streams(app: &App, now: Now) -> Vec<Row> {
+    let connected: HashSet<String> = app.nodes().iter().filter(|node| node.connected).map(selector).collect();
     let mut all: Vec<_> = app.values.iter().collect();
     all.sort_by_key(|(node, _)| node.as_str());
     let of_node = |(node, (at, values)): (&String, &(Now, Vec<Value>))| {
         let row = |value: &Value| {
             let age = value.age.map(|age| age + now.saturating_sub(*at));
-            let is_gone = !is_connected(app, Some(node));
+            let is_gone = !connected.contains(node);
             let is_old = is_gone || age.is_none_or(|age| age > OLD_VALUE) || app.is_old(now);
             let tone = if is_old { Tone::Faint } else { Tone::Plain };
             let cells = vec![
