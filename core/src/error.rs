@@ -144,6 +144,9 @@ pub enum Refusal {
     /// The vehicle has an order of another manager of the same identity, and joins this one afterwards.
     #[error("the vehicle has an order of another manager of this name and id: it joins when that has ended")]
     Driving,
+    /// The manager stands by.
+    #[error("the manager stands by: another one of this name and id commands, and the link goes there")]
+    Standby,
 }
 
 impl Refusal {
@@ -163,6 +166,7 @@ impl Refusal {
             Self::Suite => 11,
             Self::Fenced => 12,
             Self::Driving => 13,
+            Self::Standby => 14,
         }
     }
 
@@ -182,6 +186,7 @@ impl Refusal {
             11 => Self::Suite,
             12 => Self::Fenced,
             13 => Self::Driving,
+            14 => Self::Standby,
             _ => Self::Malformed,
         }
     }

@@ -18,6 +18,7 @@ impl Port for Board {
     type Cipher = LinkCipher;
     type Endpoint = SocketAddrV4;
     const MANAGES: bool = cfg!(feature = "manager");
+    const STANDS_BY: bool = false;
     const CALLS: bool = cfg!(feature = "call");
     const DISCOVERS: bool = cfg!(feature = "discover");
     const HAS_ACCESS: bool = cfg!(feature = "access");

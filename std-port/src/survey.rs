@@ -216,6 +216,7 @@ impl Survey {
             tcp_port: 0,
             expected: 0,
             known: Default::default(),
+            standby: false,
             skipped: 0,
         };
         let plain = encoded(&question(first.wrapping_add(1)), fleet, &Plain);

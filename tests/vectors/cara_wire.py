@@ -149,9 +149,10 @@ ITEMS = {
     7: ("answer", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("room", 16), ("expected", 16)]),
     8: ("claim", CLAIM),
     9: ("obeyed", CLAIM),
+    10: ("standby", []),
 }
 HELLO_ITEMS = ("unit", "wanted", "link", "limits", "claim", "obeyed")
-WHO_HAS_ITEMS = ("unit", "wanted", "search", "known")
+WHO_HAS_ITEMS = ("unit", "wanted", "search", "known", "standby")
 ANNOUNCE_ITEMS = ("unit", "answer", "claim", "obeyed")
 
 
@@ -254,6 +255,8 @@ def write_items(value, names):
             out += item(kind, write_fields({**value, **value["identity"]}, fields))
         elif name in ("claim", "obeyed", "wanted"):
             out += item(kind, write_fields(value[name], fields)) if value.get(name) else b""
+        elif name == "standby":
+            out += item(kind, b"") if value.get(name) else b""
         elif name == "known":
             out += item(kind, struct.pack("<%dI" % len(value[name]), *value[name])) if value[name] else b""
         else:
@@ -343,7 +346,7 @@ def read_datagram(data, items, own):
     found = read_items(data, items, ("unit", own))
     value = {"identity": found["identity"], "epoch": found["unit"]["epoch"], **found[own], "skipped": found["skipped"]}
     if own == "search":
-        value.update(wanted=found.get("wanted"), known=found.get("known", []))
+        value.update(wanted=found.get("wanted"), known=found.get("known", []), standby="standby" in found)
     else:
         value.update(found["claims"])
     return value

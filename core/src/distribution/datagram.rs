@@ -57,6 +57,9 @@ pub struct WhoHas {
     pub expected: u16,
     /// [`short_hash`] of nodes that are connected already and stay silent.
     pub known: heapless::Vec<u32, KNOWN_NODES>,
+    /// The sender is a standby: it is answered, and otherwise not taken for a manager. A reader that does not know the mark answers
+    /// too. Were it to drop the question, a standby would find nobody beside a manager of an earlier version.
+    pub standby: bool,
     /// Items that the reader did not know and passed over. Not sent.
     pub skipped: u16,
 }
@@ -319,7 +322,8 @@ fn sign_for_fleet(length: usize, authenticator: &dyn Authenticator, out: &mut [u
 
 impl WhoHas {
     fn take(body: &[u8]) -> Result<Self, DatagramError> {
-        let (mut unit, mut wanted, mut search, mut known, mut skipped) = (None, None, None, heapless::Vec::new(), 0);
+        let (mut unit, mut wanted, mut search, mut known) = (None, None, None, heapless::Vec::new());
+        let (mut standby, mut skipped) = (false, 0);
         for item in Items::new(body) {
             let item = item?;
             match item.kind {
@@ -327,6 +331,7 @@ impl WhoHas {
                 kind::WANTED => wanted = Some(item.read(Manager::take)?),
                 kind::SEARCH => search = Some(item.read(Search::take)?),
                 kind::KNOWN => known = hashes(item.body)?,
+                kind::STANDBY => standby = true,
                 _ => item.skip(&mut skipped)?,
             }
         }
@@ -335,7 +340,7 @@ impl WhoHas {
             return Err(DatagramError::Malformed);
         }
         let Search { sequence, nonce, tcp_port, expected } = search;
-        Ok(Self { identity, epoch, sequence, nonce, wanted, tcp_port, expected, known, skipped })
+        Ok(Self { identity, epoch, sequence, nonce, wanted, tcp_port, expected, known, standby, skipped })
     }
 
     /// The datagram, in `out`; `None` where it does not fit.
@@ -355,6 +360,10 @@ impl WhoHas {
             for hash in &self.known {
                 writer.bytes(&hash.to_le_bytes());
             }
+            writer.end(item);
+        }
+        if self.standby {
+            let item = writer.begin(kind::STANDBY);
             writer.end(item);
         }
         let mut length = writer.finish()?;
@@ -466,13 +475,14 @@ mod tests {
             tcp_port: u16::MAX,
             expected: u16::MAX,
             known: (0..known).map(|_| u32::MAX).collect(),
+            standby: false,
             skipped: 0,
         }
     }
 
     #[test]
     fn the_longest_search_fits_and_survives() {
-        let search = who_has(KNOWN_NODES);
+        let search = WhoHas { standby: true, ..who_has(KNOWN_NODES) };
         let mut out = [0; SEARCH_BYTES];
         let bytes = search.encode(FLEET, &Plain, &mut out).unwrap();
         assert_eq!(Datagram::decode(bytes, FLEET, &Plain), Ok(Datagram::WhoHas(search)));

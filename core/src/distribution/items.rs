@@ -31,6 +31,8 @@ pub(super) mod kind {
     pub(in crate::distribution) const CLAIM: u16 = 8;
     /// The highest claim of the reader's identity that the sender has obeyed.
     pub(in crate::distribution) const OBEYED: u16 = 9;
+    /// The sender stands by: it answers nobody and takes no links.
+    pub(in crate::distribution) const STANDBY: u16 = 10;
 }
 
 /// Every item begins at a multiple of this, counted from the first one.

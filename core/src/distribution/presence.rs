@@ -64,6 +64,7 @@ impl Presence {
             tcp_port: 0,
             expected: 1,
             known: heapless::Vec::new(),
+            standby: false,
             skipped: 0,
         };
         who_has.encode(self.fleet, authenticator, out)

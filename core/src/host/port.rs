@@ -16,6 +16,9 @@ pub trait Port: 'static {
     /// Whether its units may be m_units. Where none is, what only they do (answers to searches, links that are accepted, claims that
     /// are raised) is left out of the program.
     const MANAGES: bool = true;
+    /// Whether its m_units may stand by for another one. Where none does, [`Node::stand_by`](crate::distribution::connection_handler::Node::stand_by)
+    /// does nothing.
+    const STANDS_BY: bool = true;
     /// Whether its units call functions of others. Where none does, it keeps none of their functions, and counts them as skipped.
     const CALLS: bool = true;
     /// Whether its units search, answer searches and dial what they find. Where they do not, each has a manager at a fixed address.

@@ -49,6 +49,17 @@ pub enum UnitEvent<F, N, E> {
         /// Its claim.
         claim: Claim,
     },
+    /// This m_unit stands by: it has just started, or has stepped down for a live manager of its name and id with this higher
+    /// claim. Its links have ended, and with them what it ordered.
+    StandsBy {
+        /// That manager's claim.
+        by: Option<Claim>,
+    },
+    /// This standby commands from here on: no manager of its name and id is there any more.
+    TookCommand {
+        /// Its claim.
+        claim: Claim,
+    },
     /// The claim of this manager is obeyed until this unit's next start only: it could not be stored, or not in time.
     ClaimNotKept {
         /// The manager.

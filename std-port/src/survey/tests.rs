@@ -34,6 +34,7 @@ fn search(name: &str, epoch: u64) -> WhoHas {
         tcp_port: 0,
         expected: 1,
         known: Default::default(),
+        standby: false,
         skipped: 0,
     }
 }

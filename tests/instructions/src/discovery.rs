@@ -186,6 +186,7 @@ impl Discovery {
             tcp_port: 0,
             expected: 1,
             known: Default::default(),
+            standby: false,
             skipped: 0,
         };
         let mut bytes = [0; SEARCH_BYTES];

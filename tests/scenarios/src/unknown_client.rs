@@ -137,6 +137,7 @@ fn who_has(fleet: u32) -> Vec<u8> {
         tcp_port: 0,
         expected: 1,
         known: Default::default(),
+        standby: false,
         skipped: 0,
     };
     let mut bytes = [0; SEARCH_BYTES];

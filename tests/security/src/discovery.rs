@@ -70,6 +70,7 @@ fn who_has(who: &Identity, wanted_depot: bool) -> WhoHas {
         tcp_port: 666,
         expected: 1,
         known: Default::default(),
+        standby: false,
         skipped: 0,
     }
 }

@@ -176,6 +176,7 @@ fn say_anything(linux: &Linux, over: &AtomicBool, made: &AtomicU64) -> Result<()
             tcp_port: 0,
             expected: 1,
             known: Default::default(),
+            standby: false,
             skipped: 0,
         };
         let codes = Codes::Keyed(crate::discovery::Lent(linux.ground.elsewhere()));

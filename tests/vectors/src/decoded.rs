@@ -327,6 +327,7 @@ fn who_has(search: &WhoHas) -> Value {
         "tcp_port": search.tcp_port,
         "expected": search.expected,
         "known": search.known.as_slice(),
+        "standby": search.standby,
         "skipped": search.skipped,
     })
 }

@@ -195,6 +195,7 @@ fn datagrams() -> Vec<Vector> {
         tcp_port: 40_000,
         expected: 12,
         known: heapless::Vec::from_slice(&[short_hash(&known)]).unwrap_or_default(),
+        standby: false,
         skipped: 0,
     };
     let wish = WhoHas {
@@ -203,6 +204,14 @@ fn datagrams() -> Vec<Vector> {
         tcp_port: 0,
         expected: 1,
         known: heapless::Vec::new(),
+        ..search.clone()
+    };
+    let standby = WhoHas {
+        wanted: Some(manager("manager", 1)),
+        tcp_port: 0,
+        expected: 0,
+        known: heapless::Vec::new(),
+        standby: true,
         ..search.clone()
     };
     let answer = Announce {
@@ -220,6 +229,7 @@ fn datagrams() -> Vec<Vector> {
     let mut out = [0; 512];
     let search = search.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
     let wish = wish.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
+    let standby = standby.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
     let of_claim = Announce { claim: Some(report(1_500)), ..answer.clone() };
     let of_claim = of_claim.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let answer = answer.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
@@ -241,7 +251,7 @@ fn datagrams() -> Vec<Vector> {
         json!({ "who_has": {
             "identity": { "name": "agv-07", "id": 7, "role": "s_unit" }, "epoch": 9, "sequence": 3,
             "nonce": 0x0102_0304_0506_0708_u64, "wanted": { "name": "manager", "id": 1 },
-            "tcp_port": 0, "expected": 1, "known": [], "skipped": skipped,
+            "tcp_port": 0, "expected": 1, "known": [], "standby": false, "skipped": skipped,
         }})
     };
     let announced = |claim: Value| {
@@ -257,10 +267,19 @@ fn datagrams() -> Vec<Vector> {
             &search,
             &json!({ "who_has": {
                 "identity": manager, "epoch": 9, "sequence": 3, "nonce": 0x0102_0304_0506_0708_u64, "wanted": null,
-                "tcp_port": 40_000, "expected": 12, "known": [short_hash(&known)], "skipped": 0,
+                "tcp_port": 40_000, "expected": 12, "known": [short_hash(&known)], "standby": false, "skipped": 0,
             }}),
         ),
         datagram(("who_has_s_unit", "an s_unit looks for its manager"), 7, &wish, &wished(0)),
+        datagram(
+            ("who_has_standby", "a standby of `manager` asks whether that one is there"),
+            7,
+            &standby,
+            &json!({ "who_has": {
+                "identity": manager, "epoch": 9, "sequence": 3, "nonce": 0x0102_0304_0506_0708_u64,
+                "wanted": { "name": "manager", "id": 1 }, "tcp_port": 0, "expected": 0, "known": [], "standby": true, "skipped": 0,
+            }}),
+        ),
         datagram(
             ("who_has_unknown_item", "an unknown item is passed over and counted"),
             7,

@@ -27,6 +27,9 @@ pub(crate) enum Admission {
 impl<P: Port> Node<P> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
     pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: P::Endpoint, hello: &Hello) -> Admission {
+        if self.is_standby() {
+            return self.refuse(now, from, &hello.identity, Refusal::Standby);
+        }
         if let Err(refusal) = self.check(hello).and_then(|()| self.check_claim(hello)) {
             if refusal == Refusal::Fenced {
                 self.hear_obeyed(now, from, &hello.identity, hello.obeyed.as_ref());
@@ -214,7 +217,7 @@ impl<P: Port> Node<P> {
             Refusal::AlreadyConnected => NodeCounter::RefusedConnected,
             Refusal::Mode => NodeCounter::RefusedMode,
             Refusal::NoKey => NodeCounter::RefusedKey,
-            Refusal::Fenced | Refusal::Driving => NodeCounter::RefusedFenced,
+            Refusal::Fenced | Refusal::Driving | Refusal::Standby => NodeCounter::RefusedFenced,
         };
         self.counters.count(counter);
         self.note_of(now, address, identity, refusal);

@@ -15,11 +15,11 @@ use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
 /// From one question for this unit's own identity to the next.
-const PERIOD: Duration = Duration::from_secs(1);
+pub(super) const PERIOD: Duration = Duration::from_secs(1);
 /// How often the node looks meanwhile, so that it notices a pause of its own.
-const LOOK: Duration = Duration::from_millis(250);
+pub(super) const LOOK: Duration = Duration::from_millis(250);
 /// Questions in a row that nobody answers before a claim is raised.
-const QUESTIONS: u8 = 3;
+pub(super) const QUESTIONS: u8 = 3;
 /// So long the manager of a higher claim was not heard before a claim is raised above it.
 const UNHEARD: Duration = Duration::from_secs(3);
 /// Between the first raise and the next one; it doubles.
@@ -45,8 +45,22 @@ pub enum ClaimEvent {
     /// This m_unit is to claim the one above: the port draws a claimant, stores, calls [`Node::set_claim`], and has each session
     /// announce it. Where storing fails it does nothing.
     Raise(Claim),
-    /// A live manager of this m_unit's identity has this higher claim: the port stores it and stops.
+    /// A live manager of this m_unit's identity has this higher claim: the port stores it and stops. One that is to stand by ends all
+    /// links instead, and calls [`Node::stand_by`].
     StepDown(TaggedClaim),
+    /// This standby is to command with a claim above this one: the port draws a claimant, stores, and calls [`Node::lead`]. Where
+    /// storing fails it calls [`Node::stand_by`].
+    Lead(Claim),
+}
+
+/// Whether an m_unit commands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Stage {
+    Commands,
+    /// It stands by.
+    StandsBy,
+    /// The same, and the port stores the claim with which it is to command.
+    Starts,
 }
 
 /// Whether a claim that is obeyed is stored.
@@ -81,43 +95,51 @@ impl Obeyed {
     }
 }
 
-/// A genuine claim above this manager's.
+/// A genuine claim above this manager's; of a standby the highest that it has heard.
 #[derive(Clone, Copy, Debug)]
-struct Rival {
-    claim: Claim,
+pub(super) struct Rival {
+    pub(super) claim: Claim,
     /// For how long its manager had not been heard, by whoever heard it last, when a vehicle said so last: that nobody says
     /// anything any more is no sign that it is gone.
     silent: Duration,
     reported: Instant,
 }
 
+impl Rival {
+    /// From when on nobody has heard its manager for this long, as far as was said.
+    pub(super) fn silent_from(&self, silence: Duration) -> Instant {
+        if self.silent >= silence { Instant::START } else { self.reported + (silence - self.silent) }
+    }
+}
+
 /// The questions for this unit's own identity.
 #[derive(Clone, Copy, Debug)]
-struct Questions {
+pub(super) struct Questions {
     /// Of the last one; another each time.
-    nonce: u64,
+    pub(super) nonce: u64,
     /// When it was asked; none is open before the first.
-    asked: Option<Instant>,
-    unanswered: u8,
+    pub(super) asked: Option<Instant>,
+    pub(super) unanswered: u8,
     /// Vehicles were asked as well, a question ago.
     asked_vehicles: bool,
-    polled: Instant,
-    next: Instant,
+    pub(super) polled: Instant,
+    pub(super) next: Instant,
 }
 
 /// The claim of an m_unit, those that it has heard, and those that a vehicle obeys.
 #[derive(Debug)]
 pub(super) struct Claims {
-    own: TaggedClaim,
+    pub(super) stage: Stage,
+    pub(super) own: TaggedClaim,
     took_over: Option<Instant>,
     /// It raises its claim until it was the highest once.
     takes_over: bool,
     fences: heapless::Vec<ClaimReport, FENCES>,
-    rival: Option<Rival>,
-    questions: Questions,
+    pub(super) rival: Option<Rival>,
+    pub(super) questions: Questions,
     next_raise: Instant,
     pause: Duration,
-    event: Option<ClaimEvent>,
+    pub(super) event: Option<ClaimEvent>,
     /// The port stores what this unit obeys.
     stores: bool,
     obeyed: heapless::Vec<(Identity, Obeyed), OBEYED_MANAGERS>,
@@ -126,6 +148,7 @@ pub(super) struct Claims {
 impl Claims {
     pub(super) const fn new(now: Instant) -> Self {
         Self {
+            stage: Stage::Commands,
             own: TaggedClaim::NONE,
             took_over: None,
             takes_over: false,
@@ -151,6 +174,14 @@ impl Claims {
         self.questions.next
     }
 
+    /// From here on it stands by, and asks next at `next`. What it has heard, and obeyed of others, stays.
+    pub(super) fn stand_by(&mut self, now: Instant, next: Instant) {
+        let obeyed = core::mem::take(&mut self.obeyed);
+        let (rival, stores) = (self.rival, self.stores);
+        *self = Self { stage: Stage::StandsBy, rival, stores, obeyed, ..Self::new(now) };
+        self.questions.next = next;
+    }
+
     fn of(&self, manager: &Identity) -> Option<&Obeyed> {
         self.obeyed.iter().find(|(identity, _)| identity == manager).map(|(_, obeyed)| obeyed)
     }
@@ -159,7 +190,7 @@ impl Claims {
         self.obeyed.iter_mut().find(|(identity, _)| identity == manager).map(|(_, obeyed)| obeyed)
     }
 
-    fn meet_rival(&mut self, now: Instant, claim: Claim, silent: Duration) {
+    pub(super) fn meet_rival(&mut self, now: Instant, claim: Claim, silent: Duration) {
         let rival = self.rival.get_or_insert(Rival { claim, silent, reported: now });
         let known = rival.silent + now.since(rival.reported);
         *rival = Rival { claim: rival.claim.max(claim), silent: known.min(silent), reported: now };
@@ -387,6 +418,8 @@ impl<P: Port> Node<P> {
         } else if claims.takes_over {
             claims.meet_rival(now, tagged.claim, Duration::ZERO);
         } else {
+            // What it has heard, if it stands by from here on.
+            claims.meet_rival(now, tagged.claim, Duration::ZERO);
             claims.event = Some(ClaimEvent::StepDown(tagged));
             // The port asks for it when it has polled.
             claims.questions.next = now;

@@ -73,7 +73,7 @@ crate::counters::counters! {
         RefusedMode,
         /// Links refused because there is no key for the pair.
         RefusedKey,
-        /// Links refused because the vehicle has obeyed a higher claim, or drives for another manager.
+        /// Links refused because the vehicle has obeyed a higher claim, or drives for another manager, or because this unit stands by.
         RefusedFenced,
         /// Nodes that said that they obey another manager of this unit's identity.
         Fenced,

@@ -51,6 +51,13 @@ impl<P: Port> Node<P> {
         if *identity != self.config.identity {
             return false;
         }
+        if let Some(who_has) = question.filter(|who_has| who_has.standby) {
+            // It commands nothing, and is to know that this manager lives.
+            if epoch != self.config.epoch && self.role() == Role::MUnit {
+                self.answer_later(now, from, identity, who_has.nonce);
+            }
+            return true;
+        }
         if epoch != self.config.epoch {
             self.counters.count(NodeCounter::OwnIdentity);
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);

@@ -106,7 +106,8 @@ impl<P: Port> Node<P> {
     /// The dialled peer has refused for a reason that does not pass by itself.
     fn lose_hope(&mut self, now: Instant, place: usize, reason: CloseReason) {
         let CloseReason::Refused(refusal) = reason else { return };
-        if matches!(refusal, Refusal::Full | Refusal::AlreadyConnected | Refusal::Fenced | Refusal::Driving) {
+        use Refusal::{AlreadyConnected, Driving, Fenced, Full, Standby};
+        if matches!(refusal, Full | AlreadyConnected | Fenced | Driving | Standby) {
             return;
         }
         if let Target::Manager(_) = self.config.target {

@@ -22,6 +22,7 @@ mod hints;
 mod known;
 mod links;
 mod search;
+mod standby;
 mod table;
 mod timetable;
 mod views;
@@ -332,6 +333,9 @@ impl<P: Port> Node<P> {
 
     /// When [`poll`](Self::poll) has something to do next.
     pub fn next_deadline(&self) -> Instant {
+        if self.is_standby() {
+            return self.claims.next();
+        }
         let own = self.claims.next().min(self.table.next_due());
         if P::DISCOVERS { own.min(self.answers.next()).min(self.hints.next()).min(self.search.next()) } else { own }
     }
@@ -343,6 +347,10 @@ impl<P: Port> Node<P> {
         mailman: &mut dyn Mailman<P::Endpoint>,
         authenticator: &dyn Authenticator,
     ) -> Option<Command<P::Endpoint>> {
+        if self.is_standby() {
+            self.poll_standby(now, mailman, authenticator);
+            return None;
+        }
         while let Some((place, task)) = self.table.pop_due(now) {
             let command = match task {
                 Task::Dial => self.dial(now, place),
@@ -380,6 +388,10 @@ impl<P: Port> Node<P> {
             return self.counters.count(NodeCounter::DatagramNotForUs);
         }
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
+            Ok(Datagram::WhoHas(_)) if self.is_standby() => {}
+            Ok(Datagram::Announce(announce)) if self.is_standby() => {
+                self.standby_answered(now, &announce, authenticator)
+            }
             Ok(Datagram::WhoHas(who_has)) => {
                 self.counters.add(NodeCounter::DatagramItemsSkipped, who_has.skipped.into());
                 self.heard_who_has(now, from, &who_has, authenticator.mode());

@@ -146,7 +146,8 @@ impl<P: Port> Node<P> {
     /// When the next search goes out. Another unit's search may defer it, so a port reads waiting datagrams first:
     /// otherwise each of many units that one busy thread drives would search.
     pub fn searches_at(&self) -> Instant {
-        self.search.next().min(self.claims.next())
+        let own = self.claims.next();
+        if self.is_standby() { own } else { own.min(self.search.next()) }
     }
 
     fn dial_target(&mut self, now: Instant) {
@@ -275,9 +276,10 @@ impl<P: Port> Node<P> {
             sequence: self.sequence.wrapping_add(1),
             nonce: self.search.nonce,
             wanted,
-            tcp_port: self.config.tcp_port,
+            tcp_port: if self.is_standby() { 0 } else { self.config.tcp_port },
             expected,
             known: known.take(KNOWN_NODES).collect(),
+            standby: self.is_standby(),
             skipped: 0,
         };
         self.sequence = who_has.sequence;
@@ -303,6 +305,8 @@ impl<P: Port> Node<P> {
             }
             None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has),
             None if here => self.answer_survey(now, from, who_has, mode),
+            // It asks the manager of its identity once a second.
+            _ if who_has.standby => {}
             _ => self.counters.count(NodeCounter::WrongManager),
         }
     }
@@ -359,7 +363,9 @@ impl<P: Port> Node<P> {
             // What this unit has obeyed, a manager of that identity is to know.
             self.answer_later(now, from, &who_has.identity, who_has.nonce);
         }
-        self.hinted(now, from, &who_has.identity, who_has.epoch, delay);
+        if !who_has.standby {
+            self.hinted(now, from, &who_has.identity, who_has.epoch, delay);
+        }
     }
 
     pub(super) fn heard_announce(

@@ -10,7 +10,7 @@ use crate::distribution::hello::ClaimReport;
 /// The code that only holders of a key make; everybody here has it but for tags, which a test makes by hand.
 const GENUINE: [u8; CODE_BYTES] = [7; CODE_BYTES];
 
-struct Keyed;
+pub(super) struct Keyed;
 
 impl Authenticator for Keyed {
     fn mode(&self) -> Mode {
@@ -34,19 +34,19 @@ impl Authenticator for Keyed {
     }
 }
 
-fn claim(term: u64) -> Claim {
+pub(super) fn claim(term: u64) -> Claim {
     Claim { term, claimant: 4 }
 }
 
-fn tagged(claim: Claim) -> TaggedClaim {
+pub(super) fn tagged(claim: Claim) -> TaggedClaim {
     TaggedClaim { claim, tag: GENUINE }
 }
 
-fn report(claim: Claim, since: u32) -> Option<ClaimReport> {
+pub(super) fn report(claim: Claim, since: u32) -> Option<ClaimReport> {
     Some(ClaimReport { tagged: tagged(claim), since })
 }
 
-fn forged(claim: Claim) -> Option<ClaimReport> {
+pub(super) fn forged(claim: Claim) -> Option<ClaimReport> {
     Some(ClaimReport { tagged: TaggedClaim { claim, tag: [8; CODE_BYTES] }, since: ClaimReport::NEVER })
 }
 
@@ -251,12 +251,12 @@ fn question(node: &mut Node<InMemory>, now: Instant) -> WhoHas {
     asked.expect("it asks for itself")
 }
 
-fn answer(nonce: u64, claim: Option<ClaimReport>) -> Announce {
+pub(super) fn answer(nonce: u64, claim: Option<ClaimReport>) -> Announce {
     let double = NodeConfig { epoch: Epoch(99), ..m_unit(MANAGER, MANAGER_ID) };
     Announce { claim, ..announce_of(&double, 1, nonce) }
 }
 
-fn hear(node: &mut Node<InMemory>, now: Instant, announce: &Announce) {
+pub(super) fn hear(node: &mut Node<InMemory>, now: Instant, announce: &Announce) {
     let depot = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
     let mut out = [0; SEARCH_BYTES];
     let bytes = announce.encode(FLEET, &Keyed, Some(&depot), &mut out).unwrap();

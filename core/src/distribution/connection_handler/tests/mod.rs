@@ -18,6 +18,7 @@ mod load;
 mod network;
 mod ordering;
 mod restart;
+mod standby;
 mod table;
 
 use core::net::SocketAddr;
@@ -146,6 +147,7 @@ pub(super) fn search_of(config: &NodeConfig<SocketAddr>, sequence: u32) -> WhoHa
         tcp_port: config.tcp_port,
         expected: 1,
         known: heapless::Vec::new(),
+        standby: false,
         skipped: 0,
     }
 }

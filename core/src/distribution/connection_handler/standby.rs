@@ -1,0 +1,153 @@
+//! A standby: an m_unit that waits until no manager of its identity is there, and then commands in its place. Meanwhile it answers
+//! nobody, takes no links and opens none. It starts on what is missing, so only a proven answer keeps it waiting, and a pause of its
+//! own, unread sockets or a question that was not sent count as nothing.
+
+use super::claims::{ClaimEvent, LOOK, PERIOD, QUESTIONS, Questions, Stage};
+use super::search::{Search, fresh};
+use super::{Node, NodeCounter};
+use crate::config::MISSED_KEEP_ALIVES;
+use crate::distribution::authenticator::Authenticator;
+use crate::distribution::claim::{Claim, TaggedClaim};
+use crate::distribution::datagram::Announce;
+use crate::distribution::hello::{ClaimReport, Manager};
+use crate::distribution::presence::PRESENCE_WAIT;
+use crate::host::mailman::Mailman;
+use crate::host::port::Port;
+use crate::time::{Duration, Instant};
+
+/// An answer that has not come so long after the last question does not come. What is alive answers at once.
+const LISTENING: Duration = PRESENCE_WAIT;
+/// The question on which a start depends is asked so long after the time for it: answers are a little late, and clocks differ.
+const MARGIN: Duration = Duration::from_millis(20);
+
+/// Of the port, about a standby.
+impl<P: Port> Node<P> {
+    /// This m_unit stands by from here on, until a [`ClaimEvent::Lead`]. One that has stepped down has ended all of its links before,
+    /// or does so at once. It has to have keys: in plain mode anybody could keep it waiting, or answer for its vehicles.
+    pub fn stand_by(&mut self, now: Instant) {
+        // Standbys of one identity do not ask at the same time, and so do not start at the same time.
+        let next = now + self.random.jitter(self.standby_period());
+        self.claims.stand_by(now, next);
+    }
+
+    /// Whether this m_unit stands by.
+    pub fn is_standby(&self) -> bool {
+        P::MANAGES && P::STANDS_BY && self.claims.stage != Stage::Commands
+    }
+
+    /// The port has stored this claim, in answer to [`ClaimEvent::Lead`]: the m_unit commands with it from here on. `false` where it
+    /// still stands by: somebody has answered meanwhile.
+    pub fn lead(&mut self, now: Instant, tagged: TaggedClaim) -> bool {
+        let is_highest = self.claims.rival.is_none_or(|rival| rival.claim < tagged.claim);
+        if self.claims.stage != Stage::Starts || !is_highest {
+            return false;
+        }
+        self.claims.stage = Stage::Commands;
+        self.claims.questions.next = now;
+        self.set_claim(tagged);
+        self.search = Search::new(now, self.role(), &mut self.random);
+        true
+    }
+}
+
+impl<P: Port> Node<P> {
+    /// From one question to the next.
+    fn standby_period(&self) -> Duration {
+        self.config.constraints.keep_alive.min(PERIOD).max(LISTENING)
+    }
+
+    /// What an announce means to a standby. Only an answer to its last question counts.
+    pub(super) fn standby_answered(&mut self, now: Instant, announce: &Announce, authenticator: &dyn Authenticator) {
+        if announce.nonce == 0 || announce.nonce != self.claims.questions.nonce {
+            return self.counters.count(NodeCounter::Unasked);
+        }
+        self.counters.count(NodeCounter::AnnounceHeard);
+        let genuine = |report: &ClaimReport| report.tagged.is_genuine(&self.config.identity, authenticator);
+        if announce.identity != self.config.identity {
+            let Some(obeyed) = announce.obeyed.filter(genuine) else { return };
+            self.heard_of_manager(now, obeyed.claim(), Duration::from_millis(obeyed.since.into()));
+        } else if announce.epoch != self.config.epoch {
+            let claim = announce.claim.filter(genuine);
+            self.claims.questions.unanswered = 0;
+            self.heard_of_manager(now, claim.map_or(Claim::NONE, |report| report.claim()), Duration::ZERO);
+        }
+    }
+
+    /// Somebody heard the manager of this claim so long ago.
+    fn heard_of_manager(&mut self, now: Instant, claim: Claim, silent: Duration) {
+        self.claims.meet_rival(now, claim, silent);
+        if silent < self.silence() && self.claims.stage == Stage::Starts {
+            self.claims.stage = Stage::StandsBy;
+            self.claims.event = None;
+        }
+    }
+
+    /// So long nobody may have heard the manager.
+    fn silence(&self) -> Duration {
+        self.config.constraints.keep_alive.times(MISSED_KEEP_ALIVES.into())
+    }
+
+    pub(super) fn poll_standby(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
+        let silent = self.silent_from();
+        let claims = &mut self.claims;
+        let questions = &mut claims.questions;
+        if core::mem::replace(&mut questions.polled, now) + PERIOD < now {
+            // What came meanwhile may not be read yet.
+            (questions.unanswered, questions.asked, claims.event) = (0, None, None);
+            claims.stage = Stage::StandsBy;
+        }
+        if now < questions.next {
+            return;
+        }
+        // The answers to the last question would have said otherwise.
+        let listened = |asked| now >= asked + LISTENING && asked >= silent;
+        let is_alone = questions.unanswered >= QUESTIONS && questions.asked.is_some_and(listened);
+        if is_alone && claims.stage == Stage::StandsBy {
+            claims.stage = Stage::Starts;
+            claims.event = Some(ClaimEvent::Lead(claims.rival.map_or(Claim::NONE, |rival| rival.claim)));
+        }
+        if now >= self.next_question(now) {
+            self.ask_as_standby(now, mailman, authenticator);
+        }
+        let listened = self.claims.questions.asked.map(|asked| asked + LISTENING).filter(|end| *end > now);
+        self.claims.questions.next =
+            self.next_question(now).min(now + LOOK).min(listened.unwrap_or(Instant::FAR_FUTURE));
+    }
+
+    /// A period behind the last one; where that was not answered, when the manager has been silent for long enough, if that is soon.
+    fn next_question(&self, now: Instant) -> Instant {
+        let Questions { asked: Some(asked), unanswered, .. } = self.claims.questions else { return now };
+        let (due, silent) = (asked + self.standby_period(), self.silent_from() + MARGIN);
+        let is_soon = silent > asked && silent <= due + LISTENING;
+        if unanswered > 0 && is_soon { silent.max(asked + LISTENING) } else { due }
+    }
+
+    /// Since when, as far as was said, nobody has heard the manager for as long as it takes.
+    fn silent_from(&self) -> Instant {
+        self.claims.rival.map_or(Instant::START, |rival| rival.silent_from(self.silence()))
+    }
+
+    /// Asks for this unit's own identity, and all vehicles as well once the manager has not answered.
+    fn ask_as_standby(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
+        let nonce = fresh(&mut self.random);
+        let is_answered = self.claims.questions.unanswered == 0;
+        let own = Manager::new(self.config.identity.name(), self.config.identity.id()).ok();
+        self.search.nonce = nonce;
+        let sent =
+            self.say_who_has(own.filter(|_| is_answered), 0, authenticator, |datagram| mailman.broadcast(datagram));
+        self.counters.count(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed });
+        let questions = &mut self.claims.questions;
+        (questions.nonce, questions.asked) = (nonce, Some(now));
+        questions.unanswered = if sent { questions.unanswered.saturating_add(1) } else { 0 };
+    }
+}
