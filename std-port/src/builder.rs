@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::{Node, NodeConfig, Target};
 use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::hello::Manager;
@@ -66,6 +66,7 @@ pub struct Builder<T, R> {
     asks_for_itself: bool,
     state_folder: Option<PathBuf>,
     take_over: TakeOver,
+    stands_by: bool,
     starts_stopped: Option<u16>,
     state: T,
     role: PhantomData<fn() -> R>,
@@ -114,6 +115,7 @@ impl<R> Builder<(), R> {
             asks_for_itself: true,
             state_folder: crate::claims::folder(),
             take_over: TakeOver::No,
+            stands_by: false,
             starts_stopped: None,
             state: (),
             role: PhantomData,
@@ -147,6 +149,33 @@ impl<T: Send + 'static> Builder<T, MUnit> {
     /// The same also where another one has taken over within the last minute.
     pub fn force_take_over(mut self) -> Self {
         self.take_over = TakeOver::Forced;
+        self
+    }
+
+    /// The m_unit starts as a standby: it waits, connected to nobody, until no manager of its name and id answers any more and no
+    /// vehicle has heard one for three keep-alives. Then it commands, and its s_units come to it. Where another one commands with a
+    /// higher [claim](crate::Claim) it stands by again, in place of [`UnitEvent::Fenced`](crate::UnitEvent::Fenced). It
+    /// takes nothing over by [`take_over`](Self::take_over). Two of them on two hosts, each with a [folder of
+    /// state](Self::state_folder) of its own, are one manager that outlives a host. It takes keys:
+    /// [`BuildError::StandbyWithoutKeys`] in plain mode.
+    ///
+    /// ```no_run
+    /// use cara_std::{CommunicationSystem, UnitEvent};
+    ///
+    /// let depot = CommunicationSystem::builder("depot", 1)?.standby().build()?;
+    /// let events = depot.events();
+    /// depot.start()?;
+    /// for event in events {
+    ///     match event {
+    ///         UnitEvent::TookCommand { claim } => println!("commands with the claim {claim}"),
+    ///         UnitEvent::StandsBy { .. } => println!("waits"),
+    ///         _ => {}
+    ///     }
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn standby(mut self) -> Self {
+        self.stands_by = true;
         self
     }
 
@@ -289,6 +318,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
             take_over: self.take_over,
+            stands_by: self.stands_by,
             starts_stopped: self.starts_stopped,
             state,
             role: PhantomData,
@@ -327,6 +357,9 @@ impl<T: Send + 'static, R> Builder<T, R> {
     fn engine(self) -> Result<Arc<Engine<T>>, BuildError> {
         check(&self.constraints)?;
         let keys = self.keys.open(&self.identity, &self.target, self.fleet)?;
+        if self.stands_by && keys.mode() == Mode::Plain {
+            return Err(BuildError::StandbyWithoutKeys);
+        }
         let discovery_port = self.discovery_port.unwrap_or(keys.mode().port());
         let own_threads = self.threads.is_none();
         let threads = self.threads.map_or_else(Threads::of_one, Ok)?;
@@ -373,9 +406,11 @@ impl<T: Send + 'static, R> Builder<T, R> {
             datagrams,
             listener,
             maximum_links,
-            asks_for_itself: self.asks_for_itself,
+            // A standby asks for as long as it waits.
+            asks_for_itself: self.asks_for_itself && !self.stands_by,
             state_folder: self.state_folder,
-            take_over: self.take_over,
+            take_over: if self.stands_by { TakeOver::No } else { self.take_over },
+            stands_by: self.stands_by,
             starts_stopped: self.starts_stopped,
             #[cfg(feature = "control")]
             audit: self.audit,
@@ -405,6 +440,9 @@ pub enum BuildError {
     /// It does not start.
     #[error(transparent)]
     Start(#[from] StartError),
+    /// A standby in plain mode, in which nobody can prove that the manager is there.
+    #[error("a standby needs keys: in plain mode anybody could keep it waiting, or answer in its manager's name")]
+    StandbyWithoutKeys,
 }
 
 /// So that a `main` which builds a unit and calls others needs one error.

@@ -246,6 +246,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
         WeakHandle { owner: Arc::downgrade(&self.owner), role: PhantomData }
     }
 
+    /// Whether this m_unit stands by and commands nobody: see [`Builder::standby`](crate::Builder::standby).
+    pub fn is_standby(&self) -> bool {
+        self.engine().hub.lock().hub.node.is_standby()
+    }
+
     /// The claim of an m_unit, or the highest that an s_unit has obeyed.
     pub fn claim(&self) -> Claim {
         self.engine().hub.lock().hub.node.claim()

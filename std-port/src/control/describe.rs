@@ -165,6 +165,13 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         UnitEvent::NotJoined { address, peer, reason } => ("not_joined", peer.as_ref(), format!("{address}: {reason}")),
         UnitEvent::Fenced { claim } => ("fenced", None, format!("another manager commands with the claim {claim}")),
         UnitEvent::Raised { claim } => ("raised", None, format!("this manager has raised its claim to {claim}")),
+        UnitEvent::StandsBy { by: None } => ("stands_by", None, "this m_unit stands by".to_owned()),
+        UnitEvent::StandsBy { by: Some(claim) } => {
+            ("stands_by", None, format!("this m_unit stands by: another one commands with the claim {claim}"))
+        }
+        UnitEvent::TookCommand { claim } => {
+            ("took_command", None, format!("this standby commands, with the claim {claim}"))
+        }
         UnitEvent::ClaimNotKept { peer, claim } => (
             "claim not stored",
             Some(peer),

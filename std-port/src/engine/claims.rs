@@ -44,6 +44,8 @@ pub(crate) struct Claims {
     folder: Option<PathBuf>,
     /// A manager starts beside a live one, and fences it.
     take_over: TakeOver,
+    /// It starts as a standby, and is one again when it steps down.
+    stands_by: bool,
     writer: Mutex<Writer>,
     /// Says that the unit runs.
     held: Mutex<Option<File>>,
@@ -64,6 +66,8 @@ struct Writer {
 pub(super) enum Job {
     Keep(Identity, TaggedClaim),
     Raise(Claim),
+    /// Of a standby that is to command.
+    Lead(Claim),
     /// Of a manager that steps down.
     Heard(Claim),
 }
@@ -77,15 +81,21 @@ pub(super) enum Written {
     Obeyed,
     /// The raised claim is stored: it counts.
     Raised(Claim),
+    /// The same of a standby's first one.
+    Leads(Claim),
 }
 
 impl Claims {
-    pub(super) fn new(folder: Option<PathBuf>, take_over: TakeOver) -> Self {
-        Self { folder, take_over, writer: Mutex::default(), held: Mutex::default() }
+    pub(super) fn new(folder: Option<PathBuf>, take_over: TakeOver, stands_by: bool) -> Self {
+        Self { folder, take_over, stands_by, writer: Mutex::default(), held: Mutex::default() }
     }
 
     pub(crate) fn takes_over(&self) -> bool {
         self.take_over != TakeOver::No
+    }
+
+    pub(crate) fn stands_by(&self) -> bool {
+        self.stands_by
     }
 
     fn file(&self, hub: &SharedHub) -> Option<ClaimFile> {
@@ -129,7 +139,7 @@ impl Claims {
     }
 
     /// At the start: a unit obeys what it has stored. An m_unit claims above what it has stored and `heard`, and stores that
-    /// before anything is sent with it.
+    /// before anything is sent with it; a standby sees that it can.
     pub(super) fn claim(&self, hub: &SharedHub, keys: &Keys, clock: Clock, heard: Claim) -> Result<(), StartError> {
         let (identity, _) = hub.lock().identity();
         let file = self.file(hub);
@@ -146,15 +156,21 @@ impl Claims {
                 let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
                 kept.own.term = since.map_or(0, |since| since.as_secs());
             }
-            kept.own = kept.own.max(heard).raised(random());
+            if !self.stands_by {
+                kept.own = kept.own.max(heard).raised(random());
+            }
             let Some(tagged) = kept.own.tagged(&identity, &codes) else {
                 return Err(StartError::NoOwnKey { identity });
             };
             self.store(hub, &kept).map_err(StartError::Claim)?;
-            let mut cell = hub.lock();
-            cell.hub.node.set_claim(tagged);
+            let node = &mut hub.lock().hub.node;
+            if self.stands_by {
+                node.stand_by(clock.now());
+            } else {
+                node.set_claim(tagged);
+            }
             if self.takes_over() {
-                cell.hub.node.take_over(clock.now());
+                node.take_over(clock.now());
             }
         }
         if let Some(live) = keys.ring() {
@@ -206,26 +222,38 @@ impl Claims {
             Job::Keep(manager, tagged) => self.keep_obeyed(hub, keys, kept, manager, tagged),
             Job::Heard(claim) => {
                 kept.own = kept.own.max(claim);
-                if let Err(error) = self.store(hub, &kept) {
-                    tracing::error!(%error, "the claim that was heard is not stored");
+                match self.store(hub, &kept) {
+                    Ok(()) => lock(&self.writer).kept = kept,
+                    Err(error) => tracing::error!(%error, "the claim that was heard is not stored"),
                 }
                 Written::Nothing
             }
-            Job::Raise(above) => {
-                let claim = above.raised(random());
-                kept.own = claim;
-                match self.store(hub, &kept) {
-                    Ok(()) => {
-                        lock(&self.writer).kept = kept;
-                        Written::Raised(claim)
-                    }
+            Job::Raise(above) => match self.raise(hub, kept, above) {
+                Ok(claim) => Written::Raised(claim),
+                Err(error) => {
+                    tracing::error!(%error, "a raised claim cannot be stored, and is not announced");
+                    Written::Nothing
+                }
+            },
+            Job::Lead(above) => {
+                let above = above.max(kept.own);
+                match self.raise(hub, kept, above) {
+                    Ok(claim) => Written::Leads(claim),
                     Err(error) => {
-                        tracing::error!(%error, "a raised claim cannot be stored, and is not announced");
-                        Written::Nothing
+                        tracing::error!(%error, "the claim of this standby cannot be stored: it waits on");
+                        Written::Failed(job)
                     }
                 }
             }
         })
+    }
+
+    fn raise(&self, hub: &SharedHub, mut kept: KeptClaims, above: Claim) -> Result<Claim, String> {
+        let claim = above.raised(random());
+        kept.own = claim;
+        self.store(hub, &kept)?;
+        lock(&self.writer).kept = kept;
+        Ok(claim)
     }
 
     fn keep_obeyed(

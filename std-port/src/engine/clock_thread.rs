@@ -5,6 +5,7 @@ use cara_core::distribution::claim::Claim;
 use cara_core::distribution::connection_handler::ClaimEvent;
 use cara_core::distribution::datagram;
 use cara_core::distribution::identity::Role;
+use cara_core::error::CloseReason;
 use cara_core::time::Instant;
 use core::net::SocketAddr;
 use std::sync::Arc;
@@ -153,6 +154,7 @@ impl<T: Send + 'static> Engine<T> {
                 None => return,
                 Some(ClaimEvent::Keep(manager, tagged)) => self.leave_to_writer(Job::Keep(manager, tagged)),
                 Some(ClaimEvent::Raise(above)) => self.leave_to_writer(Job::Raise(above)),
+                Some(ClaimEvent::Lead(above)) => self.leave_to_writer(Job::Lead(above)),
                 Some(ClaimEvent::Unkept(peer, claim)) => {
                     tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored");
                     self.notify(UnitEvent::ClaimNotKept { peer, claim });
@@ -186,8 +188,25 @@ impl<T: Send + 'static> Engine<T> {
                 self.notify(UnitEvent::Raised { claim });
                 self.broadcast();
             }
+            Written::Failed(Job::Lead(_)) => {
+                self.hub.lock().hub.node.stand_by(self.now());
+                self.driver.wake();
+            }
+            Written::Leads(claim) => self.lead(claim),
             Written::Failed(_) | Written::Nothing => {}
         }
+    }
+
+    /// The claim of this standby is stored: it commands, unless somebody has answered meanwhile.
+    fn lead(&self, claim: Claim) {
+        let (identity, _) = self.hub.lock().identity();
+        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
+        if self.is_stopping() || !self.hub.lock().hub.node.lead(self.now(), tagged) {
+            return;
+        }
+        tracing::warn!(%claim, "no manager of this name and id is there any more: this standby commands");
+        self.notify(UnitEvent::TookCommand { claim });
+        self.driver.wake();
     }
 
     /// Tells all peers this manager's claim, with a tag of the keys as they are now.
@@ -208,6 +227,9 @@ impl<T: Send + 'static> Engine<T> {
         let Some(me) = self.me.upgrade() else { return };
         // A thread of the unit would wait for itself.
         let stop = move || {
+            if me.claims.stands_by() {
+                return me.stand_by_again(claim);
+            }
             me.stop();
             // Before the application hears of it and ends.
             me.leave_to_writer(Job::Heard(claim));
@@ -218,6 +240,16 @@ impl<T: Send + 'static> Engine<T> {
             tracing::error!(%error, "no thread is left to step down with: tries again when the other one is heard again");
             self.claims.step_down(false);
         }
+    }
+
+    /// All that it ordered ends with its links, and none is taken from here on.
+    fn stand_by_again(&self, by: Claim) {
+        self.hub.lock().hub.node.stand_by(self.now());
+        self.on_each_link(|session, cx| session.close(cx, CloseReason::StoppedHere));
+        self.leave_to_writer(Job::Heard(by));
+        self.claims.step_down(false);
+        self.notify(UnitEvent::StandsBy { by: Some(by) });
+        self.driver.wake();
     }
 }
 

@@ -175,6 +175,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) asks_for_itself: bool,
     pub(crate) state_folder: Option<PathBuf>,
     pub(crate) take_over: claims::TakeOver,
+    pub(crate) stands_by: bool,
     pub(crate) starts_stopped: Option<u16>,
     #[cfg(feature = "control")]
     pub(crate) audit: Option<Arc<Audit>>,
@@ -207,7 +208,7 @@ impl<T: Send + 'static> Engine<T> {
             key_watch: KeyWatch::new(parts.keys, driver.born()),
             driver,
             guard: access::Guard::default(),
-            claims: claims::Claims::new(parts.state_folder, parts.take_over),
+            claims: claims::Claims::new(parts.state_folder, parts.take_over, parts.stands_by),
             latch,
             accounts: accounts::Accounts::default(),
             notes: Notes {
@@ -418,6 +419,9 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.driver.wake_looker();
         self.driver.wake();
+        if self.claims.stands_by() {
+            self.notify(UnitEvent::StandsBy { by: None });
+        }
         Ok(())
     }
 

@@ -155,6 +155,7 @@ fn log_event(event: UnitEvent, address: Option<SocketAddr>) {
             tracing::warn!(node = %peer, skipped, "it has no room for some of this node's functions");
         }
         UnitEvent::LeaseExpired { peer, function } => tracing::warn!(node = %peer, function, "lease expired"),
+        UnitEvent::StandsBy { by } => tracing::warn!(by = by.map(tracing::field::display), "stands by"),
         event => tracing::debug!(?event, "event"),
     }
 }

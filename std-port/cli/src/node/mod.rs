@@ -71,6 +71,9 @@ pub(crate) struct Arguments {
     /// The same also where another one has taken over within the last minute.
     #[arg(long)]
     force_take_over: bool,
+    /// Start as a standby: command once no manager of this name and ID is there any more, and wait again where one is.
+    #[arg(long, conflicts_with_all = ["take_over", "force_take_over"])]
+    standby: bool,
     /// The folder in which the node stores its claims; CARA_STATE or STATE_DIRECTORY unless told.
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
@@ -97,6 +100,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let settings = Settings::of(read(arguments.file.as_deref())?, &over).map_err(wrong)?;
     if over.takes_over && settings.manager.is_some() {
         return Err(Ended::usage("--take-over is for an m_unit: an s_unit takes nothing over"));
+    }
+    if over.stands_by && settings.manager.is_some() {
+        return Err(Ended::usage("--standby is for an m_unit: an s_unit commands nobody"));
     }
     if arguments.check {
         check_start(&settings)?;
@@ -154,6 +160,7 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         tcp_port: arguments.tcp_port,
         takes_over: arguments.take_over || arguments.force_take_over,
         forces: arguments.force_take_over,
+        stands_by: arguments.standby,
         state: arguments.state.clone(),
         metrics: arguments.metrics,
         metrics_anywhere: arguments.metrics_anywhere,

@@ -45,6 +45,8 @@ pub(super) struct Settings {
     /// It starts although a live one has its identity.
     pub(super) takes_over: bool,
     pub(super) forces: bool,
+    /// It waits until no live one has its identity.
+    pub(super) stands_by: bool,
     /// Where it keeps its term.
     pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<Placed<SocketAddr>>,
@@ -76,6 +78,7 @@ pub(super) struct Overrides {
     pub(super) tcp_port: Option<u16>,
     pub(super) takes_over: bool,
     pub(super) forces: bool,
+    pub(super) stands_by: bool,
     pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<SocketAddr>,
     pub(super) metrics_anywhere: bool,
@@ -136,6 +139,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         m_units: m_units(file, role, over, mistakes),
         takes_over: over.takes_over,
         forces: over.forces,
+        stands_by: over.stands_by,
         state: over.state.clone(),
         fleet: over.fleet.or(file.fleet).unwrap_or(0),
         interfaces: over

@@ -54,6 +54,7 @@ impl Node {
             };
             let builder = builder.control(settings.control.clone()).take_over(settings.takes_over);
             let builder = if settings.forces { builder.force_take_over() } else { builder };
+            let builder = if settings.stands_by { builder.standby() } else { builder };
             let builder = match &settings.audit {
                 Some(path) => builder.audit(path).map_err(NotBuilt::Audit)?,
                 None => builder,
