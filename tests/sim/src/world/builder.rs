@@ -54,6 +54,7 @@ impl NewUnit {
             claims: Stored::default(),
             storing: Storing::Works,
             takes_over: false,
+            stands_by: false,
         };
         Self { shared: Rc::downgrade(shared), settings, segment: 0, ahead: Duration::ZERO }
     }
@@ -166,6 +167,12 @@ impl NewUnit {
     /// It raises its claim until that was the highest once.
     pub fn takes_over(mut self) -> Self {
         self.settings.takes_over = true;
+        self
+    }
+
+    /// It stands by, and does so again when it has stepped down.
+    pub fn stands_by(mut self) -> Self {
+        self.settings.stands_by = true;
         self
     }
 

@@ -165,11 +165,32 @@ impl Inner {
                 let claim = unit.claims.own;
                 self.log(shared, host, UnitEvent::Raised { claim });
             }
-            Some(ClaimEvent::Keep(..) | ClaimEvent::Raise(_)) => {}
+            Some(ClaimEvent::Lead(above)) if storing != Storing::Hangs => {
+                let (now, node) = (self.network.clock(host), &mut machine.links.hub.node);
+                if storing == Storing::Fails {
+                    node.stand_by(now);
+                    return true;
+                }
+                let claim = unit.claims.own.max(above).raised(self.network.random().bits());
+                unit.claims.own = claim;
+                let tagged = claim.tagged(&unit.settings.identity, &machine.links.keys.codes);
+                if node.lead(now, tagged.unwrap_or_default()) {
+                    self.log(shared, host, UnitEvent::TookCommand { claim });
+                }
+            }
+            Some(ClaimEvent::Keep(..) | ClaimEvent::Raise(_) | ClaimEvent::Lead(_)) => {}
             Some(ClaimEvent::Unkept(peer, claim)) => self.log(shared, host, UnitEvent::ClaimNotKept { peer, claim }),
             Some(ClaimEvent::StepDown(by)) => {
                 // Stored, so that its next start claims above it.
                 unit.claims.own = unit.claims.own.max(by.claim);
+                if unit.settings.stands_by {
+                    machine.links.hub.node.stand_by(self.network.clock(host));
+                    for index in machine.links.indices() {
+                        self.close(shared, host, index, CloseReason::StoppedHere);
+                    }
+                    self.log(shared, host, UnitEvent::StandsBy { by: Some(by.claim) });
+                    return true;
+                }
                 for index in machine.links.indices() {
                     machine
                         .links

@@ -259,6 +259,13 @@ impl UnitHandle {
         promise.await;
     }
 
+    /// Whether it is an m_unit that stands by.
+    pub fn is_standby(&self) -> bool {
+        let machine =
+            |inner: &mut Inner| Some(inner.units[self.host.index()].machine.as_ref()?.links.hub.node.is_standby());
+        self.with(machine).unwrap_or(false)
+    }
+
     /// The claim of an m_unit, or the highest that an s_unit has obeyed; while it is down, the one that an m_unit has stored.
     pub fn claim(&self) -> Claim {
         self.with(|inner| {

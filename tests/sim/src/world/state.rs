@@ -63,6 +63,7 @@ pub(super) struct Settings {
     /// Whether it can store anything.
     pub(super) storing: Storing,
     pub(super) takes_over: bool,
+    pub(super) stands_by: bool,
 }
 
 /// What a unit stores of claims.
@@ -159,7 +160,9 @@ impl UnitState {
             hub.node.choose(m_units.clone());
         }
         let now = network.clock(self.host);
-        if listens {
+        if listens && settings.stands_by {
+            hub.node.stand_by(now);
+        } else if listens {
             // Drawn anew for each life, without a draw of the network's.
             self.claims.own = self.claims.own.raised(epoch.rotate_left(23) ^ seed);
             let tagged = self.claims.own.tagged(&settings.identity, &keys.codes);

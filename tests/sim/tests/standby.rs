@@ -1,0 +1,217 @@
+//! Two or three managers of one identity that stand by for each other, and five vehicles, in runs drawn from seeds: managers and
+//! vehicles crash and hang, the network parts, disks fail. The claims that a vehicle obeys never decrease, and once a manager
+//! commands and its vehicles can be reached, each has it soon.
+//!
+//! `CARA_SIM_SEEDS=10000 cargo test --release -p cara-sim --test standby` runs more seeds.
+
+use std::cell::RefCell;
+use std::rc::Rc;
+
+use cara_core::distribution::claim::Claim;
+use cara_core::distribution::parameters::Parameters;
+use cara_core::random::Random;
+use cara_core::time::{Duration, Instant};
+use cara_sim::{Crash, Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+
+const VEHICLES: u32 = 5;
+/// So long everything fails, and so long a manager may take to command alone afterwards, with the highest claim: one that vehicles
+/// refuse has to raise its own first.
+const FAULTS: Duration = Duration::from_secs(30);
+const STARTS: Duration = Duration::from_secs(20);
+/// And so long its vehicles to obey it.
+const JOINS: Duration = Duration::from_secs(5);
+
+const fn millis(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+fn between(random: &mut Random, least: u64, most: u64) -> Duration {
+    millis(least + random.below(most - least))
+}
+
+type Executed = Rc<RefCell<Vec<Vec<Claim>>>>;
+
+struct Fleet {
+    world: World,
+    managers: Vec<UnitHandle>,
+    vehicles: Vec<UnitHandle>,
+    executed: Executed,
+}
+
+impl Fleet {
+    /// All managers but the first may have a disk that fails or hangs.
+    fn new(seed: u64, managers: u64) -> Self {
+        let world = World::secured(seed);
+        let mut random = Random::new(seed ^ 0x57A2_DB1E);
+        let executed = Executed::default();
+        executed.borrow_mut().resize(VEHICLES as usize, Vec::new());
+        let vehicle = |number: u32| {
+            let executed = Rc::clone(&executed);
+            let program = move |unit: &UnitHandle| {
+                let (executed, obeying) = (Rc::clone(&executed), unit.clone());
+                let drive = Service::new(move |_, _| {
+                    executed.borrow_mut()[number as usize].push(obeying.claim());
+                    Ok(())
+                });
+                unit.my_function_list()
+                    .add_service("drive()", drive.lease(millis(400), |_| {}))
+                    .expect("there is room");
+                unit.publish_my_function_list().expect("it runs");
+            };
+            world.s_unit(&format!("agv-{number}"), 10 + number).joins("manager", 1).program(program).start()
+        };
+        let vehicles = (0..VEHICLES).map(vehicle).collect();
+        let manager = |number: u64| {
+            let storing = match random.below(6) {
+                0 if number > 0 => Storing::Fails,
+                1 if number > 0 => Storing::Hangs,
+                _ => Storing::Works,
+            };
+            let ahead = Duration::from_micros(random.below(1 << 42));
+            world.m_unit("manager", 1).stands_by().storing(storing).clock(ahead).start()
+        };
+        let managers = (0..managers).map(manager).collect();
+        Self { world, managers, vehicles, executed }
+    }
+
+    /// Lets everybody work for a while; who commands has all of its vehicles drive.
+    fn run(&mut self, span: Duration) {
+        let end = self.world.now() + span;
+        while self.world.now() < end {
+            for manager in &self.managers {
+                let hangs = self.world.network(|network| network.suspended_until(manager.host())) > self.world.now();
+                if hangs || !manager.is_running() {
+                    continue;
+                }
+                for vehicle in manager.nodes_offering("drive") {
+                    let _ = manager.request(&vehicle, "drive", &Parameters::new());
+                }
+            }
+            self.world.run_for(millis(50));
+        }
+        for (number, executed) in self.executed.borrow().iter().enumerate() {
+            assert!(executed.is_sorted(), "agv-{number} executed commands of {executed:?}");
+        }
+    }
+
+    fn something_happens(&mut self, random: &mut Random) {
+        let pick = |random: &mut Random, units: &[UnitHandle]| units[random.below(units.len() as u64) as usize].clone();
+        let (manager, vehicle) = (pick(random, &self.managers), pick(random, &self.vehicles));
+        let crash = if random.below(2) == 0 { Crash::PowerCut } else { Crash::Process };
+        match random.below(8) {
+            0 | 1 => {
+                let down = between(random, 100, 9_000);
+                self.world.network(|network| network.crash_for(manager.host(), crash, down));
+            }
+            2 | 3 => self.world.suspend(&manager, between(random, 100, 9_000)),
+            4 | 5 => {
+                let units = self.managers.iter().chain(&self.vehicles).map(UnitHandle::host);
+                let others: Vec<_> = units.filter(|host| *host != manager.host() && random.below(4) > 0).collect();
+                let direction = if random.below(2) == 0 { Direction::Both } else { Direction::FirstToSecond };
+                let span = between(random, 500, 9_000);
+                self.world.network(|network| network.partition_for(&[manager.host()], &others, direction, span));
+            }
+            6 => self.world.suspend(&vehicle, between(random, 20, 5_000)),
+            _ => {
+                let down = between(random, 50, 3_000);
+                self.world.network(|network| network.crash_for(vehicle.host(), crash, down));
+            }
+        }
+    }
+
+    /// The one that commands, if it is one.
+    fn leader(&self) -> Option<&UnitHandle> {
+        let mut leading = self.managers.iter().filter(|manager| manager.is_running() && !manager.is_standby());
+        leading.next().filter(|_| leading.next().is_none())
+    }
+
+    fn has_all(&self, leader: &UnitHandle) -> bool {
+        self.vehicles.iter().all(|agv| leader.knows(agv, "drive") && agv.claim() == leader.claim())
+    }
+
+    /// How long it took, in steps of 50 ms.
+    fn until(&mut self, limit: Duration, holds: impl Fn(&Self) -> bool) -> Option<Duration> {
+        let start: Instant = self.world.now();
+        while !holds(self) {
+            if self.world.now() >= start + limit {
+                return None;
+            }
+            self.run(millis(50));
+        }
+        Some(self.world.now().since(start))
+    }
+
+    fn logs(&self) -> String {
+        let log = |unit: &UnitHandle| {
+            let log: Vec<_> =
+                unit.log().into_iter().filter(|(_, event)| !matches!(event, LogEvent::Called { .. })).collect();
+            format!("{:?} {}: {log:?}\n", unit.claim(), unit.is_standby())
+        };
+        self.managers.iter().chain(&self.vehicles).map(log).collect()
+    }
+}
+
+/// The longest times until one commanded and until all obeyed, and how often one took command and stood by again.
+fn run(seed: u64) -> (Duration, Duration, usize, usize) {
+    let mut fleet = Fleet::new(seed, 2 + seed % 2);
+    let mut random = Random::new(seed ^ 0x0FA1_77E5);
+    let end = fleet.world.now() + FAULTS;
+    while fleet.world.now() < end {
+        fleet.something_happens(&mut random);
+        fleet.run(between(&mut random, 200, 4_000));
+    }
+    // What was begun ends.
+    fleet.world.network(|network| network.heal_all());
+    let calm = |fleet: &Fleet| {
+        let units = || fleet.managers.iter().chain(&fleet.vehicles);
+        let awake = |unit: &UnitHandle| {
+            let until = fleet.world.network(|network| network.suspended_until(unit.host()));
+            unit.is_running() && until <= fleet.world.now()
+        };
+        units().all(awake)
+    };
+    assert!(fleet.until(Duration::from_secs(10), calm).is_some());
+    let highest = |fleet: &Fleet| fleet.vehicles.iter().map(UnitHandle::claim).max().unwrap_or_default();
+    let starts = fleet.until(STARTS, |fleet| fleet.leader().is_some_and(|leader| leader.claim() >= highest(fleet)));
+    assert!(starts.is_some(), "{seed}: nobody commands alone\n{}", fleet.logs());
+    let joins = fleet.until(JOINS, |fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader)));
+    assert!(joins.is_some(), "{seed}: not all vehicles obey\n{}", fleet.logs());
+    let count = |what: fn(&UnitEvent) -> bool| fleet.managers.iter().map(|manager| manager.count(what)).sum();
+    let took = count(|event| matches!(event, UnitEvent::TookCommand { .. }));
+    let stood = count(|event| matches!(event, UnitEvent::StandsBy { by: Some(_) }));
+    (starts.unwrap_or_default(), joins.unwrap_or_default(), took, stood)
+}
+
+#[test]
+fn whatever_fails_claims_never_decrease_and_each_vehicle_has_a_manager_soon() {
+    let ends = for_each_seed(30, run);
+    let longest = |each: fn(&(Duration, Duration, usize, usize)) -> Duration| ends.iter().map(each).max();
+    let sum = |each: fn(&(Duration, Duration, usize, usize)) -> usize| ends.iter().map(each).sum::<usize>();
+    let (took, stood) = (sum(|end| end.2), sum(|end| end.3));
+    println!(
+        "{} seeds: one commands within {:?}, all obey within {:?}; took command {took} times, stood by again {stood} times",
+        ends.len(),
+        longest(|end| end.0),
+        longest(|end| end.1)
+    );
+    assert!(ends.len() == 1 || took > ends.len() && stood > 0, "{took} {stood}");
+}
+
+/// Two that start at once, or of which neither hears the other, end with one that commands and one that stands by.
+#[test]
+fn of_two_that_command_the_lower_claim_stands_by_again() {
+    for seed in 0..4 {
+        let mut fleet = Fleet::new(seed, 2);
+        assert!(fleet.until(STARTS, |fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader))).is_some());
+        let hosts: Vec<_> = fleet.managers.iter().map(UnitHandle::host).collect();
+        let standby = fleet.managers.iter().find(|manager| manager.is_standby()).expect("one stands by").clone();
+        let vehicles: Vec<_> = fleet.vehicles.iter().map(UnitHandle::host).collect();
+        // Alone in the network it commands nobody, until it hears of the other one.
+        let others: Vec<_> = hosts.iter().chain(&vehicles).copied().filter(|host| *host != standby.host()).collect();
+        fleet.world.network(|network| network.partition(&[standby.host()], &others, Direction::Both));
+        let storing = fleet.until(STARTS, |_| !standby.is_standby());
+        fleet.world.network(|network| network.heal_all());
+        let one = fleet.until(STARTS, |fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader)));
+        assert!(one.is_some(), "{seed} {storing:?}: {}", fleet.logs());
+    }
+}
