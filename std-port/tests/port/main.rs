@@ -27,6 +27,7 @@ mod orders;
 mod outcomes;
 mod processes;
 mod readers;
+mod standby;
 mod stopping;
 mod stuck;
 mod support;
