@@ -113,18 +113,19 @@ fn a_call_that_has_waited_half_its_time_out_is_next(world: &mut dyn World) {
 
 /// The first run takes 2 s, all others nothing.
 fn one_slow_run_refuses_short_calls_for_seconds_only(world: &mut dyn World) {
-    let (gate, work) = (Gate::default(), Service::numbered("work").waits_at(&gate));
+    let (gate, work) = (Gate::default(), Service::numbered("work"));
+    let work = work.waits_at(&gate);
     let (manager, agv) = one_at_a_time(world, &gate, &[&work]);
     agv.change(|limits| limits.scheduling = Scheduling::Admission);
     let ask = |world: &mut dyn World, timeout| {
         let call = manager.begin("agv", "work", &number("n", 1), within(timeout));
-        world.finish(&call)
+        world.finish(&call).map(drop)
     };
     gate.close();
     let slow = manager.begin("agv", "work", &number("n", 1), within(secs(10)));
     world.run_for(secs(2));
     gate.open();
-    assert_eq!(world.finish(&slow), Ok(()));
+    assert!(world.finish(&slow).is_ok());
     assert_eq!(ask(world, secs(3)), Ok(()), "it has the time");
     assert_eq!(ask(world, secs(1)), Ok(()), "one a second is tried");
     assert_eq!(ask(world, secs(1)), Err(Error::Busy), "the next one is refused at once");
