@@ -200,7 +200,10 @@ impl<T: Send + 'static> Engine<T> {
     /// The claim of this standby is stored: it commands, unless somebody has answered meanwhile.
     fn lead(&self, claim: Claim) {
         let (identity, _) = self.hub.lock().identity();
-        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
+        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else {
+            // The key with itself was taken away meanwhile.
+            return self.hub.lock().hub.node.stand_by(self.now());
+        };
         if self.is_stopping() || !self.hub.lock().hub.node.lead(self.now(), tagged) {
             return;
         }

@@ -36,13 +36,16 @@ impl<P: Port> Node<P> {
     }
 
     /// The port has stored this claim, in answer to [`ClaimEvent::Lead`]: the m_unit commands with it from here on. `false` where it
-    /// still stands by: somebody has answered meanwhile.
+    /// still stands by: somebody has answered meanwhile, or a higher claim was heard, above which it claims next.
     pub fn lead(&mut self, now: Instant, tagged: TaggedClaim) -> bool {
-        let is_highest = self.claims.rival.is_none_or(|rival| rival.claim < tagged.claim);
-        if self.claims.stage != Stage::Starts || !is_highest {
+        if self.claims.stage != Stage::Starts {
             return false;
         }
-        self.claims.stage = Stage::Commands;
+        let is_highest = self.claims.rival.is_none_or(|rival| rival.claim < tagged.claim);
+        self.claims.stage = if is_highest { Stage::Commands } else { Stage::StandsBy };
+        if !is_highest {
+            return false;
+        }
         self.claims.questions.next = now;
         self.set_claim(tagged);
         self.search = Search::new(now, self.role(), &mut self.random);

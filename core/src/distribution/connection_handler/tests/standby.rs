@@ -202,6 +202,8 @@ fn an_answer_while_its_claim_is_stored_keeps_it_a_standby() {
     let mut higher = starts();
     higher.run(higher.now + 2_000, vehicle(0, claim(9)));
     assert!(!higher.node.lead(at(higher.now), stored()));
+    higher.until_it_leads(5_000, nobody);
+    assert_eq!(higher.leads, [claim(6), claim(9)], "it claims above that one next");
     // Where storing fails it begins anew.
     let mut failed = starts();
     failed.node.stand_by(at(failed.now));
