@@ -18,9 +18,9 @@ const VEHICLES: u32 = 5;
 /// refuse has to raise its own first.
 const FAULTS: Duration = Duration::from_secs(30);
 const STARTS: Duration = Duration::from_secs(20);
-/// And so long its vehicles to obey it: nearly all take less than 5 s, but one that was cut off searches every 8 to 16 s by then, and
-/// a manager that has other vehicles does not search for it.
-const JOINS: Duration = Duration::from_secs(17);
+/// And so long its vehicles to obey it: nearly all take less than 5 s. But one that was cut off searches every 8 to 16 s by then and
+/// holds back for others that search, and a manager that has other vehicles does not search for it.
+const JOINS: Duration = Duration::from_secs(40);
 
 const fn millis(millis: u64) -> Duration {
     Duration::from_millis(millis)
