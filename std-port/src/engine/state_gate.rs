@@ -488,7 +488,8 @@ mod tests {
         let mut later = Vec::new();
         for _ in 0..100 {
             let turn = gate.take_turn(HERE, Access::Read);
-            match lock(&gate.gate).has_turn(turn) {
+            let is_next = lock(&gate.gate).has_turn(turn);
+            match is_next {
                 true => reading = entered(gate.enter_by(turn)).unwrap(),
                 false => later.push(turn),
             }
