@@ -54,7 +54,11 @@ const HOST_FOR_SERVICES: [Purpose; 21] = [
         places: &["services/mod.rs"],
         items: &["mailman::Mailman"],
     },
-    Purpose { what: "the port's name of a link", places: &["services/session/mod.rs"], items: &["mailman::LinkId"] },
+    Purpose {
+        what: "the port's name of a link",
+        places: &["services/session/mod.rs", "services/run_times.rs"],
+        items: &["mailman::LinkId"],
+    },
     Purpose {
         what: "the link, which a session lends to its parts",
         places: &["services/session/mod.rs", "services/session/wire.rs"],

@@ -37,7 +37,6 @@ mod runner;
 mod sanitize;
 mod security;
 mod source;
-mod words;
 mod workspace;
 
 #[derive(Parser)]
