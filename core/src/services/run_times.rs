@@ -8,11 +8,11 @@ use crate::time::{Duration, Instant};
 
 /// Functions whose average is kept; one more takes the place of the one that ran longest ago.
 const FUNCTIONS: usize = 8;
-/// So large a part of what a call took differs from the average moves it.
+/// A run moves the average by one part in so many of the difference.
 const WEIGHT: u64 = 8;
-/// A call that cannot make its deadline begins all the same where none has for so long: the average can only fall by calls.
+/// Once in so long a call begins although it seems too late: only runs show what a function takes now.
 const PROBE: Duration = Duration::from_secs(1);
-/// A measured call that has not ended for so long no longer keeps another one from being measured: its link may have ended.
+/// After so long another call is measured in place of one that has not ended: its link may be gone.
 const MEASURED_FOR: Duration = Duration::from_secs(60);
 
 /// A call that runs, among those of all links.
@@ -27,17 +27,17 @@ struct RunTime {
     /// When a measured call of it ended last.
     ran: Instant,
     /// When a call of it began last although its average said that it would be too late.
-    probed: Instant,
+    probed: Option<Instant>,
     /// The call that is measured, and since when. One at a time, so that what each call keeps does not grow.
     measured: Option<(Running, Instant)>,
 }
 
 impl RunTime {
-    /// Halved for each second without a run: what was slow once is tried again.
+    /// Halved for each second in which nothing was measured: what was slow once is tried again.
     fn average(&self, now: Instant) -> Duration {
-        let seconds = now.since(self.ran).as_micros().checked_div(Duration::from_secs(1).as_micros()).unwrap_or(0);
-        let halved = self.average.as_micros().checked_shr(seconds.min(64) as u32);
-        Duration::from_micros(halved.unwrap_or(0))
+        let until = self.measured.map_or(now, |(_, since)| since.min(now));
+        let idle = until.since(self.ran).as_micros().checked_div(PROBE.as_micros()).unwrap_or(0);
+        Duration::from_micros(self.average.as_micros().checked_shr(idle.min(64) as u32).unwrap_or(0))
     }
 }
 
@@ -54,58 +54,56 @@ pub(crate) struct RunTimes(State<Table, { SCHEDULING as usize }>);
 impl RunTimes {
     /// Whether a call that comes now, or is to begin now, cannot make its deadline as far as its function's average shows.
     pub(crate) fn is_too_late(&self, now: Instant, call: &CallHead) -> bool {
-        let Some(times) = self.of((call.slot, call.generation)) else { return false };
-        times.average(now) > call.deadline.since(now) && now < times.probed + PROBE
+        let Some(times) = self.0.iter().flatten().find(|times| times.function == (call.slot, call.generation)) else {
+            return false;
+        };
+        let is_due = times.probed.is_none_or(|probed| now >= probed + PROBE);
+        times.average(now) > call.deadline.since(now) && !is_due
     }
 
     /// A call begins, on a link, under a ticket.
     pub(crate) fn began(&mut self, now: Instant, call: &CallHead, running: Running) {
         let function = (call.slot, call.generation);
-        let is_new = self.of(function).is_none();
         self.0.change(|table| {
-            let place = if is_new { oldest(table) } else { table.iter_mut().find(|place| is_of(place, function)) };
-            let Some(place) = place else { return };
-            let times = if is_new { None } else { *place };
-            let (average, ran, probed, measured) = (Duration::ZERO, now, Instant::START, None);
-            let mut times = times.unwrap_or(RunTime { function, average, ran, probed, measured });
+            let known = table.iter().position(|place| place.is_some_and(|times| times.function == function));
+            // Else a free place, or that of the function that ran longest ago.
+            let oldest = || {
+                let ran = |(_, place): &(usize, &Option<RunTime>)| place.map_or(Instant::START, |times| times.ran);
+                table.iter().enumerate().min_by_key(ran).map(|(index, _)| index)
+            };
+            let Some(place) = known.or_else(oldest).and_then(|index| table.get_mut(index)) else { return };
+            if known.is_none() {
+                *place = Some(RunTime { function, average: Duration::ZERO, ran: now, probed: None, measured: None });
+            }
+            let Some(times) = place else { return };
             if times.average(now) > call.deadline.since(now) {
-                times.probed = now;
+                times.probed = Some(now);
             }
             if times.measured.is_none_or(|(_, since)| now >= since + MEASURED_FOR) {
                 times.measured = Some((running, now));
             }
-            *place = Some(times);
         });
     }
 
-    /// A call has been answered, or has failed.
-    pub(crate) fn ended(&mut self, now: Instant, running: Running) {
+    /// The handler of a call of this function is through.
+    pub(crate) fn ended(&mut self, now: Instant, function: (Slot, Generation), running: Running) {
         self.0.change(|table| {
-            let is_measured = |times: &&mut RunTime| times.measured.is_some_and(|(measured, _)| measured == running);
-            let Some(times) = table.iter_mut().flatten().find(is_measured) else { return };
-            let Some((_, since)) = times.measured.take() else { return };
-            let (took, average) = (now.since(since), times.average(now));
-            times.average = if average == Duration::ZERO {
-                took
-            } else {
+            let Some(times) = table.iter_mut().flatten().find(|times| times.function == function) else { return };
+            let average = times.average(now);
+            let Some((_, since)) = times.measured.take_if(|(measured, _)| *measured == running) else { return };
+            if now >= since + MEASURED_FOR {
+                return;
+            }
+            let took = now.since(since);
+            // The first run after a pause counts alone.
+            times.average = if average == times.average && average != Duration::ZERO {
                 average - average.divided_by(WEIGHT) + took.divided_by(WEIGHT)
+            } else {
+                took
             };
             times.ran = now;
         });
     }
-
-    fn of(&self, function: (Slot, Generation)) -> Option<&RunTime> {
-        self.0.iter().flatten().find(|times| times.function == function)
-    }
-}
-
-fn is_of(place: &Option<RunTime>, function: (Slot, Generation)) -> bool {
-    place.is_some_and(|times| times.function == function)
-}
-
-/// A free place, or that of the function that ran longest ago.
-fn oldest(table: &mut Table) -> Option<&mut Option<RunTime>> {
-    table.iter_mut().min_by_key(|place| place.map_or(Instant::START, |times| times.ran))
 }
 
 #[cfg(all(test, feature = "scheduling"))]
@@ -114,6 +112,7 @@ mod tests {
     use crate::config::Priority;
 
     const LINK: LinkId = LinkId(0);
+    const FIRST: (Slot, Generation) = (Slot(1), Generation(0));
 
     /// A call of a function that is made at `now`.
     fn call(id: u32, function: u16, now: Instant, timeout: Duration) -> CallHead {
@@ -137,8 +136,12 @@ mod tests {
     fn run(times: &mut RunTimes, now: Instant, function: u16, takes: Duration) -> Instant {
         let running = (LINK, Ticket::of(0, 1));
         times.began(now, &call(1, function, now, Duration::from_secs(9)), running);
-        times.ended(now + takes, running);
+        times.ended(now + takes, (Slot(function), Generation(0)), running);
         now + takes
+    }
+
+    fn of(times: &RunTimes, function: u16) -> Option<&RunTime> {
+        times.0.iter().flatten().find(|times| times.function == (Slot(function), Generation(0)))
     }
 
     fn is_too_late(times: &RunTimes, now: Instant, function: u16, millis: u64) -> bool {
@@ -153,7 +156,7 @@ mod tests {
         let mut now = run(&mut times, start, 1, Duration::from_millis(100));
         // One call is let through: from there on the second counts.
         times.began(now, &call(3, 1, now, Duration::from_millis(1)), (LINK, Ticket::of(1, 3)));
-        times.ended(now + Duration::from_millis(100), (LINK, Ticket::of(1, 3)));
+        times.ended(now + Duration::from_millis(100), FIRST, (LINK, Ticket::of(1, 3)));
         now = now + Duration::from_millis(100);
         assert!(
             is_too_late(&times, now, 1, 99) && !is_too_late(&times, now, 1, 101) && !is_too_late(&times, now, 2, 1)
@@ -169,7 +172,7 @@ mod tests {
         times.began(now, &late, (LINK, Ticket::of(1, 3)));
         assert!(is_too_late(&times, now, 1, 60));
         assert!(!is_too_late(&times, now + Duration::from_secs(1), 1, 60), "the next one after a second");
-        times.ended(now, (LINK, Ticket::of(1, 3)));
+        times.ended(now, FIRST, (LINK, Ticket::of(1, 3)));
         let halved = now + Duration::from_secs(1);
         times.began(halved, &call(4, 1, halved, Duration::from_millis(1)), (LINK, Ticket::of(0, 4)));
         assert!(is_too_late(&times, halved, 1, 40) && !is_too_late(&times, halved, 1, 51));
@@ -180,11 +183,11 @@ mod tests {
         let mut times = RunTimes::default();
         let mut now = run(&mut times, Instant::from_micros(60_000_000), 1, Duration::from_millis(80));
         now = run(&mut times, now, 1, Duration::ZERO);
-        assert_eq!(times.of((Slot(1), Generation(0))).map(|times| times.average(now)), Some(Duration::from_millis(70)));
+        assert_eq!(of(&times, 1).map(|times| times.average(now)), Some(Duration::from_millis(70)));
         for function in 2..=FUNCTIONS as u16 + 1 {
             now = run(&mut times, now, function, Duration::from_millis(1));
         }
-        let known = |function: u16| times.of((Slot(function), Generation(0))).is_some();
+        let known = |function: u16| of(&times, function).is_some();
         assert!(!known(1) && (2..=FUNCTIONS as u16 + 1).all(known));
     }
 }

@@ -1,4 +1,4 @@
-//! Calls that a handler makes and waits for, on the thread that runs it: they end with the call that the handler serves.
+//! Calls that a handler makes and waits for, on the thread that runs it: they end at the deadline of the call that the handler serves.
 
 use std::cell::Cell;
 
@@ -11,7 +11,7 @@ thread_local! {
     static END: Cell<Option<Duration>> = const { Cell::new(None) };
 }
 
-/// Runs a handler whose caller waits until `end`; one that returns in any case. `None` where no caller waits for an answer.
+/// Runs a handler whose caller waits until `end`; it must not panic, or the end would stay. `None` where no caller waits for an answer.
 pub(super) fn until<R>(end: Option<Duration>, run: impl FnOnce() -> R) -> R {
     let outer = END.replace(end);
     let result = run();

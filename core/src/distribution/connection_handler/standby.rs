@@ -1,6 +1,6 @@
 //! A standby: an m_unit that waits until no manager of its identity is there, and then commands in its place. Meanwhile it answers
-//! nobody, takes no links and opens none. It starts on what is missing, so only a proven answer keeps it waiting, and a pause of its
-//! own, unread sockets or a question that was not sent count as nothing.
+//! nobody, takes no links and opens none. It starts because answers are missing. So only a proven answer keeps it waiting, and a
+//! question counts only if it was sent, the sockets were read, and this unit did not pause.
 
 use super::claims::{ClaimEvent, LOOK, PERIOD, QUESTIONS, Questions, Stage};
 use super::search::{Search, fresh};
@@ -85,7 +85,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// So long nobody may have heard the manager.
+    /// How long the manager must be unheard before a start.
     fn silence(&self) -> Duration {
         self.config.constraints.keep_alive.times(MISSED_KEEP_ALIVES.into())
     }
@@ -122,7 +122,7 @@ impl<P: Port> Node<P> {
             self.next_question(now).min(now + LOOK).min(listened.unwrap_or(Instant::FAR_FUTURE));
     }
 
-    /// A period behind the last one; where that was not answered, when the manager has been silent for long enough, if that is soon.
+    /// One period after the last. After an unanswered one it is the end of the manager's silence, if that is near.
     fn next_question(&self, now: Instant) -> Instant {
         let Questions { asked: Some(asked), unanswered, .. } = self.claims.questions else { return now };
         let (due, silent) = (asked + self.standby_period(), self.silent_from() + MARGIN);

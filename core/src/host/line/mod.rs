@@ -62,7 +62,7 @@ pub enum State {
     /// What was written before it was closed is still sent.
     Closing,
     /// It has ended: [`DialFailed`](CloseReason::DialFailed), [`Reset`](CloseReason::Reset) by the other end, or
-    /// [`Silent`](CloseReason::Silent), since nothing was acknowledged for [`LINE_LOST`](crate::config::LINE_LOST).
+    /// [`Silent`](CloseReason::Silent), since nothing was heard for [`LINE_LOST`](crate::config::LINE_LOST).
     Ended(CloseReason),
 }
 

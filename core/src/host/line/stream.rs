@@ -190,13 +190,13 @@ impl Stream {
                 return self.begin(number, Phase::Dialing { is_due: true });
             }
             Phase::Dialing { .. } => self.end(CloseReason::DialFailed),
-            // The acceptance was lost. Behind data it would be another link that drew the same number.
+            // The acceptance was lost. Once data has come, it is another link with the same number.
             Phase::Open if frame.number == self.number && self.receiver.expected == 0 => {
                 self.answer = Some((Kind::Accept, frame.number));
                 return;
             }
             Phase::Open => self.end(CloseReason::Reset),
-            Phase::Closing(_) => self.phase = Phase::Idle,
+            Phase::Closing(_) => self.begin(self.number, Phase::Idle),
             Phase::Idle | Phase::Ended(_) => {}
         }
         self.offered = Some((frame.number, port));
@@ -217,7 +217,7 @@ impl Stream {
             _ if number != self.number => {}
             Phase::Dialing { .. } => self.end(CloseReason::DialFailed),
             Phase::Open => self.end(CloseReason::Reset),
-            Phase::Closing(_) => self.phase = Phase::Idle,
+            Phase::Closing(_) => self.begin(self.number, Phase::Idle),
             Phase::Idle | Phase::Ended(_) => {}
         }
     }
@@ -232,8 +232,11 @@ impl Stream {
             }
             return;
         }
-        self.sender.acknowledged(frame.acknowledged, frame.credit);
-        self.heard(now);
+        self.unanswered = now;
+        // What acknowledges nothing new must not put off what is to be sent again.
+        if self.sender.acknowledged(frame.acknowledged, frame.credit) || self.sender.filled == 0 {
+            self.heard(now);
+        }
         if frame.kind == Kind::Repeat {
             self.sender.go_back();
         }
@@ -305,7 +308,7 @@ struct Slot {
     length: usize,
 }
 
-/// What is written. All but `base` and `credit` are numbers of frames, each at least as large as the one before it.
+/// What is written. Counted from `base`: `sent` <= `fixed` <= `filled`.
 struct Sender {
     slots: [Slot; FRAMES],
     /// The sequence number of the first frame that is not acknowledged.
@@ -360,17 +363,18 @@ impl Sender {
         bytes.len().saturating_sub(rest.len())
     }
 
-    /// The other end expects the frame of that sequence number.
-    fn acknowledged(&mut self, expected: u8, credit: u8) {
+    /// The other end expects the frame of that sequence number. Whether that acknowledges anything.
+    fn acknowledged(&mut self, expected: u8, credit: u8) -> bool {
         let count = expected.wrapping_sub(self.base);
         if count > self.fixed {
-            return;
+            return false;
         }
         self.base = expected;
         self.sent = self.sent.saturating_sub(count);
         self.fixed = self.fixed.saturating_sub(count);
         self.filled = self.filled.saturating_sub(count);
         self.credit = credit;
+        count > 0
     }
 
     fn go_back(&mut self) {

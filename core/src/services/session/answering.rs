@@ -112,7 +112,7 @@ impl<P: Port> Session<P> {
                 return Err(error);
             }
         };
-        if self.is_measured(&head) {
+        if self.is_measured(head.priority, head.keeps_order) {
             let (now, running) = (cx.now, (self.wire.link.id(), ticket));
             cx.hub.enter(&mut |hub| hub.publications.run_times.began(now, &head, running));
         }
@@ -141,6 +141,11 @@ impl<P: Port> Session<P> {
         failure: Option<&Failure>,
     ) -> Result<(), Error> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
+        // Before the answer leaves: what waits for room in the stream is not the function's time.
+        if self.is_measured(head.priority, false) {
+            let (now, function, running) = (cx.now, (head.slot, head.generation), (self.wire.link.id(), ticket));
+            cx.hub.enter(&mut |hub| hub.publications.run_times.ended(now, function, running));
+        }
         // Before the answer leaves: one that says it was reset is true.
         let result = if head.resets {
             result.and_then(|results| Granting::reset_orders(&mut self.wire, cx, &head).map(|()| results))
@@ -163,10 +168,6 @@ impl<P: Port> Session<P> {
             }
         }
         self.calls.end(ticket);
-        if SCHEDULING && self.wire.constraints.scheduling == Scheduling::Admission {
-            let (now, running) = (cx.now, (self.wire.link.id(), ticket));
-            cx.hub.enter(&mut |hub| hub.publications.run_times.ended(now, running));
-        }
         if head.resets {
             self.pump(cx);
         }
@@ -204,17 +205,15 @@ impl<P: Port> Session<P> {
     }
 
     /// Whether the average of a call's function counts.
-    fn is_measured(&self, head: &CallHead) -> bool {
-        SCHEDULING
-            && self.wire.constraints.scheduling == Scheduling::Admission
-            && !head.keeps_order
-            && head.priority != Priority::Emergency
+    fn is_measured(&self, class: Priority, keeps_order: bool) -> bool {
+        let admits = SCHEDULING && self.wire.constraints.scheduling == Scheduling::Admission;
+        admits && !keeps_order && class != Priority::Emergency
     }
 
     /// Refuses a call that cannot make its deadline any more.
     pub(super) fn admit(&mut self, cx: &mut Context<'_, P>, head: &CallHead) -> Result<(), Error> {
         let (now, mut is_too_late) = (cx.now, false);
-        if self.is_measured(head) {
+        if self.is_measured(head.priority, head.keeps_order) {
             cx.hub.enter(&mut |hub| is_too_late = hub.publications.run_times.is_too_late(now, head));
         }
         if is_too_late {

@@ -554,9 +554,6 @@ impl<P: Port> Session<P> {
                 || function.attributes.lease.is_some()
                     && self.granting.obedience.may_move(&mut self.wire, cx).is_none();
             let arguments = arguments.filter(|_| !waits && self.calls.is_idle(priority));
-            if arguments.is_none() {
-                self.admit(cx, &head)?;
-            }
             let bytes = self.wire.link.view(block, lent);
             match arguments {
                 // The arguments are checked before the call begins: a lease must not start for a request that is refused.
@@ -653,6 +650,8 @@ impl<P: Port> Session<P> {
             sent_at,
             number: header.number,
         };
+        // Before another call is refused in its favour.
+        self.admit(cx, &head)?;
         let is_emergency = is_emergency(function.attributes, priority);
         let admitted = self.calls.admit(header.slot, is_emergency, self.wire.constraints.calls_per_peer);
         if admitted.is_err() && !self.displace(cx, &head, length) {

@@ -35,7 +35,7 @@ impl PeerClock {
     /// Notes the peer's clock. A sample that was held up on its way would make everything that is sent look old, so it
     /// is passed over while a better one is fresh.
     pub(super) fn hear(&mut self, now: Instant, stamp: u64) {
-        // Nothing has elapsed and the stamp is 0 while none has come: the first one is better.
+        // Before the first sample both are 0, so that one is taken.
         let elapsed = now.since(self.heard);
         let expected = Duration::from_micros(self.stamp) + elapsed - elapsed.divided_by(DRIFT);
         if Duration::from_micros(stamp) >= expected || elapsed >= SAMPLE_LIFE {
@@ -49,10 +49,10 @@ impl PeerClock {
     }
 }
 
-/// The earliest time at which the peer can have made what it stamped so; `None` for a stamp from the future.
+/// The earliest time at which the peer can have made what it stamped so; `None` for a stamp that this clock has not reached, so never gave out.
 pub(super) fn sent_at_earliest(now: Instant, stamp: u64, since: Duration) -> Option<Instant> {
     let sent_at = Instant::from_micros(stamp) + since;
-    // The peer's clock runs a little faster or slower than ours; what seems to come from the future is new.
+    // The clocks drift: a sum that lies ahead means now.
     if Instant::from_micros(stamp) > now { None } else { Some(sent_at.min(now)) }
 }
 

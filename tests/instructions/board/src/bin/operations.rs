@@ -17,7 +17,7 @@ const CHARACTERS: usize = 512;
 const ARGUMENTS: usize = CHARACTERS + 64;
 const BUFFER: usize = buffer_bytes(ARGUMENTS as u32, 0);
 /// With more of them there is too little stack for the pair.
-const NODES: usize = 32;
+const NODES: usize = 24;
 
 /// Nanoseconds of an instruction.
 const INSTRUCTION: u64 = 1 << 10;
