@@ -20,7 +20,7 @@ use crate::security::OVERHEAD;
 /// struct Agv;
 /// const LIMITS: Limits = Limits { message_size: 512, ..Limits::S_UNIT };
 /// type AgvResources = resources!(Agv, LIMITS);
-/// const { assert!(AgvResources::BYTES <= 26 * 1024) };
+/// const { assert!(AgvResources::BYTES <= 27 * 1024) };
 ///
 /// // Only for a unit that wants others than these.
 /// const CONSTRAINTS: Constraints =
