@@ -23,9 +23,10 @@ pub const STREAMS: bool = Streams::IS_ON;
 pub const DETAILS: bool = Details::IS_ON;
 /// Lists and records.
 pub const NESTED: bool = Nested::IS_ON;
-/// Calls that wait begin by their deadlines, and those that cannot make them can be refused. Where the build cannot, calls begin as
-/// they came, whatever the constraints say.
+/// Calls that wait begin by their deadlines. Where the build cannot, they begin as they came, whatever the constraints say.
 pub const SCHEDULING: bool = cfg!(feature = "scheduling");
+/// Calls that cannot make their deadlines can be refused. Where the build cannot, none is.
+pub const ADMISSION: bool = cfg!(feature = "admission");
 /// Lines for people behind signatures.
 pub const HELP: bool = cfg!(feature = "help");
 

@@ -221,7 +221,8 @@ pub enum Scheduling {
     /// The one that came first. Where no more calls may wait, the one that comes is refused.
     Fifo,
     /// As [`EarliestDeadline`](Self::EarliestDeadline), and a call is refused as [`Busy`](crate::error::Error::Busy), when it comes
-    /// or when its turn comes, if its function has lately taken longer on average than it has left. The averages of the eight functions that ran last are kept. One a second begins all the
+    /// or when its turn comes, if its function has lately taken longer on average than it has left. The averages of the eight functions that ran last are kept. On a
+    /// board with the feature `admission`. One a second begins all the
     /// same, so that a function that was slow once is tried again. So more deadlines are met where more is asked than can be done.
     Admission,
 }

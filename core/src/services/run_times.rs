@@ -1,6 +1,6 @@
 //! How long the unit's functions run: what admission ([`Scheduling::Admission`](crate::config::Scheduling::Admission)) goes by.
 
-use crate::ability::{Begins, SCHEDULING, State};
+use crate::ability::{ADMISSION, Begins, State};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::host::mailman::LinkId;
 use crate::services::calls::{CallHead, Ticket};
@@ -47,9 +47,9 @@ impl Begins for Table {
     const BEGIN: &'static Self = &[None; FUNCTIONS];
 }
 
-/// The averages of a unit, measured with the calls of all its links. Where the build cannot schedule, it takes no room.
+/// The averages of a unit, measured with the calls of all its links. Where the build has no admission, it takes no room.
 #[derive(Default)]
-pub(crate) struct RunTimes(State<Table, { SCHEDULING as usize }>);
+pub(crate) struct RunTimes(State<Table, { ADMISSION as usize }>);
 
 impl RunTimes {
     /// Whether a call that comes now, or is to begin now, cannot make its deadline as far as its function's average shows.
@@ -106,7 +106,7 @@ impl RunTimes {
     }
 }
 
-#[cfg(all(test, feature = "scheduling"))]
+#[cfg(all(test, feature = "admission"))]
 mod tests {
     use super::*;
     use crate::config::Priority;

@@ -364,7 +364,7 @@ async fn lose(browser: &Browser, stage: &mut Stage) -> Result<()> {
     browser.says("#banner", "The manager does not answer. What is shown is old.").await?;
     stage.thaw_manager()?;
     browser.wait("a manager that goes on is live", "document.querySelector('#banner').hidden").await?;
-    let ended = "/The manager does not answer[^]*until 20/.test(document.querySelector('#alarms').innerText)";
+    let ended = "/The manager is lost[^]*until 20/.test(document.querySelector('#alarms').innerText)";
     browser.wait("its alarm has an end, and is to be acknowledged", ended).await?;
     browser.click("#alarms-all").await?;
     browser

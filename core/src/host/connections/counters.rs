@@ -94,8 +94,6 @@ counters! {
         RequestsAhead,
         /// Requests refused while they waited, for others with earlier deadlines.
         RequestsDisplaced,
-        /// Requests refused because their functions have lately taken longer than they had left.
-        RequestsTooLate,
         /// Texts or values of failures that were cut or dropped, because they were too long or did not fit the signature.
         DetailsDropped,
         /// Progress of calls sent.

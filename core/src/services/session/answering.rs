@@ -4,7 +4,7 @@ use super::details::DetailsPart;
 use super::granting::Granting;
 use super::permitting::{decide_call, log_refusal};
 use super::{Incoming, Phase, Session};
-use crate::ability::{DETAILS, SCHEDULING};
+use crate::ability::{ADMISSION, DETAILS, SCHEDULING};
 use crate::config::{Priority, Scheduling};
 use crate::distribution::block;
 use crate::distribution::failure::Failure;
@@ -206,7 +206,7 @@ impl<P: Port> Session<P> {
 
     /// Whether the average of a call's function counts.
     fn is_measured(&self, class: Priority, keeps_order: bool) -> bool {
-        let admits = SCHEDULING && self.wire.constraints.scheduling == Scheduling::Admission;
+        let admits = ADMISSION && self.wire.constraints.scheduling == Scheduling::Admission;
         admits && !keeps_order && class != Priority::Emergency
     }
 
@@ -217,7 +217,6 @@ impl<P: Port> Session<P> {
             cx.hub.enter(&mut |hub| is_too_late = hub.publications.run_times.is_too_late(now, head));
         }
         if is_too_late {
-            self.wire.link.counters.count(LinkCounter::RequestsTooLate);
             return Err(Error::Busy);
         }
         Ok(())

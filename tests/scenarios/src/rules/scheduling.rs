@@ -17,7 +17,7 @@ scenarios![
     the_earliest_deadline_begins_first_or_what_came_first: "74", Light, [], ["RequestsAhead", "fifo"];
     calls_that_move_begin_in_their_order_whatever_their_deadlines: "74", Light, [], ["RequestsRun"];
     a_call_that_has_waited_half_its_time_out_is_next: "74", Light, [ExactTime], ["RequestsAhead"];
-    one_slow_run_refuses_short_calls_for_seconds_only: "74", Light, [ExactTime], ["RequestsTooLate"];
+    one_slow_run_refuses_short_calls_for_seconds_only: "74", Light, [ExactTime], ["RequestsBusy"];
     a_peer_with_short_deadlines_keeps_no_other_peer_waiting: "74", Light, [], ["RequestsRun"];
 ];
 
@@ -129,7 +129,7 @@ fn one_slow_run_refuses_short_calls_for_seconds_only(world: &mut dyn World) {
     assert_eq!(ask(world, secs(3)), Ok(()), "it has the time");
     assert_eq!(ask(world, secs(1)), Ok(()), "one a second is tried");
     assert_eq!(ask(world, secs(1)), Err(Error::Busy), "the next one is refused at once");
-    assert_eq!((work.log().runs(), agv.counted(LinkCounter::RequestsTooLate)), (3, 1));
+    assert_eq!((work.log().runs(), agv.counted(LinkCounter::RequestsBusy)), (3, 1));
     world.run_for(secs(2));
     assert_eq!(ask(world, secs(1)), Ok(()), "what was slow once is tried again");
 }
