@@ -30,6 +30,7 @@ mod orders;
 mod overtaking;
 mod pair;
 mod requests;
+#[cfg(feature = "scheduling")]
 mod scheduling;
 mod serving;
 mod setup;
