@@ -66,6 +66,8 @@ entry!(node_hears, {
     node().left_unread();
     node().store_claims();
     keep((node().claim(), node().take_claim_event(), node().obeyed(unknown())));
+    node().stand_by(*unknown());
+    keep((node().is_standby(), node().lead(*unknown(), *unknown())));
 });
 
 entry!(node_dials, {

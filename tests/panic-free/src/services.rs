@@ -154,7 +154,7 @@ entry!(session_asked, {
 entry!(session_details, {
     keep(session().answer_failed(context(), *unknown(), unknown()));
     keep(session().progress(context(), *unknown(), parameters()));
-    keep((session().failure(unknown_slice()), session().is_cancelled(*unknown())));
+    keep((session().failure(unknown_slice()), session().is_cancelled(*unknown()), session().is_answered(*unknown())));
     if let Event::Progress(_, values) = unknown::<Event>() {
         keep(session().progress_values(values, unknown_slice()).map(|block| block.bytes().len()));
     }
@@ -208,6 +208,7 @@ entry!(session_set, {
 entry!(session_requests, {
     keep(session().request(context(), unknown_text().into(), parameters(), unknown(), *unknown()));
     session().cancel(context(), *unknown());
+    session().cancel_but_wait(context(), *unknown());
     keep((session().holds(*unknown()), session().last_order(), session().lease_left(*unknown(), *unknown())));
 });
 
