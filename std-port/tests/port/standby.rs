@@ -3,7 +3,7 @@
 //! The child is this test binary again, with [`as_child`] as its only test. It ends when its standard input does.
 
 use std::io::{BufRead, BufReader, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex};
@@ -15,7 +15,7 @@ use cara_std::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::support::{PATIENCE, counter, fleet, number, system, unit, until, value};
+use crate::support::{PATIENCE, counter, fleet, number, system, unit, until, value, within};
 
 const PART: &str = "CARA_TEST_STANDBY";
 /// How often the manager that commands is killed; a measurement sets more.
@@ -107,13 +107,14 @@ fn as_child() {
 
 /// Vehicles, and what each has executed.
 struct Vehicles {
+    fleet: u32,
     units: Vec<Unit>,
     obeyed: Vec<Arc<Mutex<Vec<Obeyed>>>>,
 }
 
 impl Vehicles {
     fn start(fleet: u32, state: &Path) -> Self {
-        let mut vehicles = Self { units: Vec::new(), obeyed: Vec::new() };
+        let mut vehicles = Self { fleet, units: Vec::new(), obeyed: Vec::new() };
         for (name, id) in [("agv-7", 7), ("agv-8", 8), ("agv-9", 9)] {
             let unit = unit(name, id, fleet).state_folder(state).build().unwrap();
             let obeyed = Arc::<Mutex<Vec<Obeyed>>>::default();
@@ -142,7 +143,10 @@ impl Vehicles {
             obeyed.iter().find(|(at, by, _)| *at >= since && *by == manager).map(|(at, ..)| *at)
         };
         let all = || self.obeyed.iter().map(first).collect::<Option<Vec<_>>>();
-        until("all vehicles obey it", || all().is_some());
+        if !within(PATIENCE, || all().is_some()) {
+            let last: Vec<_> = self.obeyed.iter().map(|obeyed| obeyed.lock().unwrap().last().copied()).collect();
+            panic!("not in time: all vehicles obey {manager} since {since:?}. What each obeyed last: {last:?}");
+        }
         all().unwrap()
     }
 
@@ -158,13 +162,12 @@ impl Vehicles {
     }
 }
 
-/// The one of two that commands, and the other one, once the vehicles obey.
-fn led(vehicles: &Vehicles, one: Manager, other: Manager, since: Instant) -> (Manager, Manager) {
-    let by = || vehicles.obeyed[0].lock().unwrap().iter().rev().find(|(at, ..)| *at >= since).map(|(_, by, _)| *by);
-    until("one of the two commands", || by().is_some());
-    let (active, standby) = if by() == Some(one.number()) { (one, other) } else { (other, one) };
-    vehicles.obey(active.number(), since);
-    (active, standby)
+/// One that commands, and one that stands by. Of two that start at once both may command for a moment, so the second starts later.
+fn led(vehicles: &Vehicles, state: impl Fn(&str) -> PathBuf) -> (Manager, Manager) {
+    let start = Instant::now();
+    let active = Manager::start(vehicles.fleet, &state("0"));
+    vehicles.obey(active.number(), start);
+    (active, Manager::start(vehicles.fleet, &state("1")))
 }
 
 #[test]
@@ -173,9 +176,7 @@ fn a_standby_commands_when_the_manager_is_killed() {
     let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
     let state = |name: &str| folder.path().join(name);
     let vehicles = Vehicles::start(fleet, &state("vehicles"));
-    let start = Instant::now();
-    let (mut active, mut standby) =
-        led(&vehicles, Manager::start(fleet, &state("0")), Manager::start(fleet, &state("1")), start);
+    let (mut active, mut standby) = led(&vehicles, state);
     let (mut first, mut last) = (Vec::new(), Vec::new());
     for run in 0..runs {
         let killed = Instant::now();
@@ -205,9 +206,7 @@ fn a_frozen_manager_stands_by_when_it_goes_on_and_commands_again_in_its_turn() {
     let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
     let state = |name: &str| folder.path().join(name);
     let vehicles = Vehicles::start(fleet, &state("vehicles"));
-    let start = Instant::now();
-    let (active, standby) =
-        led(&vehicles, Manager::start(fleet, &state("0")), Manager::start(fleet, &state("1")), start);
+    let (active, standby) = led(&vehicles, state);
     let frozen = Instant::now();
     active.signal(Signal::STOP);
     vehicles.obey(standby.number(), frozen);
