@@ -7,7 +7,7 @@ use anyhow::{Result, bail};
 use crate::command::Run;
 use crate::{
     bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, later, layers,
-    licences, links, manifests, msrv, names, orders, panic_free, paper, planted, security, workspace,
+    licences, links, manifests, msrv, names, orders, packages, panic_free, paper, planted, security, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -41,7 +41,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 27] = [
+pub(crate) const GROUPS: [Group; 28] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -284,6 +284,15 @@ pub(crate) const GROUPS: [Group; 27] = [
         by_default: true,
         waits: false,
         run: |_| instructions::check(),
+    },
+    Group {
+        name: "packages",
+        what: "each crate to publish is packaged and builds, a program that has the packages alone runs, the oldest dependencies build; before a release",
+        budget: 900,
+        quick: None,
+        by_default: false,
+        waits: false,
+        run: |_| packages::check().into(),
     },
 ];
 

@@ -29,6 +29,7 @@ mod manifests;
 mod msrv;
 mod names;
 mod orders;
+mod packages;
 mod panic_free;
 mod paper;
 mod peers;
