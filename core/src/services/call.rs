@@ -1,11 +1,11 @@
-//! A call as its caller makes it: one object, with its options, that a thread waits for, a task awaits, or that is only sent.
+//! A call as its caller makes it: one object with its options, which a thread waits for, a task awaits, or which is only sent.
 //!
-//! A port's handle to a peer is a [`Caller`]. What is called is a [`Request`]: [`Dynamic`], or what `#[interface]` writes for a
-//! function. Nothing is sent before `.wait()`, `.await` or `.send()`, and a [`Call`] that is dropped before did nothing.
+//! A port's handle to a peer is a [`Caller`]. What is called is a [`Request`]: [`Dynamic`], or a function of an `#[interface]`.
+//! `.wait()`, `.await` or `.send()` sends the call, and its deadline counts from there; a [`Call`] that is dropped before did
+//! nothing.
 //!
-//! A deadline counts from there. A [`Reply`] that is dropped gives its call up: what the call started, or would start, stops if its
-//! service has a lease. Once it is answered, what it started goes on for as long as its [`renewing`](Call::renewing) says, or
-//! until what [`hold`](Call::hold) returns is dropped.
+//! Dropping a [`Reply`] gives its call up: the motion of a service with a lease stops, or does not begin. The motion of an
+//! answered call lasts as long as its [`renewing`](Call::renewing) says, or until the guard of [`hold`](Call::hold) is dropped.
 
 use core::fmt;
 use core::future::{Future, IntoFuture};
@@ -25,15 +25,15 @@ use crate::services::requests::CallId;
 use crate::services::session::{Delivery, RequestOptions};
 use crate::time::Duration;
 
-/// The function that a call is of.
+/// The function to call.
 #[derive(Clone, Copy, Debug)]
 pub struct Callee<'a> {
     name: &'a str,
     declared: Option<Declared>,
 }
 
-/// A function as an interface declares it, and what compares that with what the peer has published. It is a pointer so that
-/// a program that calls by name alone has nothing of the comparison.
+/// A function as an interface declares it, and the comparison with what the peer has published: a pointer, so that a program that
+/// only calls by name does not link the comparison.
 #[derive(Clone, Copy, Debug)]
 struct Declared {
     signature: Signature<'static>,
@@ -41,7 +41,7 @@ struct Declared {
 }
 
 impl Callee<'static> {
-    /// A function of an interface: a peer that has another version of it is not called.
+    /// A function of an interface. The call fails if the peer has another version of it.
     pub(crate) fn declared(signature: Signature<'static>) -> Self {
         Self { name: signature.name(), declared: Some(Declared { signature, check: Mismatch::check }) }
     }
@@ -53,7 +53,7 @@ impl<'a> Callee<'a> {
         self.name
     }
 
-    /// Compares it with what the peer has published under its name.
+    /// Compares it with the function that the peer has published under this name.
     pub fn check(&self, published: Signature<'_>) -> Result<(), Mismatch> {
         self.declared.map_or(Ok(()), |Declared { signature, check }| check(signature, published))
     }
@@ -65,20 +65,20 @@ impl<'a> From<&'a str> for Callee<'a> {
     }
 }
 
-/// Hears what a call tells while it runs. `Break` gives the call up.
+/// Receives the progress of a call. Returning `Break` gives the call up.
 pub type OnProgress<'a> = &'a mut dyn FnMut(&ParametersView) -> ControlFlow<()>;
 
-/// A call as a port gets it.
+/// A call as it is passed to a port.
 pub struct Outgoing<'a, K> {
     /// The function.
     pub callee: Callee<'a>,
-    /// The arguments, and the place for the results.
+    /// The arguments, and the capacity for results.
     pub parameters: &'a mut ParametersView,
-    /// How it is called.
+    /// The call's options.
     pub options: &'a RequestOptions,
-    /// Hears the progress; what the service tells is wanted only then.
+    /// Receives progress; without it, none is requested from the peer.
     pub progress: Option<OnProgress<'a>>,
-    /// Gives it up.
+    /// Gives the call up from elsewhere.
     pub canceller: Option<&'a K>,
 }
 
@@ -88,30 +88,30 @@ impl<K> fmt::Debug for Outgoing<'_, K> {
     }
 }
 
-/// How a call has ended.
+/// The outcome of a call.
 pub type Answer<C> = Result<<C as Caller>::Answered, CallError<(), <C as Caller>::Details>>;
 
-/// A port's handle to a peer whose functions are called. It has no `impl Trait` in return position, so that a [`Reply`] is `Send`
-/// where the port's types are.
+/// A port's handle to a peer whose functions are called. No method returns `impl Trait`: a [`Reply`] is `Send` if the port
+/// allows.
 pub trait Caller {
-    /// A call on its way, which a task polls. Dropped before it has ended, it gives the call up.
+    /// A call in flight, polled by a task. Dropping it before the call has ended gives the call up.
     type Pending: Unpin;
-    /// Names a call that was answered.
+    /// Names an answered call.
     type Answered;
-    /// What a call has started goes on until this is dropped.
+    /// Keeps the motion of an answered call alive until it is dropped.
     type Hold;
-    /// What is known of a failure beside its [`Error`].
+    /// What the port keeps of a failure beside its [`Error`].
     type Details: CallDetails;
-    /// Holds variables that are too many for the stack.
+    /// Stores variables that are too large for the stack.
     type Room: DerefMut<Target = ParametersView> + Unpin;
     /// Gives calls up from elsewhere.
     type Canceller;
 
-    /// Room for variables of so many bytes; `None` where there is no other memory than the stack.
+    /// Memory for variables of this many bytes; `None` if the port has only the stack.
     #[doc(hidden)]
     fn room(bytes: usize) -> Option<Self::Room>;
 
-    /// Calls without waiting.
+    /// Sends a call without waiting for it.
     fn send(
         &self,
         callee: Callee<'_>,
@@ -119,7 +119,7 @@ pub trait Caller {
         options: &RequestOptions,
     ) -> Result<CallId, CallError<(), Self::Details>>;
 
-    /// Goes on with a call, which the first poll puts into `pending`. Not to be called again once it was ready.
+    /// Polls a call. The first poll sends it and fills `pending`. Do not call it again after it was ready.
     fn poll(
         &self,
         pending: &mut Option<Self::Pending>,
@@ -127,7 +127,7 @@ pub trait Caller {
         cx: &mut Context<'_>,
     ) -> Poll<Answer<Self>>;
 
-    /// What an answered call has started is given up with what is returned.
+    /// A guard for the motion of an answered call, which ends when the guard is dropped.
     fn hold(&self, answered: Self::Answered) -> Self::Hold;
 }
 
@@ -137,22 +137,22 @@ pub trait BlockingCaller: Caller {
     fn wait(&self, outgoing: Outgoing<'_, Self::Canceller>) -> Answer<Self>;
 }
 
-/// What is called, and with what.
+/// A function to call, with its arguments.
 pub trait Request: Sized {
-    /// What the call gives back.
+    /// The results.
     type Results;
-    /// What it tells while it runs.
+    /// The values of progress reports.
     type Progress<'v>;
-    /// The values of its failures.
+    /// The values of failures.
     type Failure;
-    /// It with its variables while it runs. `R` is where a port keeps those that are too many for the stack.
+    /// The request with its variables while the call runs. `R` stores variables that are too large for the stack.
     #[doc(hidden)]
     type Frame<R: DerefMut<Target = ParametersView> + Unpin>;
 
-    /// With variables that are not set: they are in one place from here on, and are not moved.
+    /// Adds variables, not set yet. The frame is not moved from here on.
     #[doc(hidden)]
     fn frame<R: DerefMut<Target = ParametersView> + Unpin>(self) -> Self::Frame<R>;
-    /// Puts the arguments into the variables, once.
+    /// Encodes the arguments into the variables, once.
     #[doc(hidden)]
     fn open<C: Caller>(frame: &mut Self::Frame<C::Room>) -> Result<(), Error>;
     /// The function and its variables.
@@ -163,12 +163,12 @@ pub trait Request: Sized {
     /// Reads the results.
     #[doc(hidden)]
     fn results<R: DerefMut<Target = ParametersView> + Unpin>(frame: &Self::Frame<R>) -> Result<Self::Results, Error>;
-    /// Reads the progress; `None` where it is of another version.
+    /// Reads progress; `None` if the peer's version of it differs.
     #[doc(hidden)]
     fn progress(values: &ParametersView) -> Option<Self::Progress<'_>>;
 }
 
-/// A call by name, whose results update the parameters that it was made with.
+/// A call by name, whose results update its parameters.
 pub struct Dynamic<'p> {
     name: &'p str,
     parameters: &'p mut ParametersView,
@@ -181,7 +181,7 @@ impl fmt::Debug for Dynamic<'_> {
 }
 
 impl<'p> Dynamic<'p> {
-    /// Of the function of this name. On an error the parameters stay as they are.
+    /// A call of the function of this name. On an error the parameters are unchanged.
     pub const fn new(name: &'p str, parameters: &'p mut ParametersView) -> Self {
         Self { name, parameters }
     }
@@ -214,25 +214,25 @@ impl Request for Dynamic<'_> {
     }
 }
 
-/// A typed call and its variables: on the stack, or where the port has room for more.
+/// A typed call with its variables: on the stack, or in the port's memory if they are too large.
 #[doc(hidden)]
 #[derive(Debug)]
 pub struct Frame<const BYTES: usize, R, A> {
     function: Signature<'static>,
-    /// The arguments, until they are among the variables.
+    /// The arguments, until they are encoded into the variables.
     request: Option<A>,
     on_stack: Parameters<BYTES>,
     room: Option<R>,
 }
 
 impl<const BYTES: usize, R: DerefMut<Target = ParametersView>, A> Frame<BYTES, R, A> {
-    /// Without variables yet.
+    /// A frame without variables.
     #[inline]
     pub const fn new(function: Signature<'static>, request: A) -> Self {
         Self { function, request: Some(request), on_stack: Parameters::sized(), room: None }
     }
 
-    /// Lays the variables out, which take `bytes`; the arguments, once.
+    /// Lays the variables out, in `bytes` bytes. Returns the arguments the first time.
     pub fn lay_out<C: Caller<Room = R>>(&mut self, bytes: usize) -> Result<Option<(A, &mut ParametersView)>, Error> {
         let Some(request) = self.request.take() else { return Ok(None) };
         if bytes > BYTES {
@@ -258,7 +258,7 @@ impl<const BYTES: usize, R: Deref<Target = ParametersView>, A> Deref for Frame<B
     }
 }
 
-/// A call that has not been sent.
+/// A call that has not been sent yet.
 ///
 /// ```
 /// use cara_core::Parameters;
@@ -277,7 +277,7 @@ impl<const BYTES: usize, R: Deref<Target = ParametersView>, A> Deref for Frame<B
 /// }
 /// ```
 ///
-/// `W` hears its progress, and `K` says what it leads to.
+/// `W` receives its progress, and `K` determines its output.
 #[must_use = "nothing is sent before `.wait()`, `.await` or `.send()`"]
 pub struct Call<'c, C: Caller, Q, W = Unwatched, K = Once> {
     caller: &'c C,
@@ -295,14 +295,14 @@ impl<C: Caller, Q: fmt::Debug, W, K> fmt::Debug for Call<'_, C, Q, W, K> {
 }
 
 impl<'c, C: Caller, Q> Call<'c, C, Q> {
-    /// With the default options.
+    /// A call with the default options.
     pub const fn new(caller: &'c C, request: Q) -> Self {
         let options = RequestOptions::new();
         Self { caller, request, options, canceller: None, watch: Unwatched, kind: PhantomData }
     }
 
-    /// Hears what the call tells while it runs: the newest progress that has not been heard, and none after the reply. Where
-    /// `hear` returns `Break`, the call is given up and ends with [`Error::Cancelled`]: what it moves stops, and its handler is told.
+    /// Receives progress: the newest report that was not passed on yet, and none after the reply. If `hear` returns `Break`, the
+    /// call ends with [`Error::Cancelled`]: its motion stops, and its handler is notified.
     pub fn watch<F>(self, hear: F) -> Call<'c, C, Q, Watched<F>>
     where
         Q: Request,
@@ -312,7 +312,7 @@ impl<'c, C: Caller, Q> Call<'c, C, Q> {
         Call { caller, request, options, canceller, watch: Watched(hear), kind: PhantomData }
     }
 
-    /// Sends it without waiting: accepted, not executed. A failure comes as an event under the returned id.
+    /// Sends the call without waiting: `Ok` means accepted, not executed. A failure is reported as an event with the returned id.
     pub fn send(self) -> Result<CallId, CallError<Q::Failure, C::Details>>
     where
         Q: Request,
@@ -325,7 +325,7 @@ impl<'c, C: Caller, Q> Call<'c, C, Q> {
 }
 
 impl<'c, C: Caller, Q, W> Call<'c, C, Q, W> {
-    /// What the call has started goes on until the [hold](Held) that it ends with is dropped, and at most for as long as
+    /// The motion that the call starts continues until the returned [hold](Held) is dropped, but no longer than
     /// [`renewing`](Self::renewing) says.
     pub fn hold(self) -> Call<'c, C, Q, W, Holding> {
         let Self { caller, request, options, canceller, watch, .. } = self;
@@ -334,52 +334,52 @@ impl<'c, C: Caller, Q, W> Call<'c, C, Q, W> {
 }
 
 impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
-    /// The caller waits no longer, and the callee begins no later, than this; otherwise the constraint `request_timeout`.
+    /// How long the caller waits, and until when the callee may begin. The default is the constraint `request_timeout`.
     pub fn timeout(mut self, timeout: impl Into<Duration>) -> Self {
         self.options.timeout = Some(timeout.into());
         self
     }
 
-    /// In this class, and not in the function's own.
+    /// Overrides the function's own priority class.
     pub const fn priority(mut self, priority: Priority) -> Self {
         self.options.priority = Some(priority);
         self
     }
 
-    /// What it starts is wanted so long, if its function has a lease.
+    /// How long the call renews its lease, if the function has one.
     pub const fn renewing(mut self, renew: Renew) -> Self {
         self.options.renew = renew;
         self
     }
 
-    /// Takes over what another caller moves, in place of [`Error::Held`].
+    /// Takes over an actuator that another caller holds, instead of failing with [`Error::Held`].
     pub const fn take_over(mut self) -> Self {
         self.options.take_over = true;
         self
     }
 
-    /// In one datagram, now or never: only for a call that is [sent](Call::send).
+    /// Sends one datagram, without retransmission: only for a call that is [sent](Call::send).
     pub const fn best_effort(mut self) -> Self {
         self.options.delivery = Delivery::BestEffort;
         self
     }
 
-    /// With these options in place of those so far.
+    /// Replaces all options set so far.
     pub const fn with(mut self, options: RequestOptions) -> Self {
         self.options = options;
         self
     }
 
-    /// Ends with [`Error::Cancelled`] within 20 ms once `canceller` says so; an answer that is here already wins.
+    /// Ends with [`Error::Cancelled`] within 20 ms of `canceller`'s request, unless the answer is already here.
     pub const fn cancelled_by(mut self, canceller: &'c C::Canceller) -> Self {
         self.canceller = Some(canceller);
         self
     }
 
-    /// Once it is given up, by a [canceller](Self::cancelled_by) or by what [watches](Call::watch) it, it waits so long for the
-    /// service's answer, at most until its deadline, and ends with that: results, or its error with text and values. With
-    /// [`Error::Cancelled`] where none comes in time. What it moves stops at once all the same. A [`Reply`] that is dropped waits for
-    /// nothing. Where a call had not begun, the answer is [`Error::Expired`].
+    /// If the call is given up, by a [canceller](Self::cancelled_by) or what [watches](Call::watch) it, waits up to this long,
+    /// and at most until its deadline, for the service's answer, and returns that: results, or its error with text and values. If
+    /// none comes, [`Error::Cancelled`]. Motion stops at once all the same. [`Error::Expired`] if the call had not begun. A
+    /// dropped [`Reply`] waits for nothing.
     pub fn answer_within(mut self, wait: impl Into<Duration>) -> Self
     where
         C: BlockingCaller,
@@ -388,7 +388,7 @@ impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
         self
     }
 
-    /// Sends it and waits for the results. What it started, or would start, stops on an error if its service has a lease.
+    /// Sends the call and waits for its results. On an error motion of a service with a lease stops, or does not begin.
     pub fn wait(mut self) -> Result<K::Output, CallError<Q::Failure, C::Details>>
     where
         C: BlockingCaller,
@@ -412,12 +412,12 @@ impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
     }
 }
 
-/// Progress is asked for where something hears it, and not otherwise.
+/// Requests progress only if something receives it.
 const fn options<Q: Request, W: Watch<Q>>(options: RequestOptions) -> RequestOptions {
     RequestOptions { progress: W::WATCHES, ..options }
 }
 
-/// The results of an answered call. Where they cannot be read, what the call started is not wanted.
+/// The results of an answered call. If they cannot be read, the caller fails, so its motion ends.
 fn finish<C: Caller, Q: Request, K: Kind<C, Q::Results>>(
     caller: &C,
     frame: &Q::Frame<C::Room>,
@@ -443,7 +443,7 @@ impl<'c, C: Caller, Q: Request, W: Watch<Q>, K: Kind<C, Q::Results>> IntoFuture 
     }
 }
 
-/// What a [`Call`] is while a task awaits it. Dropped before it has ended, it gives the call up.
+/// A [`Call`] while a task awaits it. Dropping it before the call has ended gives the call up.
 #[must_use = "nothing is sent before it is polled; dropped, the call is given up"]
 pub struct Reply<'c, C: Caller, Q: Request, W = Unwatched, K = Once> {
     caller: &'c C,
@@ -452,7 +452,7 @@ pub struct Reply<'c, C: Caller, Q: Request, W = Unwatched, K = Once> {
     canceller: Option<&'c C::Canceller>,
     watch: W,
     pending: Option<C::Pending>,
-    /// It was ready. Polled once more, it must not call again.
+    /// It was ready: a further poll must not send the call again.
     is_over: bool,
     kind: PhantomData<K>,
 }
@@ -463,7 +463,7 @@ impl<C: Caller, Q: Request, W, K> fmt::Debug for Reply<'_, C, Q, W, K> {
     }
 }
 
-/// Nothing in it is ever pinned.
+/// No field is structurally pinned.
 impl<C: Caller, Q: Request, W, K> Unpin for Reply<'_, C, Q, W, K> {}
 
 impl<C: Caller, Q: Request, W: Watch<Q>, K: Kind<C, Q::Results>> Future for Reply<'_, C, Q, W, K> {
@@ -490,19 +490,19 @@ impl<C: Caller, Q: Request, W: Watch<Q>, K: Kind<C, Q::Results>> Future for Repl
     }
 }
 
-/// Nothing hears the progress of a call.
+/// Progress is ignored.
 #[derive(Clone, Copy, Debug)]
 pub struct Unwatched;
 
-/// Hears the progress of a call: see [`Call::watch`].
+/// Progress is received: see [`Call::watch`].
 #[derive(Clone, Copy, Debug)]
 pub struct Watched<F>(F);
 
-/// A call that ends with its results.
+/// The call returns its results.
 #[derive(Debug)]
 pub enum Once {}
 
-/// A call that ends with its results and a hold: see [`Call::hold`].
+/// The call returns its results and a hold: see [`Call::hold`].
 #[derive(Debug)]
 pub enum Holding {}
 
@@ -514,7 +514,7 @@ mod sealed {
     use super::{Caller, Held, Holding, Once, Request, Unwatched, Watched};
     use crate::distribution::parameters::ParametersView;
 
-    /// What hears the progress of a call.
+    /// Receives the progress of a call.
     pub trait Watch<Q: Request> {
         const WATCHES: bool;
         fn hear(&mut self, values: &ParametersView) -> ControlFlow<()>;
@@ -532,12 +532,12 @@ mod sealed {
         const WATCHES: bool = true;
 
         fn hear(&mut self, values: &ParametersView) -> ControlFlow<()> {
-            // Progress of another version is no reason to end a motion.
+            // Unreadable progress of another version is no reason to end a motion.
             Q::progress(values).map_or(ControlFlow::Continue(()), &mut self.0)
         }
     }
 
-    /// What a call leads to.
+    /// Determines the output of a call.
     pub trait Kind<C: Caller, R> {
         type Output;
         fn output(caller: &C, answered: C::Answered, results: R) -> Self::Output;
@@ -560,13 +560,13 @@ mod sealed {
     }
 }
 
-/// What a call that is held has given, and what gives it up when this is dropped.
+/// The results of a held call, and the guard that keeps its motion alive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use = "dropped, it is released at once"]
 pub struct Held<H, R = ()> {
     /// The results; `()` of a call by name.
     pub results: R,
-    /// What the call has started goes on until this is dropped.
+    /// Dropping this ends the motion that the call has started.
     pub hold: H,
 }
 
@@ -582,17 +582,17 @@ impl<H, R> Deref for Held<H, R> {
 #[derive(Clone, Debug)]
 #[expect(clippy::large_enum_variant, reason = "the core has no memory to box it in; a port may")]
 pub enum Detail {
-    /// What the service has said.
+    /// The failure that the service returned.
     Service(Failure),
     /// Where the peer's version of the function differs.
     Version(Mismatch),
 }
 
-/// How a port keeps what is known of a failed call; `()` keeps nothing.
+/// How a port stores details of a failed call; `()` stores nothing.
 pub trait CallDetails: Default {
-    /// Of this.
+    /// Stores this detail.
     fn of(detail: Detail) -> Self;
-    /// What is known, if it was kept.
+    /// The detail, if it was stored.
     fn get(&self) -> Option<&Detail>;
 }
 
@@ -614,24 +614,24 @@ impl CallDetails for Option<Detail> {
     }
 }
 
-/// Why a call has no results. `F` are the values of its service's failures, and `D` is how the port keeps them.
+/// Why a call has no results. `F` is the type of failure values, and `D` is how the port stores details.
 ///
 /// It turns into an [`Error`] by `?`.
 pub struct CallError<F = (), D = ()> {
-    /// What every caller learns.
+    /// The error, as every caller gets it.
     pub error: Error,
     details: D,
     values: PhantomData<fn() -> F>,
 }
 
 impl<F, D: CallDetails> CallError<F, D> {
-    /// An error, and what else is known of it.
+    /// An error and its details.
     pub fn new(error: Error, detail: Option<Detail>) -> Self {
         Self { error, details: detail.map(D::of).unwrap_or_default(), values: PhantomData }
     }
 
-    /// What the service has said of its failure, with the values of a call by name. `None` where it has said nothing, or the
-    /// port keeps nothing of it.
+    /// The failure that the service returned, with its values if the call was by name. `None` if it returned only a code, or the
+    /// port stores no details.
     pub fn failure(&self) -> Option<&Failure> {
         match self.details.get() {
             Some(Detail::Service(failure)) => Some(failure),
@@ -639,7 +639,7 @@ impl<F, D: CallDetails> CallError<F, D> {
         }
     }
 
-    /// Where the peer's version of the function differs, of [`Error::Mismatch`].
+    /// How the peer's version of the function differs, for [`Error::Mismatch`].
     pub fn mismatch(&self) -> Option<&Mismatch> {
         match self.details.get() {
             Some(Detail::Version(mismatch)) => Some(mismatch),
@@ -647,12 +647,12 @@ impl<F, D: CallDetails> CallError<F, D> {
         }
     }
 
-    /// The reason in words; empty where there is none.
+    /// The reason in words; empty if there is none.
     pub fn text(&self) -> &str {
         self.failure().map_or("", Failure::text)
     }
 
-    /// The values that the interface declares for failures; `None` where the service sent none.
+    /// The failure values that the interface declares; `None` if the service sent none.
     pub fn values(&self) -> Option<F>
     where
         F: Variables,
@@ -678,7 +678,7 @@ impl<F, D> CallError<F, D> {
 }
 
 impl<D> CallError<(), D> {
-    /// The same, of a call whose interface declares values for failures.
+    /// Converts to the failure type that the interface declares.
     fn typed<F>(self) -> CallError<F, D> {
         CallError { error: self.error, details: self.details, values: PhantomData }
     }
@@ -690,7 +690,7 @@ impl<F, D: Clone> Clone for CallError<F, D> {
     }
 }
 
-/// By what happened; what the service has said of it is not compared.
+/// Compares the errors only, not what the service said.
 impl<F, D> PartialEq for CallError<F, D> {
     fn eq(&self, other: &Self) -> bool {
         self.error == other.error

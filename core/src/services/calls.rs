@@ -1,8 +1,8 @@
-//! Calls of a peer: at most once, begun in order within a class, side by side, bounded.
+//! Calls of a peer: executed at most once, begun in order within a class, run side by side, bounded.
 //!
-//! A call that may begin now becomes a ticket, whatever else runs; one for which no slot is free waits in its class's
-//! queue, and those behind it wait as well. Some slots are kept for emergencies, and a queue of their own to wait in, so
-//! that other calls cannot keep them out, nor two calls of one emergency service those of another one.
+//! A call that may begin gets a slot, whatever else runs. If none is free, it waits in the queue of its class, with all later
+//! calls of that class behind it. Some slots and a queue are reserved for emergencies, so that other calls cannot keep them out;
+//! nor can one emergency service keep out another.
 
 use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
@@ -11,21 +11,21 @@ use crate::error::{Error, Limit};
 use crate::storage::{Buffer, Buffers, Storage, take_at};
 use crate::time::{Duration, Instant};
 
-/// Which ids of one class have been seen. Serves the stream and datagrams alike.
+/// The sliding window of ids seen in one class, over stream and datagrams together.
 #[derive(Clone, Copy, Debug, Default)]
 struct Window {
     newest: u32,
     seen: u64,
 }
 
-/// What the window says about an id.
+/// Whether an id was seen before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Seen {
-    /// New, and recorded now.
+    /// It is new, and now recorded.
     Never,
-    /// Recorded before: a duplicate, to be dropped without an answer, since the first copy is answered.
+    /// It is a duplicate: drop it without an answer, since the first copy is answered.
     Before,
-    /// Below the window, so that it cannot be decided.
+    /// It is below the window, so it may be a duplicate.
     TooOld,
 }
 
@@ -49,7 +49,7 @@ impl Window {
         Seen::Never
     }
 
-    /// Whether an id was noted, or is so old that it may have been.
+    /// Whether an id was seen, or is so old that it may have been.
     fn knows(&self, id: u32) -> bool {
         let behind = self.newest.saturating_sub(id);
         let bit = 1_u64.checked_shl(behind).unwrap_or(0);
@@ -57,7 +57,7 @@ impl Window {
     }
 }
 
-/// Names a call that runs: to be answered exactly once.
+/// Names a running call, which is to be answered exactly once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Ticket {
     index: u16,
@@ -71,48 +71,48 @@ impl Ticket {
     }
 }
 
-/// Whether a call that runs has been given up by its caller.
+/// Whether the caller has given a running call up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Cancelled {
-    /// It is wanted.
+    /// It has not.
     #[default]
     No,
-    /// It has been, and the port does not know.
+    /// It has, and the port has yet to be notified.
     Untold,
-    /// The port knows.
+    /// The port has been notified.
     Report,
 }
 
-/// A call that was accepted, without its arguments.
+/// An accepted call, without its arguments.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct CallHead {
-    /// The caller's id of it.
+    /// The caller's id.
     pub(crate) id: u32,
     /// The function called.
     pub(crate) slot: Slot,
-    /// The life of the function.
+    /// The generation of the function.
     pub(crate) generation: Generation,
     /// Its class.
     pub(crate) priority: Priority,
     /// Whether the caller waits.
     pub(crate) wants_reply: bool,
-    /// Whether the caller wants to be told progress.
+    /// Whether the caller asked for progress.
     pub(crate) wants_progress: bool,
-    /// Whether it takes over what another caller moves.
+    /// Whether it takes over an actuator that another caller holds.
     pub(crate) takes_over: bool,
-    /// Whether an operator of the caller's unit made it.
+    /// Whether an operator made it, and not the caller's program.
     pub(crate) operator: bool,
-    /// Whether it moves, stops or resets something: no call overtakes it, and it overtakes none.
+    /// Whether it moves, stops or resets something: then no call overtakes it, and it overtakes none.
     pub(crate) keeps_order: bool,
-    /// After this the caller no longer waits, and the call is not begun.
+    /// When the caller stops waiting; the call does not begin later.
     pub(crate) deadline: Instant,
-    /// The earliest time at which the caller can have made the request: its age is counted from here.
+    /// The earliest time at which the caller can have made the request, from which its age counts.
     pub(crate) sent_at: Instant,
-    /// The caller's number of it: a call that it made later has a higher one.
+    /// The caller's number of the call: later calls have higher ones.
     pub(crate) number: u32,
 }
 
-/// A call that runs: what its answer needs. There is room for many on each link.
+/// What the answer of a running call needs. Small, since each link has many.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RunningCall {
     pub(crate) id: u32,
@@ -123,21 +123,21 @@ pub struct RunningCall {
     pub(crate) wants_progress: bool,
     /// Whether the caller has given it up.
     pub(crate) cancelled: Cancelled,
-    /// Whether its results let what was stopped move again.
+    /// Whether returning results resets a stop.
     pub(crate) resets: bool,
     pub(crate) deadline: Instant,
     pub(crate) sent_at: Instant,
 }
 
-/// So many requests that were given up before they arrived are remembered beside the windows.
+/// How many requests that were given up before they arrived are remembered beside the windows.
 const UNWANTED: usize = 8;
 
-/// Of so many calls that wait the one with the earliest deadline begins; those behind them wait longer.
+/// How many of the waiting calls are compared to find the earliest deadline; calls behind them are not.
 const LOOKED_AT: usize = 16;
 
 /// Bytes of a call's head in a queue.
 const HEAD_BYTES: usize = 36;
-/// Where its deadline is.
+/// Offset of the deadline in the head.
 const DEADLINE: usize = 16;
 
 /// Calls of one peer that run or wait.
@@ -147,10 +147,10 @@ pub(crate) struct Calls<S: Storage> {
     unwanted: heapless::Vec<(u32, Priority), UNWANTED>,
     running: S::Slice<Option<RunningCall>>,
     queues: [Option<Queue<S>>; 3],
-    /// Emergencies that wait: one of the longest, or several short ones.
+    /// Waiting emergencies: capacity for one of the longest, or several shorter ones.
     emergencies: ([u8; HEAD_BYTES + EMERGENCY_BYTES], Span),
     held: u16,
-    /// When the next request is due by the minimum interval.
+    /// When the next request may come by the minimum interval.
     due: Instant,
 }
 
@@ -159,29 +159,29 @@ struct Queue<S: Storage> {
     span: Span,
 }
 
-/// Where the calls that wait are among the bytes of their queue.
+/// The range of a queue's bytes that waiting calls occupy.
 #[derive(Clone, Copy, Default)]
 struct Span {
     start: usize,
     end: usize,
 }
 
-/// Calls of one emergency service that one peer may have running or waiting; the next one is told `Busy`.
+/// How many calls of one emergency service a peer may have running or waiting; the next is `Busy`.
 const EMERGENCIES_OF_ONE: usize = 2;
 
-/// Of so many slots, those that are kept for emergencies.
+/// How many of these slots are reserved for emergencies.
 const fn kept(slots: usize) -> usize {
     if slots < 8 { 1 } else { slots / 4 }
 }
 
-/// Slots that a link needs for so many calls to run at the same time, those that are kept for emergencies included.
+/// Slots that a link needs to run this many calls at a time, including the slots reserved for emergencies.
 pub const fn slots_for(running: usize) -> usize {
     let kept = if running < 6 { 1 } else { running / 3 };
     running.saturating_add(kept)
 }
 
 impl<S: Storage> Calls<S> {
-    /// `running` bounds the calls that run at the same time; one slot in four, at least one, is kept for emergencies.
+    /// `running` bounds the calls that run at a time; one slot in four, but at least one, is reserved for emergencies.
     pub(crate) fn new(running: S::Slice<Option<RunningCall>>) -> Self {
         Self {
             windows: [Window::default(); 4],
@@ -194,7 +194,7 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// Notes a request's id in the window of its class.
+    /// Records the id of a request in the window of its class.
     pub(crate) fn note(&mut self, priority: Priority, id: u32) -> Seen {
         let seen = self.windows.get_mut(usize::from(priority.to_wire())).map_or(Seen::TooOld, |window| window.note(id));
         if self.unwanted.is_empty() || seen != Seen::Never {
@@ -205,7 +205,7 @@ impl<S: Storage> Calls<S> {
         if self.unwanted.len() < unwanted { Seen::Before } else { Seen::Never }
     }
 
-    /// Whether a request has arrived, as far back as the window of its class reaches.
+    /// Whether a request has arrived, as far as the window of its class can tell.
     pub(crate) fn has_arrived(&self, class: Priority, id: u32) -> bool {
         self.windows.get(usize::from(class.to_wire())).is_some_and(|window| window.knows(id))
     }
@@ -221,7 +221,7 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// The bytes in which the calls of a class wait; `None` where none does.
+    /// The bytes of a class's queue, and the part in use; `None` if it has no buffer.
     fn queue(&mut self, class: Priority) -> Option<(&mut [u8], &mut Span)> {
         match queue_index(class) {
             None => Some((&mut self.emergencies.0, &mut self.emergencies.1)),
@@ -232,7 +232,7 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// Gives the buffer of a class back when none of its calls waits any more.
+    /// Returns the buffer of a class to the pool once its queue is empty.
     fn give_drained(&mut self, buffers: &mut dyn Buffers<S>, class: Priority) {
         let queue = queue_index(class).and_then(|index| self.queues.get_mut(index));
         if let Some(queue) = queue.and_then(|queue| queue.take_if(|queue| queue.span.is_empty())) {
@@ -240,8 +240,7 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// The caller no longer wants a call. One that waits runs out at once, and is refused when its turn comes; one that has
-    /// not arrived is passed over when it does.
+    /// The caller gives a call up. A waiting call expires at once and is refused in its turn; a later arrival is dropped.
     pub(crate) fn give_up(&mut self, class: Priority, id: u32) {
         if !self.has_arrived(class, id) {
             return self.keep_out(class, id);
@@ -251,7 +250,7 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// A window that went ahead to this id would take earlier requests that are still on their way for too old.
+    /// Remembers an id without moving the window to it: else earlier requests that are in flight would be refused as too old.
     fn keep_out(&mut self, class: Priority, id: u32) {
         let known = self.unwanted.contains(&(id, class));
         if !known && self.unwanted.push((id, class)).is_err() {
@@ -268,8 +267,7 @@ impl<S: Storage> Calls<S> {
         !self.emergencies.1.is_empty() || self.queues.iter().any(Option::is_some)
     }
 
-    /// The callee's side of the minimum interval. One request may come early by a whole interval, because a network
-    /// does not keep distances.
+    /// The callee's check of the minimum interval. A request may be a whole interval early: the network does not keep intervals.
     pub(crate) fn interval(&mut self, now: Instant, interval: Duration) -> Result<(), Error> {
         if interval == Duration::ZERO {
             return Ok(());
@@ -282,8 +280,7 @@ impl<S: Storage> Calls<S> {
         Ok(())
     }
 
-    /// Whether a call of this class may begin at once: a slot is free, nothing of the class waits, and no other class has
-    /// a call that came before and may begin.
+    /// Whether a call of this class may begin at once: a slot is free, none of its class waits, and no earlier one could begin.
     pub(crate) fn is_idle(&self, priority: Priority) -> bool {
         if self.free_slot(priority == Priority::Emergency).is_none() {
             return false;
@@ -291,7 +288,7 @@ impl<S: Storage> Calls<S> {
         !self.any_waiting() || !self.class_waits(priority) && (priority == Priority::Emergency || !self.can_begin())
     }
 
-    /// An empty slot; the last ones are for emergencies, which take those first.
+    /// A free slot. Emergencies take the reserved slots, at the end, first.
     fn free_slot(&self, emergency: bool) -> Option<usize> {
         if emergency {
             return self.running.iter().rposition(Option::is_none);
@@ -307,8 +304,8 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// [`Error::Busy`] when the peer has as many calls here as it may; of an emergency service it may have two, whatever
-    /// else there is.
+    /// [`Error::Busy`] if the peer has its limit of calls here. An emergency service has its own limit of two, which other calls
+    /// do not count towards.
     pub(crate) fn admit(&self, slot: Slot, is_emergency: bool, limit: u16) -> Result<(), Error> {
         let free = if is_emergency { self.emergencies_of(slot) < EMERGENCIES_OF_ONE } else { self.held < limit };
         if free { Ok(()) } else { Err(Error::Busy) }
@@ -321,13 +318,13 @@ impl<S: Storage> Calls<S> {
         running.saturating_add(span.heads(bytes).filter(|(_, head, _)| head.slot == slot).count())
     }
 
-    /// Whether one more call of any class with a block of `bytes` could wait, as far as this peer's own calls go.
+    /// Whether one more call of any class with a block of `bytes` could wait in this peer's queues.
     pub(crate) fn has_room(&self, limit: u16, bytes: usize) -> bool {
         let needed = HEAD_BYTES.saturating_add(bytes);
         self.held < limit && self.queues.iter().flatten().all(|queue| queue.span.room(&queue.buffer) >= needed)
     }
 
-    /// Begins a call; one of an emergency service may take a slot that is kept for those.
+    /// Begins a call. One of an emergency service may take a reserved slot.
     pub(crate) fn begin(&mut self, head: &CallHead, resets: bool, is_emergency: bool) -> Result<Ticket, Error> {
         let index = self.free_slot(is_emergency).ok_or(Error::Busy)?;
         let place = self.running.get_mut(index).ok_or(Error::Full(Limit::IncomingCalls))?;
@@ -354,7 +351,7 @@ impl<S: Storage> Calls<S> {
         self.running.get(usize::from(ticket.index)).copied().flatten().filter(|head| head.id == ticket.id)
     }
 
-    /// The caller has given up a call that runs; `false` where that is known, an error where it does not run.
+    /// The caller gives up a running call. Returns `false` if that was known, an error if the call does not run.
     pub(crate) fn cancel(&mut self, class: Priority, id: u32) -> Result<bool, Error> {
         let mut running = self.running.iter_mut().flatten();
         let head = running.find(|head| head.id == id && head.priority == class).ok_or(Error::Stale)?;
@@ -365,7 +362,7 @@ impl<S: Storage> Calls<S> {
         Ok(is_new)
     }
 
-    /// A call that was given up, of which the port does not know.
+    /// A call that was given up, of which the port has not been notified.
     pub(crate) fn take_cancelled(&mut self) -> Option<Ticket> {
         let is_untold = |head: &RunningCall| head.cancelled == Cancelled::Untold;
         let index = self.running.iter().position(|head| head.as_ref().is_some_and(is_untold))?;
@@ -374,7 +371,7 @@ impl<S: Storage> Calls<S> {
         Some(Ticket { index: index as u16, id: head.id })
     }
 
-    /// Ends a call; `false` when it was ended already.
+    /// Ends a call; `false` if it had ended before.
     pub(crate) fn end(&mut self, ticket: Ticket) -> bool {
         let Some(place) = self.running.get_mut(usize::from(ticket.index)) else { return false };
         if place.take_if(|head| head.id == ticket.id).is_none() {
@@ -384,7 +381,7 @@ impl<S: Storage> Calls<S> {
         true
     }
 
-    /// Keeps a call until it may begin. If it needs a buffer, it leaves so many others in the pool.
+    /// Queues a call. If that takes a buffer, at least `left` others have to remain in the pool.
     pub(crate) fn wait(
         &mut self,
         buffers: &mut dyn Buffers<S>,
@@ -407,17 +404,17 @@ impl<S: Storage> Calls<S> {
         result
     }
 
-    /// Whether a call waits for which a slot is free.
+    /// Whether a call waits that could begin.
     pub(crate) fn can_begin(&self) -> bool {
         self.next_class().is_some()
     }
 
-    /// Whether an emergency waits for which a slot is free.
+    /// Whether an emergency waits that could begin.
     pub(crate) fn has_next_emergency(&self) -> bool {
         !self.emergencies.1.is_empty() && self.free_slot(true).is_some()
     }
 
-    /// Takes the next call that may begin and shows its block to `look`.
+    /// Dequeues the next call that may begin, and shows its block to `look`.
     pub(crate) fn take_next<R>(
         &mut self,
         buffers: &mut dyn Buffers<S>,
@@ -431,7 +428,7 @@ impl<S: Storage> Calls<S> {
         taken
     }
 
-    /// Puts the call first that [`take_next`](Self::take_next) is to take by deadlines; whether others had come earlier.
+    /// Moves the call with the earliest deadline to the front of its queue. Returns whether it overtakes earlier arrivals.
     pub(crate) fn put_next_first(&mut self, now: Instant) -> bool {
         let class = self.next_class().filter(|class| *class != Priority::Emergency);
         let Some((bytes, span)) = class.and_then(|class| self.queue(class)) else { return false };
@@ -443,8 +440,8 @@ impl<S: Storage> Calls<S> {
         !is_first
     }
 
-    /// Takes out the call of this class with the latest deadline, so that one with an earlier deadline and a block of `length`
-    /// bytes can wait in its place.
+    /// Removes the call of this class with the latest deadline, so that a newcomer with an earlier one and a block of `length`
+    /// bytes can wait instead.
     pub(crate) fn displace(
         &mut self,
         now: Instant,
@@ -459,7 +456,7 @@ impl<S: Storage> Calls<S> {
             return None;
         }
         span.put_first(bytes, last, size);
-        // The buffer stays, also when it is empty now: the other call waits in it.
+        // Keep the buffer even if it is empty now: the newcomer waits in it.
         let (head, ()) = span.pop(bytes, class, |_, _| ())?;
         self.held = self.held.saturating_sub(1);
         Some(head)
@@ -474,7 +471,7 @@ impl<S: Storage> Calls<S> {
         Priority::ALL.into_iter().find(may_begin)
     }
 
-    /// Forgets what waits and gives the buffers back. Running calls may still be ended.
+    /// Drops the waiting calls and returns the buffers. Running calls can still be ended.
     pub(crate) fn release(&mut self, buffers: &mut dyn Buffers<S>) {
         for queue in self.queues.iter_mut().filter_map(Option::take) {
             buffers.give(queue.buffer);
@@ -483,29 +480,29 @@ impl<S: Storage> Calls<S> {
         self.held = self.running.iter().flatten().count() as u16;
     }
 
-    /// Moves the running calls to more slots. Returns the slots that are not needed any more.
+    /// Moves the running calls to more slots. Returns the slots that are now unused.
     pub(crate) fn grow(&mut self, mut running: S::Slice<Option<RunningCall>>) -> S::Slice<Option<RunningCall>> {
         if running.len() < self.running.len() {
             return running;
         }
         running.iter_mut().for_each(|slot| *slot = None);
-        // A ticket names its slot by number.
+        // Keep each index: tickets contain it.
         running.iter_mut().zip(self.running.iter()).for_each(|(new, old)| *new = *old);
         core::mem::replace(&mut self.running, running)
     }
 
-    /// How many calls may run.
+    /// How many calls can run.
     pub(crate) fn slots(&self) -> usize {
         self.running.len()
     }
 
-    /// The slots, all empty.
+    /// The slots, cleared for the next session.
     pub(crate) fn into_slots(mut self) -> S::Slice<Option<RunningCall>> {
         self.running.iter_mut().for_each(|slot| *slot = None);
         self.running
     }
 
-    /// Calls that run or wait.
+    /// How many calls run or wait.
     pub(crate) const fn held(&self) -> u16 {
         self.held
     }
@@ -536,7 +533,7 @@ impl Span {
         Ok(())
     }
 
-    /// The calls that wait: where each begins, its head without the class, and its block.
+    /// The waiting calls: the offset of each, its head without the class, and its block.
     fn heads(self, bytes: &[u8]) -> impl Iterator<Item = (usize, CallHead, &[u8])> {
         let mut at = self.start;
         core::iter::from_fn(move || {
@@ -547,7 +544,7 @@ impl Span {
         })
     }
 
-    /// Where the head of a call is.
+    /// The offset of a call's head.
     fn find(self, bytes: &[u8], id: u32) -> Option<usize> {
         self.heads(bytes).find(|(_, head, _)| head.id == id).map(|(at, ..)| at)
     }
@@ -558,15 +555,15 @@ impl Span {
         bytes.get_mut(deadline).unwrap_or_default().fill(0);
     }
 
-    /// Where the call is that is next by deadlines, and how long it is there. What has waited half its time-out goes before
-    /// all others, so that calls with short time-outs cannot keep one with a long time-out waiting until it has run out.
+    /// Offset and size of the call that is next by deadline. A call that has waited half of its time-out precedes all others, so
+    /// that short time-outs cannot starve long ones.
     fn by_deadline(self, bytes: &[u8], now: Instant) -> Option<(usize, usize)> {
         let (mut next, mut earliest, mut sent_at) = (None, Instant::FAR_FUTURE, Instant::START);
         for (at, head, block) in self.heads(bytes).take(LOOKED_AT) {
             if next.is_some() && head.keeps_order {
                 break;
             }
-            // Each is an estimate, and a later call's may be the earlier time: equal time-outs keep their order all the same.
+            // Send times are estimates: do not let a later arrival look earlier, so that equal time-outs keep their order.
             sent_at = sent_at.max(head.sent_at);
             let due = due(&head, sent_at, now);
             if next.is_none() || due < earliest {
@@ -579,7 +576,7 @@ impl Span {
         next
     }
 
-    /// The call with the latest deadline of those that may be refused for another one, and how long it is in the queue.
+    /// The call with the latest deadline that may be displaced, with its offset and size.
     fn latest(self, bytes: &[u8], now: Instant) -> Option<(usize, CallHead, usize)> {
         let may_go = |head: &CallHead| !head.keeps_order && head.sent_at + half(head) > now;
         let (at, head, block) =
@@ -587,7 +584,7 @@ impl Span {
         Some((at, head, HEAD_BYTES.saturating_add(block.len())))
     }
 
-    /// Puts a call before all others, which keep their order.
+    /// Moves a call to the front; the others keep their order.
     fn put_first(self, bytes: &mut [u8], at: usize, size: usize) {
         let moved = bytes.get_mut(self.start..at.saturating_add(size));
         bytes::rotate_up(moved.unwrap_or_default(), size);
@@ -612,8 +609,8 @@ const fn half(head: &CallHead) -> Duration {
     head.deadline.since(head.sent_at).divided_by(2)
 }
 
-/// The order of calls, here of one that was made at `sent_at`. Where half the time-out is over, that time counts, which is past
-/// and so before all deadlines of calls that can wait.
+/// The key by which waiting calls are compared: the deadline, or, once half of the time-out is over, that time, which is past and
+/// so precedes all deadlines of calls that can still wait.
 fn due(head: &CallHead, sent_at: Instant, now: Instant) -> Instant {
     let half = half(head);
     let due = sent_at + half;

@@ -1,4 +1,4 @@
-//! What a unit tells its application: one type for all ports.
+//! What a unit reports to its application: one type for all ports.
 
 use crate::distribution::claim::Claim;
 use crate::distribution::identity::Identity;
@@ -8,10 +8,10 @@ use crate::services::requests::CallId;
 use crate::services::session::{Event, Session};
 use crate::services::{OwnFunctions, Port};
 
-/// Something happened that no call returned.
+/// Something that no call returned.
 ///
-/// A port fills in how it names a function (`F`), what can be used of the network (`N`) and how it addresses nodes (`E`),
-/// and gives the whole a short name: a program for Linux sees `cara_std::UnitEvent`, one for a board `cara_embassy::UnitEvent`.
+/// A port chooses how it names a function (`F`), what it says of the network (`N`) and how it addresses nodes (`E`), in an alias:
+/// `cara_std::UnitEvent` on Linux, `cara_embassy::UnitEvent` on boards.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum UnitEvent<F, N, E> {
@@ -27,51 +27,50 @@ pub enum UnitEvent<F, N, E> {
         /// Why.
         reason: CloseReason,
     },
-    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity` with
-    /// this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
+    /// A link ended before it joined: refused by either end, silent, or not opened. `DuplicateIdentity` with this unit's own
+    /// identity in `peer`: another live unit has it, and one of the two waits until the other is gone.
     NotJoined {
         /// The other end.
         address: E,
-        /// The identity that it claimed, or is expected to have.
+        /// The identity that it claimed, or that was dialled.
         peer: Option<Identity>,
         /// Why.
         reason: CloseReason,
     },
-    /// A live manager with this m_unit's name and id and a higher claim has shown itself: this one has stepped down. Its links
-    /// have ended, and with them what it ordered; it does nothing more, and is to be stopped. Where it is started again while
-    /// the other one runs, it does not start unless it is to take over.
+    /// A live manager with this m_unit's name and id has a higher claim: this one has stepped down. Its links and orders have
+    /// ended, and it does nothing more: stop it. Started again while the other one runs, it fails unless it takes over.
     Fenced {
         /// The higher claim.
         claim: Claim,
     },
-    /// This manager has raised its claim above one that vehicles obeyed and whose manager is not there any more.
+    /// This manager has raised its claim above one that vehicles obeyed, whose manager is no longer there.
     Raised {
         /// Its claim.
         claim: Claim,
     },
-    /// This m_unit stands by: it has just started, or has stepped down for a live manager of its name and id with this higher
-    /// claim. Its links have ended, and with them what it ordered.
+    /// This m_unit stands by: it has started as a standby, or has stepped down for a live manager of its name and id with this
+    /// higher claim. Its links and orders have ended.
     StandsBy {
         /// That manager's claim.
         by: Option<Claim>,
     },
-    /// This standby commands from here on: no manager of its name and id is there any more.
+    /// This standby commands from now on: no manager of its name and id answers any more.
     TookCommand {
         /// Its claim.
         claim: Claim,
     },
-    /// The claim of this manager is obeyed until this unit's next start only: it could not be stored, or not in time.
+    /// This unit could not store the claim of its manager in time, and obeys it only until its next start.
     ClaimNotKept {
         /// The manager.
         peer: Identity,
         /// Its claim.
         claim: Claim,
     },
-    /// The network that this unit can use has changed, and it searches again by itself. On Linux also when the unit finds
-    /// none at its start; a board's first address is not reported, and its links have ended.
+    /// The networks that this unit can use have changed; it searches again by itself. On Linux also reported if there is none at
+    /// the start; on a board the first address is not reported, and links end with each change.
     NetworkChanged {
-        /// What can be used now. On Linux the names of the interfaces that are up, `lo` among them: where there is no other
-        /// one, no node on another host can be found. On a board its address, if it has one.
+        /// What can be used now. On Linux the names of the interfaces that are up, including `lo`; with `lo` alone no node on
+        /// another host can be found. On a board its address, if it has one.
         up: N,
     },
     /// A node published or withdrew functions.
@@ -79,31 +78,31 @@ pub enum UnitEvent<F, N, E> {
         /// Which.
         peer: Identity,
     },
-    /// A node keeps no room for some of this unit's functions.
+    /// A node has no capacity for some of this unit's functions.
     FunctionsSkipped {
         /// Which.
         peer: Identity,
         /// How many.
         skipped: u16,
     },
-    /// An asynchronous request was not run, or its service failed.
+    /// A request without a reply was not run, or its service failed.
     RequestFailed {
-        /// Asked of this node.
+        /// The node that was asked.
         peer: Identity,
         /// As returned by the request.
         call: CallId,
         /// Why.
         error: Error,
     },
-    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead. On a board its safe hook
-    /// has run; on Linux it runs, on a thread of its own.
+    /// An order of this unit's service ended because its caller no longer wanted it. Its lease is dead. On a board the safe hook
+    /// has run; on Linux it runs on its own thread.
     LeaseExpired {
         /// Its caller.
         peer: Identity,
         /// The service.
         function: F,
     },
-    /// A node ended what this unit's call of a leased service started.
+    /// A node ended an order of this unit's.
     LeaseEnded {
         /// Which.
         peer: Identity,
@@ -114,20 +113,20 @@ pub enum UnitEvent<F, N, E> {
         /// Why.
         why: LeaseEnd,
     },
-    /// What a service of a node moves was stopped, so that no order begins, or has been reset. Boards are not told: a call
-    /// is refused as inhibited all the same.
+    /// An actuator of a node was stopped, so that no order begins, or was reset. Not reported on boards: there a call fails as
+    /// inhibited all the same.
     Inhibited {
         /// Which.
         peer: Identity,
         /// The service.
         function: F,
-        /// What inhibits it; `None` once it has been reset.
+        /// What inhibits it; `None` after a reset.
         latch: Option<Latch>,
     },
 }
 
 impl<F, N, E> UnitEvent<F, N, E> {
-    /// What the application is told of an event on a link; `None` where it is told nothing.
+    /// The application's event for an event of a link; `None` if the application is not notified of it.
     pub fn of<P: Port<Endpoint = E>>(
         event: Event,
         session: &Session<P>,

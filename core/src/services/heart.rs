@@ -1,31 +1,31 @@
-//! Hearts: what a unit renews for a loop only as long as that loop runs.
+//! Hearts: orders are renewed only while the loop that wants them runs.
 //!
-//! A process that is alive does not show that the part of it which wants a motion is. So the loop that wants it beats a
-//! [`Heart`] each time round, and renewals of the orders that name it count from its last beat: a loop that hangs ends its
-//! motions within their lease, and those of other loops go on.
+//! That a process is alive does not show that its planning loop is. So that loop beats a [`Heart`] in each round, and renewals of
+//! orders that name it count from its last beat: a loop that hangs ends its own motions within their lease, and other loops are
+//! not affected.
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
 use super::lease::odd_millis;
 use crate::time::{Duration, Instant};
 
-/// A beat is at most so many milliseconds newer than the time at which it is looked at.
+/// A beat may be up to this many milliseconds newer than the time at which it is checked.
 const NEWER: u32 = 60_000;
 
-/// Shows that one loop runs. Beaten by that loop, read by the sessions that renew what it has started.
+/// Shows that a loop runs. The loop beats it; the sessions that renew its orders read it.
 ///
-/// A heart that has not been beaten for 49 days seems to beat again for the length of one lease.
+/// After 49 days without a beat the clock has wrapped, and the heart seems to beat again for the length of one lease.
 #[derive(Debug)]
 pub struct Heart {
-    /// When it last beat, in milliseconds of the port's clock, wrapping, with the lowest bit set; 0 while it does not.
+    /// Time of the last beat in milliseconds of the port's clock, modulo 2^32, with the lowest bit set; 0 if it is stopped.
     beaten: AtomicU32,
-    /// Rises when it stops, so that what named it before is not renewed by beats of a later owner.
+    /// Increases at each stop, so that beats of a later owner do not renew earlier orders.
     life: AtomicU32,
-    /// At most so long between two beats, in microseconds.
+    /// Longest time between two beats, in microseconds.
     period: AtomicU32,
 }
 
-/// A heart that an order names: [`Heart::beats`].
+/// A heart as an order names it: [`Heart::beats`].
 #[derive(Clone, Copy, Debug)]
 pub struct Beats {
     heart: &'static Heart,
@@ -38,47 +38,47 @@ impl Heart {
         Self { beaten: AtomicU32::new(0), life: AtomicU32::new(0), period: AtomicU32::new(period.as_wire()) }
     }
 
-    /// The loop has come round, at `now`.
+    /// Beats: the loop has come round at `now`.
     pub fn beat(&self, now: Instant) {
-        // Rounded down, so that nothing is renewed for longer than it may.
+        // Rounded down, so that no lease is prolonged beyond its length.
         self.beaten.store(odd_millis(now) as u32, Ordering::Release);
     }
 
-    /// The loop has ended: nothing that names this heart until now is renewed any more.
+    /// Stops the heart: orders that name it are no longer renewed, even if it beats again.
     pub fn stop(&self) {
         self.life.store(self.life.load(Ordering::Acquire).wrapping_add(1), Ordering::Release);
         self.beaten.store(0, Ordering::Release);
     }
 
-    /// Gives a heart that was stopped another period, for its next owner.
+    /// Sets the period of a stopped heart, for its next owner.
     pub fn set_period(&self, period: Duration) {
         self.period.store(period.as_wire(), Ordering::Release);
     }
 
-    /// For the [`Renew::Heart`] of requests.
+    /// The value for [`Renew::Heart`].
     pub fn beats(&'static self) -> Beats {
         Beats { heart: self, life: self.life.load(Ordering::Acquire) }
     }
 }
 
 impl Beats {
-    /// How long ago it last beat; `None` where it does not beat, or was stopped.
+    /// How long ago the heart last beat; `None` if it was stopped or has not begun.
     pub(crate) fn age(&self, now: Instant) -> Option<Duration> {
         let beaten = self.heart.beaten.load(Ordering::Acquire);
         let is_same = self.heart.life.load(Ordering::Acquire) == self.life;
         let age = ((now.as_micros() / 1_000) as u32).wrapping_sub(beaten);
-        // A beat may be a little newer than the `now` of a session that looks at it.
+        // A beat may be a little newer than the session's `now`.
         let age = if (age as i32) < 0 && age > u32::MAX - NEWER { 0 } else { age };
         (beaten != 0 && is_same).then(|| Duration::from_millis(age.saturating_add(1).into()))
     }
 
-    /// At most so long between two beats.
+    /// Longest time between two beats.
     pub(crate) fn period(&self) -> Duration {
         Duration::from_micros(self.heart.period.load(Ordering::Acquire).into())
     }
 }
 
-/// Whether two name the same heart in the same life of it.
+/// Equal if both name the same heart between the same two stops.
 impl PartialEq for Beats {
     fn eq(&self, other: &Self) -> bool {
         core::ptr::eq(self.heart, other.heart) && self.life == other.life
@@ -87,21 +87,20 @@ impl PartialEq for Beats {
 
 impl Eq for Beats {}
 
-/// How long a call wants what it starts, if its function has a lease.
+/// How long a call renews its lease, if its function has one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Renew {
-    /// For the length of the lease.
+    /// Not at all: the motion lasts one lease.
     #[default]
     Never,
     /// While this heart beats, until the call is released.
     Heart(Beats),
-    /// While the process lives, until the call is released. A loop that hangs lets its vehicles drive on: for programs that
-    /// have none.
+    /// While the process lives, until the call is released. For programs without a loop only: one that hangs lets vehicles drive.
     Process,
 }
 
 impl Renew {
-    /// How old a renewal made at `now` is; `None` where none is to be made.
+    /// How old the evidence in a renewal at `now` is; `None` if there is none to send.
     pub(crate) fn age(&self, now: Instant) -> Option<Duration> {
         match self {
             Self::Never => None,

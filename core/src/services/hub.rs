@@ -1,24 +1,24 @@
-//! State shared by the links of a unit: known nodes, and the functions published to each.
+//! State that all links of a unit share: known nodes, and the functions published to each.
 //!
-//! A session enters the hub by itself, through the [`Door`] in its [`Context`](super::Context), when a peer has
-//! introduced itself or has shown that it is alive. Effects on another link, the port takes from [`Node::poll`] and
-//! passes on with [`Session::direct`](super::session::Session::direct), while it does not hold the hub.
+//! A session enters the hub through the [`Door`] in its [`Context`](super::Context) when a peer has introduced itself or shown
+//! that it is alive. If another link is affected, [`Node::poll`] returns a command, which the port passes to
+//! [`Session::direct`](super::session::Session::direct) after it has unlocked the hub.
 
 use crate::distribution::connection_handler::Node;
 
 use super::Port;
 use super::publications::Publications;
 
-/// One unit's membership and publications.
+/// A unit's membership and publications.
 pub struct Hub<P: Port> {
-    /// Finds nodes and decides which links are taken.
+    /// Finds nodes and decides which links are admitted.
     pub node: Node<P>,
     /// The functions published to each node.
     pub publications: Publications<P::Storage>,
 }
 
-/// The way of a session to its hub. The hub itself is one; a port that shares it between threads locks it, and nothing is
-/// locked inside.
+/// A session's access to its hub. The hub itself implements it; a port with threads puts a lock around it. While the hub is lent,
+/// no other lock is taken.
 pub trait Door<P: Port> {
     /// Lends the hub.
     fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<P>));

@@ -1,10 +1,10 @@
-//! Leases: a motion goes on only while the caller renews it.
+//! Leases: motion continues only while its caller renews it (docs/safety.md, "The bound").
 //!
-//! [`Lease`] is what the application reads, from a motor's interrupt if it likes: a few atomic loads say whether the
-//! motion may go on. It is dead again when nothing polls, so a busy or hung executor cannot keep a vehicle moving.
+//! The application reads a [`Lease`], even in a motor's interrupt: a few atomic loads tell whether motion may continue. A lease
+//! ends by itself if nothing polls, so a busy or hung executor cannot keep a vehicle moving.
 //!
-//! A service has one lease, and each call that begins is an [`Order`] of it. The newest order holds the lease; an earlier
-//! one stays dead for ever, whatever comes after it.
+//! A service has one lease; each call that begins is an [`Order`] of it. The newest order holds the lease; an earlier one is dead
+//! for good, whatever comes after it.
 
 use core::num::NonZeroU32;
 use core::sync::atomic::{AtomicBool, AtomicU8, AtomicU16, AtomicU32, Ordering};
@@ -20,7 +20,7 @@ use crate::services::heart::Renew;
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
-/// One call's hold of a service's [`Lease`]. Numbers rise, and repeat after 2^32 calls of one service.
+/// One call's hold of a service's [`Lease`]. The numbers wrap after 2^32 calls of one service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Order(NonZeroU32);
 
@@ -30,88 +30,87 @@ impl Order {
     }
 }
 
-/// On whose behalf an order begins.
+/// Who begins an order, and how.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Claim {
-    /// The ID number of the caller.
+    /// The ID number of the calling unit.
     pub holder: u32,
-    /// The caller's own order, which gives way.
+    /// The caller's own earlier order, which the new one may replace.
     pub replaces: Option<Order>,
-    /// The order of any other caller gives way as well.
+    /// Also replaces another caller's order.
     pub takes_over: bool,
-    /// An operator of the caller's unit made it, and not its program: they hold for themselves.
+    /// Made by an operator of the calling unit and not by its program: the two are different holders.
     pub operator: bool,
-    /// The caller's name for the link, as in [`LastOrder`].
+    /// The caller's nonce of the link, as in [`LastOrder`].
     pub link: u32,
     /// The caller's id of the call.
     pub call: u32,
-    /// What the caller commands with.
+    /// The claim under which the caller commands.
     pub under: claim::Claim,
-    /// When it was made: an order that is older than a stop does not begin, whatever was reset since.
+    /// When the call was made: an order made before a stop does not begin, even after a reset.
     pub made: Instant,
 }
 
 /// Longest ramp, in milliseconds.
 const LONGEST_RAMP: u16 = 60_000;
-/// A reader's clock may be so many milliseconds behind the unit's.
+/// Tolerance for a reader whose clock reading is older than the unit's, in milliseconds.
 const NEWER: u32 = 10;
 
-/// Says until when a leased service may act. Written by the unit, read anywhere. Services that share one move the same
-/// thing: one order of all of them holds it.
+/// Until when a leased service may act. Written by the unit, read anywhere. Services that share a lease move the same thing: one
+/// order at a time holds it.
 ///
-/// A reader may be later than the unit, which renews the lease as of the time at which it began to look at a renewal: an
-/// interrupt can fall between, and a thread can be held up there. So a lease that has been seen dead remembers it, and no
-/// renewal revives it: only a new order does.
+/// A reader's time may be later than the unit's, which renews as of the time at which it began to process a renewal: an interrupt
+/// may fall between, or a thread be held up. So a lease that was once seen dead records that, and only a new order revives it, no
+/// renewal.
 ///
-/// There is no compare-and-swap on the smallest boards. Each write is one store, and the stores come in an order in which
-/// a reader that falls between two of them sees less than there is: dead where it might be live, never the reverse. Two
-/// writers side by side would undo that: a renewal could revive what the other one has just ended. The unit writes by the
-/// methods of [`Service`], which take turns.
+/// The smallest boards have no compare-and-swap. Each write is a single store, and stores are ordered such that a reader between
+/// two of them may see a live lease as dead, never the reverse. Two concurrent writers would break that: a renewal could revive
+/// what the other has just ended. So all writes go through [`Service`], whose methods take turns.
 #[derive(Debug, Default)]
 pub struct Lease {
-    /// The end in milliseconds of the port's clock, wrapping, with the lowest bit set; 0 when there is none.
+    /// The end in milliseconds of the port's clock, modulo 2^32, with the lowest bit set; 0 if there is no order.
     end: AtomicU32,
-    /// A reader has been told that it has passed its end, or the unit has cut it: its safe hook is due.
+    /// A reader has seen the end pass, or the unit has cut the lease: the safe hook is due.
     seen_dead: AtomicBool,
-    /// An operator of `holder` made the order.
+    /// Whether the order was made by an operator of `holder`.
     operator: AtomicBool,
-    /// The order that holds it, or held it last; 0 before the first.
+    /// The order that holds the lease, or was the last to hold it; 0 before the first.
     order: AtomicU32,
-    /// The ID number of the one that made it.
+    /// The ID number of the unit that made the order.
     holder: AtomicU32,
-    /// That one's name for the link.
+    /// That unit's nonce of the link.
     link: AtomicU32,
-    /// That one's name for the call.
+    /// That unit's id of the call.
     call: AtomicU32,
-    /// That one's claim: term and claimant, the lower halves first.
+    /// That unit's claim: term, then claimant, each with the lower half first.
     claim: [AtomicU32; 4],
-    /// How it ended, as the number of a [`LeaseEnd`].
+    /// How the order ended, as the number of a [`LeaseEnd`].
     how: AtomicU8,
-    /// While it is latched, no order begins.
+    /// While this is set, no order begins.
     latch: LatchWord,
-    /// How long what moves takes to stand still, in milliseconds.
+    /// How long the motion takes to come to rest, in milliseconds.
     ramp: AtomicU16,
-    /// When the last order was stopped, as `end` has its time; 0 where none was since the last one began.
+    /// When the last order began to stop, in the format of `end`; 0 if it did not, or another has begun since.
     stopped: AtomicU32,
 }
 
-/// What may be done for an order, as of now: for a loop that moves what cannot stand still at once.
+/// What a loop that cannot stop its motion at once may do for an order now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
-    /// What it wants.
+    /// Do what the order wants.
     Live,
-    /// Nothing but to slow down: it is over, and its [ramp](Lease::set_ramp) is not.
+    /// Only slow down: the order is over, its [ramp](Lease::set_ramp) is not.
     Stopping,
     /// Nothing: power off.
     Dead,
 }
 
-/// The order that something was to be done for has ended.
+/// The order has ended, so what was to be done for it was not done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the order has ended: its caller no longer wants it, or it was stopped")]
 pub struct Ended;
 
-/// So that a service may use `?`: what it was asked for it does not do.
+/// Lets a service use `?`.
 impl From<Ended> for ServiceError {
     fn from(Ended: Ended) -> Self {
         Self::NotReady
@@ -137,8 +136,8 @@ impl Lease {
         }
     }
 
-    /// Whether the service may act at `now`, which is no time to come, for whichever order holds the lease. Never later
-    /// than what was granted: the end is rounded down. Once it has said no, it says so until the next order.
+    /// Whether the service may act at `now`, for whichever order holds the lease. `now` must not lie in the future. Never true
+    /// after the granted end, which is rounded down; once false, it stays false until the next order.
     pub fn is_live(&self, now: Instant) -> bool {
         if self.seen_dead.load(Ordering::Acquire) {
             return false;
@@ -151,31 +150,30 @@ impl Lease {
         live
     }
 
-    /// So long an order is [stopping](Stage::Stopping) when it has ended in any other way than by being finished or replaced,
-    /// and until then no other one begins ([`Error::Busy`]). To be set before the first order; at most a minute. The safe
-    /// hook runs when the ramp begins, and what moves is to stand still when the loop that reads [`stage`](Self::stage) finds
-    /// it dead: lease and ramp are the bound.
+    /// Sets how long an order is [stopping](Stage::Stopping) when it ends other than by being finished or replaced. Meanwhile no
+    /// other order begins ([`Error::Busy`]). Set it before the first order; at most a minute. The safe hook runs when the ramp
+    /// begins. Motion has to be at rest when the loop reads [`stage`](Self::stage) as dead: the bound is lease plus ramp.
     pub fn set_ramp(&self, span: Duration) {
         self.ramp.store(span.as_millis().min(LONGEST_RAMP.into()) as u16, Ordering::Release);
     }
 
-    /// As [`is_live`](Self::is_live), with what comes between live and dead.
+    /// As [`is_live`](Self::is_live), plus the stage between live and dead.
     pub fn stage(&self, now: Instant) -> Stage {
         if self.is_live(now) {
             return Stage::Live;
         }
         let end = self.end.load(Ordering::Acquire);
-        // The unit has not looked at it since: it was cut, or its time is over.
+        // The unit has not noticed the end yet: the lease was cut, or has expired.
         let runs_out = end != 0 && (is_before(now, end) || self.is_on_ramp(now, end));
         let is_stopping =
             if self.stopped.load(Ordering::Acquire) == 0 { runs_out && self.has_ramp() } else { self.is_stopping(now) };
         if is_stopping { Stage::Stopping } else { Stage::Dead }
     }
 
-    /// The same for one order; it is dead at once where a newer one holds the lease.
+    /// The same for one order, which is dead as soon as a newer one holds the lease.
     pub fn stage_for(&self, order: Order, now: Instant) -> Stage {
         let stage = if self.is_held_by(order) { self.stage(now) } else { Stage::Dead };
-        // As in `is_live_for`.
+        // See `is_live_for`.
         if self.is_held_by(order) { stage } else { Stage::Dead }
     }
 
@@ -183,21 +181,21 @@ impl Lease {
         self.ramp.load(Ordering::Acquire) != 0
     }
 
-    /// Whether the ramp of an order that was ended is not over. Again for as long each 49 days, where no order has begun since.
+    /// Whether the ramp of the last order is not over. Clocks wrap: true again every 49 days if no order has begun since.
     fn is_stopping(&self, now: Instant) -> bool {
         self.is_on_ramp(now, self.stopped.load(Ordering::Acquire))
     }
 
     fn is_on_ramp(&self, now: Instant, started: u32) -> bool {
-        // A reader may have looked at the clock a little before the unit did.
+        // The reader's clock reading may be a little older than the unit's.
         let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(started).wrapping_add(NEWER);
         started != 0 && self.has_ramp() && since < u32::from(self.ramp.load(Ordering::Acquire)).saturating_add(NEWER)
     }
 
-    /// The same for one order: once it is dead it stays so, also when another order holds the lease.
+    /// The same for one order: once dead it stays dead, even if another order holds the lease.
     pub fn is_live_for(&self, order: Order, now: Instant) -> bool {
-        // A new order stores its number first and its end last. So the end read in between is this order's own if the
-        // number is still the same behind it.
+        // A new order stores its number first, its end last: if the number is unchanged after the end was read, the end is its
+        // own.
         self.is_held_by(order) && self.is_live(now) && self.is_held_by(order)
     }
 
@@ -206,14 +204,14 @@ impl Lease {
         self.order.load(Ordering::Acquire) == order.number()
     }
 
-    /// Whether it lasts beyond `at` as things are, for measurements: nothing is remembered, so `at` may be to come.
+    /// Whether the lease lasts beyond `at` as it stands, for measurements. Records nothing, so `at` may lie in the future.
     pub fn lasts_beyond(&self, at: Instant) -> bool {
         let ended = self.seen_dead.load(Ordering::Acquire) || self.is_inhibited();
         !ended && is_before(at, self.end.load(Ordering::Acquire))
     }
 
-    /// How long it still lasts as things are: zero once it has passed its end, `None` when nothing is granted. It is only
-    /// looked at, as by [`Lease::lasts_beyond`].
+    /// How long the lease still lasts as it stands: zero after its end, `None` without an order. Records nothing, like
+    /// [`Lease::lasts_beyond`].
     pub fn left(&self, now: Instant) -> Option<Duration> {
         let end = self.end.load(Ordering::Acquire);
         let (millis, rest) = (now.as_micros() / 1_000, now.as_micros() % 1_000);
@@ -222,10 +220,9 @@ impl Lease {
         (end != 0).then(|| Duration::from_micros(left))
     }
 
-    /// [`begin`](Self::begin) for this caller: [`Error::Held`] where another one holds it and is not taken over, be it the
-    /// operator or the program of the same unit,
-    /// [`Error::Busy`] where an earlier order is dead and its safe hook comes first, [`Error::Inhibited`] where it was stopped,
-    /// [`Error::Expired`] where it was stopped after the call was made.
+    /// [`begin`](Self::begin) for a caller. Errors: [`Error::Held`] if another unit, or the other of operator and program, holds
+    /// the lease and is not taken over; [`Error::Busy`] if an earlier order is dead and its safe hook has yet to run;
+    /// [`Error::Inhibited`] after a stop; [`Error::Expired`] if the call was made before a stop.
     pub fn claim(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
         if let Some(latch) = self.latch() {
             return Err(latch.into());
@@ -250,8 +247,7 @@ impl Lease {
         Ok(order)
     }
 
-    /// Lets the service act for a new order, until [`Lease::seen_end`] of `end`. `None` where an earlier order is dead and
-    /// has not been ended: its safe hook comes first.
+    /// Begins an order, live until [`Lease::seen_end`] of `end`. `None` if the safe hook of a dead order has yet to run.
     pub fn begin(&self, now: Instant, end: Instant) -> Option<Order> {
         let runs = self.has_order();
         if runs && !self.is_live(now) || self.is_stopping(now) {
@@ -265,7 +261,7 @@ impl Lease {
             self.seen_dead.store(false, Ordering::Release);
         }
         self.end.store(odd_millis(end) as u32, Ordering::Release);
-        // The earlier order may have been seen dead in between, or all of them inhibited.
+        // A reader may have seen the earlier order dead in between, or a stop may have come.
         if self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() {
             self.order.store(before, Ordering::Release);
             self.end.store(end_before, Ordering::Release);
@@ -274,8 +270,7 @@ impl Lease {
         Some(Order(order))
     }
 
-    /// Lets the service go on until [`Lease::seen_end`] of `end`: `false` when the order has ended or been seen dead, and
-    /// stays so.
+    /// Prolongs the order until [`Lease::seen_end`] of `end`. `false` if it has ended or was seen dead, which is final.
     #[must_use]
     pub fn renew(&self, order: Order, end: Instant) -> bool {
         let ended = self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() || !self.has_order();
@@ -283,26 +278,25 @@ impl Lease {
             return false;
         }
         self.end.store(odd_millis(end) as u32, Ordering::Release);
-        // It may have been seen in between.
+        // A reader may have seen it dead in between.
         !self.seen_dead.load(Ordering::Acquire)
     }
 
-    /// When a lease that is granted until `end` is seen to be dead: up to 2 ms earlier. The unit ends it at that moment
-    /// too.
+    /// When a lease granted until `end` is seen as dead: up to 2 ms earlier. The unit ends it at that moment, too.
     pub fn seen_end(end: Instant) -> Instant {
         Instant::from_micros(odd_millis(end).saturating_mul(1_000))
     }
 
-    /// Stops an order whose safe hook is due: no other one begins before [`Lease::end`].
+    /// Marks an order dead. Its safe hook is due, and no other order begins before [`Lease::end`].
     pub fn cut(&self, order: Order) {
         if self.is_held_by(order) {
             self.seen_dead.store(true, Ordering::Release);
         }
     }
 
-    /// Stops whichever order holds it and lets none begin until [`reset`](Self::reset): a stop that a unit was sent, or the
-    /// vehicle's own, as of a bumper; then `latch.by` is 0. May be called from an interrupt. The first latch stays when
-    /// there is one, but with the time of the newest. The safe hook is due like that of an order that was [`cut`](Self::cut).
+    /// Stops whichever order holds the lease, and lets none begin until [`reset`](Self::reset): for a stop by a peer, or the
+    /// vehicle's own, such as a bumper's, with `latch.by` 0. May be called from an interrupt. An existing latch stays, with the
+    /// time of the newest stop. The safe hook is due as after [`cut`](Self::cut).
     pub fn inhibit(&self, now: Instant, latch: Latch) {
         self.latch.note(latch);
         self.stop_at(now, self.end.load(Ordering::Acquire));
@@ -310,7 +304,7 @@ impl Lease {
         self.seen_dead.store(true, Ordering::Release);
     }
 
-    /// Takes a latch along: that of the service that this one's replaces, or of the unit that it is new in.
+    /// Inherits a latch: of the service that this one replaces, or of the unit.
     pub(crate) fn inherit(&self, from: &LatchWord) {
         self.latch.inherit(from);
         if self.is_inhibited() {
@@ -323,13 +317,13 @@ impl Lease {
         &self.latch
     }
 
-    /// Lets orders begin again, if it was inhibited before `made`, at which the reset was asked for: an earlier wish does not
-    /// undo a later stop, nor one made within 3 ms of it.
+    /// Ends the latch if the last stop was before `made`, when the reset was requested: an earlier request does not undo a later
+    /// stop, nor one made within 3 ms of it.
     pub fn reset(&self, now: Instant, made: Instant) {
         self.latch.reset(now, made);
     }
 
-    /// What inhibits it.
+    /// The latch, if it is set.
     pub fn latch(&self) -> Option<Latch> {
         self.latch.latch()
     }
@@ -339,17 +333,17 @@ impl Lease {
         self.latch.is_inhibited()
     }
 
-    /// Whether an order is dead and has not been ended: its safe hook comes before anything else.
+    /// Whether an order is dead and has not been ended: its safe hook has to run before anything else.
     pub fn awaits_hook(&self) -> bool {
         self.seen_dead.load(Ordering::Acquire) && self.has_order()
     }
 
-    /// Whether an order is dead and has not been ended: it was cut or inhibited, or a reader saw its time pass.
+    /// Whether this order is dead and has not been ended: it was cut or inhibited, or a reader saw its time pass.
     pub(crate) fn is_cut(&self, order: Order) -> bool {
         self.seen_dead.load(Ordering::Acquire) && self.is_held_by(order)
     }
 
-    /// The ramp begins, unless it has: at `now`, or when the order's time was over.
+    /// Starts the ramp unless it has started: at `now`, or at the end of the lease if that was earlier.
     fn stop_at(&self, now: Instant, end: u32) {
         if self.stopped.load(Ordering::Acquire) == 0 {
             let started = if is_before(now, end) { odd_millis(now) as u32 } else { end };
@@ -357,7 +351,7 @@ impl Lease {
         }
     }
 
-    /// Ends an order; `false` when a newer one holds the lease.
+    /// Ends an order; `false` if a newer one holds the lease.
     pub fn end(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
         let held = self.is_held_by(order);
         if held {
@@ -366,7 +360,7 @@ impl Lease {
         held
     }
 
-    /// Ends an order because what it has started is finished: no hook runs. `false` for one that is dead, which was not.
+    /// Ends an order whose work is finished: no hook runs. `false` if it is dead, since it then was not finished.
     pub fn finish(&self, now: Instant, order: Order) -> bool {
         self.is_live_for(order, now) && self.end(now, order, LeaseEnd::Finished)
     }
@@ -381,7 +375,7 @@ impl Lease {
         self.end.store(0, Ordering::Release);
     }
 
-    /// The state of what it moves. What other threads write meanwhile may be in it in part: see [`Service::state`].
+    /// The state of the actuator. May mix in part of a concurrent write: see [`Service::state`].
     pub fn state(&self) -> ActuatorState {
         let how = LeaseEnd::of(self.how.load(Ordering::Acquire).into());
         let end = if self.has_order() { None } else { Some(how) };
@@ -402,7 +396,7 @@ impl Lease {
         claim::Claim { term: term | term_high << 32, claimant: claimant | claimant_high << 32 }
     }
 
-    /// Differs when the [state](Self::state) does; 0 for one that nothing has happened to.
+    /// Differs whenever the [state](Self::state) does; 0 in the initial state.
     pub(crate) fn changes(&self) -> u32 {
         let order = self.order.load(Ordering::Acquire);
         let latched = self.latch.changes();
@@ -413,7 +407,7 @@ impl Lease {
         self.end.load(Ordering::Acquire) != 0
     }
 
-    /// Ends whichever order holds it, as when the service is removed: whether there is one, whose safe hook is to run.
+    /// Ends whichever order holds the lease, as when the service is removed. Returns whether its safe hook has to run.
     pub fn clear(&self, now: Instant) -> bool {
         let has_order = self.has_order();
         if has_order {
@@ -423,25 +417,25 @@ impl Lease {
     }
 }
 
-/// Whether a time comes before the end of a lease, if there is one.
+/// Whether a time precedes the end of a lease, if there is one.
 const fn is_before(time: Instant, end: u32) -> bool {
     let time = (time.as_micros() / 1_000) as u32;
-    // A lease is far shorter than half of the range, so the sign of the difference tells the order.
+    // Times wrap. A lease is far shorter than half of the range, so the sign of the difference tells the order.
     end != 0 && (end.wrapping_sub(time) as i32) > 0
 }
 
-/// What the core asks of a port's service: where its lease is, if it has one, and all writes to it.
+/// What the core needs of a port's service: its lease, if it has one, and all writes to it.
 ///
-/// The writes do for a port that drives all links of a unit in one thread. A port that drives them in several does each
-/// write under a lock of the service, and starts the safe hook of [`expire_lease`](Self::expire_lease) under the same
-/// lock: a call of another peer that begins in between would be stopped by the hook of the one before it.
+/// The default methods suit a port that drives all links of a unit in one thread. A port with several threads performs each write
+/// under a lock of the service, and starts the safe hook of [`expire_lease`](Self::expire_lease) under the same lock: otherwise
+/// the hook of one order could stop the motion of the next, which another peer's call began in between.
 pub trait Service {
     /// The lease that the application reads.
     fn lease(&self) -> Option<&Lease> {
         None
     }
 
-    /// The newest value, of a stream.
+    /// The newest value, if the function is a stream.
     fn stream(&self) -> Option<&dyn crate::services::stream::Source> {
         None
     }
@@ -451,7 +445,7 @@ pub trait Service {
         self.lease().map(|lease| lease.claim(now, end, claim)).transpose()
     }
 
-    /// [`Lease::inhibit`]. A port that runs safe hooks by itself starts that of an order which this stops.
+    /// [`Lease::inhibit`]. A port that runs safe hooks itself starts that of the order that this stops.
     fn inhibit(&self, now: Instant, latch: Latch) {
         if let Some(lease) = self.lease() {
             lease.inhibit(now, latch);
@@ -482,14 +476,14 @@ pub trait Service {
         self.lease().is_some_and(|lease| lease.finish(now, order))
     }
 
-    /// [`Lease::end`], because its caller no longer wants it or it was stopped. Where this is `true`, the safe hook is due:
-    /// the event [`LeaseExpired`](crate::services::session::Event::LeaseExpired) says so to a port that has not started it
-    /// here.
+    /// [`Lease::end`], because the caller no longer wants the order or it was stopped. If this returns `true`, the safe hook is
+    /// due: the session reports [`LeaseExpired`](crate::services::session::Event::LeaseExpired) for ports that have not started
+    /// it here.
     fn expire_lease(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
         self.lease().is_none_or(|lease| lease.end(now, order, how))
     }
 
-    /// [`Lease::state`], between two writes.
+    /// [`Lease::state`], not during a write.
     fn state(&self) -> ActuatorState {
         self.lease().map(Lease::state).unwrap_or_default()
     }
@@ -497,34 +491,34 @@ pub trait Service {
 
 impl Service for () {}
 
-/// The lease that a call of the peer holds on a function of this unit: one for each function, or for all that share it.
+/// The lease that a call of the peer holds on a function of this unit, or on several that share an actuator.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Granted {
     /// The peer's id of the call.
     pub(crate) call: u32,
     pub(crate) slot: Slot,
     pub(crate) generation: Generation,
-    /// `None` where the port has no [`Lease`] for the service.
+    /// `None` if the port has no [`Lease`] for the service.
     pub(crate) order: Option<Order>,
     pub(crate) length: Duration,
     pub(crate) end: Instant,
 }
 
-/// The lease that a call of this unit holds on a function of the peer, until it is released.
+/// The lease that a call of this unit holds at the peer, until it is released.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Held {
     pub(crate) call: CallId,
     pub(crate) slot: Slot,
-    /// An operator made it.
+    /// Whether an operator made it.
     pub(crate) operator: bool,
     pub(crate) class: Priority,
-    /// In milliseconds, as the peer has published it.
+    /// Its length in milliseconds, as the peer has published it.
     pub(crate) lease: u32,
-    /// For how long the call wants it.
+    /// How long the call renews it.
     pub(crate) renew: Renew,
-    /// The next renewal; in the far future when it is renewed no more, and its release has yet to be sent in the stream.
+    /// When it is renewed next; in the far future if no longer, while its release has yet to be sent in the stream.
     pub(crate) next: Instant,
-    /// When the peer answered a renewal last.
+    /// When the peer last answered a renewal.
     pub(crate) answered: Instant,
 }
 

@@ -1,11 +1,11 @@
-//! COMMON SERVICES (paper, section 2): requesting, serving, publishing; the m_unit's and the s_unit's view of a peer.
+//! Common services (paper, section 2): requesting, serving, publishing; the m_unit's and the s_unit's view of a peer.
 //!
 //! # How a port drives the machines
 //!
-//! A port owns sockets, time, threads and memory; the state machines make every decision. A [`Hub`](hub::Hub) is what the links
-//! of one unit share: the [`Node`](crate::distribution::connection_handler::Node) that finds and admits peers, and the
-//! publications. A [`Session`](session::Session) is one link. Each is called with the time and what it needs, does what it can at
-//! once, and returns what happened. Neither waits, reads a clock or allocates.
+//! A port owns sockets, time, threads and memory; the state machines make every decision. A [`Hub`](hub::Hub) is the part that
+//! all links of a unit share: the [`Node`](crate::distribution::connection_handler::Node), which finds and admits peers, and the
+//! publications. A [`Session`](session::Session) is one link. Each call passes the time and what else is needed; it does what is
+//! possible now and returns what happened. It never waits, reads a clock or allocates.
 //!
 //! | what happens | what the port calls |
 //! |---|---|
@@ -14,24 +14,24 @@
 //! | … it returns `Command::Dial` | open a stream, `Session::new` with `dialed: true`, `node.dialing`; or `node.dial_failed` |
 //! | … it returns `Command::Notify(link, directive)` | `session.direct`, with nothing of the hub locked |
 //! | a stream that was dialled is open, or one was accepted | `session.connected` |
-//! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.poll` and `session.next_call`, each until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
+//! | bytes have come | `session.receive` until it consumes nothing and returns no event, then `session.poll` and `session.next_call`, each until `None`. After `paused`, offer the rest again after `direct`, or when a buffer may be free |
 //! | the stream takes bytes again, and `session.wants_to_write()` | `session.writable` |
 //! | a datagram has come | `session.datagram` of the link that [`for_session`](crate::distribution::datagram::for_session) names, if there is one; else `node.datagram` |
-//! | at `session.deadline()`, and after each call that may have ended the link | `session.poll` until `None`, **before** anything that has arrived: leases end here |
+//! | at `session.deadline()`, and after each call that may have ended the link | `session.poll` until `None`, **before** any received bytes: leases end here |
 //! | a handler has run, outside of all locks | `session.answer`, then `session.next_call` |
 //! | the stream has ended | `session.disconnected` |
 //!
 //! | event | what the port does |
 //! |---|---|
 //! | [`LeaseExpired`](session::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
-//! | [`Incoming`](session::Event::Incoming) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
-//! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | gives the program the event that [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` returns. It calls `session.cancel` for a call that the program gives up, `session.release` for all calls of a function |
-//! | `Sample`, `Subscribed` (feature `streams`) | keeps the value, which `session.results` returns, or the outcome of a subscription. It calls `session.subscribe` again at each [`ListChanged`](session::Event::ListChanged), and `session.stream_changed`, then `session.poll`, for each value that the unit publishes |
+//! | [`Incoming`](session::Event::Incoming) | runs the handler, and answers by ticket. An `order` is the handler's view of the service's [`Lease`](lease::Lease); a newer call of the service ends it without an event, so wake what awaits its end |
+//! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | passes the program the event that [`UnitEvent::of`](event::UnitEvent::of) returns, and a reply's results from `session.results`. It calls `session.cancel` for a call that the program gives up, `session.release` for all calls of a function |
+//! | `Sample`, `Subscribed` (feature `streams`) | stores the value from `session.results`, or the outcome of the subscription. It calls `session.subscribe` again at each [`ListChanged`](session::Event::ListChanged), and `session.stream_changed`, then `session.poll`, for each value that the unit publishes |
 //! | [`Joined`](session::Event::Joined) | notes that the peer is admitted and learns what is published to it; from now on it is `session.peer()` |
 //! | [`Closed`](session::Event::Closed) | the last event: drops the session (`into_storage` returns its slices), then calls `node.left`, also for a link that never joined |
 //!
-//! Ports differ only in which thread or task makes these calls, and under which lock. Two sessions are never locked at
-//! the same time; a session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].
+//! Ports differ only in which thread or task makes these calls, and under which lock. No port locks two sessions at the same
+//! time; a session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].
 //!
 //! ```
 //! # use cara_core::config::Constraints;
@@ -223,14 +223,14 @@ pub struct Context<'c, P: Port> {
     pub functions: &'c dyn OwnFunctions,
     /// The access table; without one, a joined node may do everything.
     pub access: Option<&'c dyn access::Access>,
-    /// What the links of the unit share.
+    /// The state that the unit's links share.
     pub hub: &'c mut dyn hub::Door<P>,
-    /// The keys of the unit's pairs; `()` where links are not secured.
+    /// The keys of the unit's pairs; `()` in plain mode.
     pub keys: &'c mut dyn Keys<P>,
 }
 
 impl<'c, P: Port> Context<'c, P> {
-    /// The access table, where the port asks one.
+    /// The access table, on ports that have access control.
     pub(crate) const fn table(&self) -> Option<&'c dyn access::Access> {
         if P::HAS_ACCESS { self.access } else { None }
     }
@@ -238,8 +238,8 @@ impl<'c, P: Port> Context<'c, P> {
 
 /// Looks up the key of a pair.
 pub trait Keys<P: Port> {
-    /// The key of this unit and the peer that a hello names, with freshly drawn bytes; `None` where there is none. The hello
-    /// may be anybody's.
+    /// The key of this unit and the peer that a hello names, with fresh random bytes; `None` if there is none. The hello is not
+    /// authenticated.
     fn credentials(&mut self, hello: &Hello) -> Option<<P::Cipher as Secure>::Credentials>;
 }
 
@@ -249,7 +249,7 @@ impl<P: Port> Keys<P> for () {
     }
 }
 
-/// A unit's own [`FunctionList`], whatever runs its services.
+/// A unit's own [`FunctionList`], whatever type its handlers have.
 pub trait OwnFunctions {
     /// [`FunctionList::function`]
     fn function(&self, slot: Slot) -> Option<Function<'_, dyn Service>>;

@@ -1,8 +1,8 @@
-//! Changes of a unit's own list of functions, and what they leave stopped: one rule for all ports.
+//! Changes of a unit's own function list while something is stopped: one rule for all ports.
 //!
-//! A latch is of what moves, and of the unit where all was stopped. It survives every change of the list: what is added starts
-//! latched where the unit is; what takes the place of a latched service is latched; what is removed leaves its latch to the unit.
-//! It ends by a reset alone.
+//! A latch (docs/concepts.md, "Stop and reset") belongs to an actuator, or to the unit after a stop of all. It survives every
+//! change of the list: a new service starts latched if the unit is, a replacement inherits the latch, and a removed service
+//! leaves it to the unit. Only a reset ends it.
 
 use super::lease::{Lease, Service};
 use crate::distribution::function::{Attributes, Definition, Signature};
@@ -11,13 +11,12 @@ use crate::error::Error;
 use crate::storage::Storage;
 
 impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
-    /// Adds a function; [`Error::NameTaken`] or [`Error::Full`] leave the list unchanged. What it moves is latched where all of the
-    /// unit is.
+    /// Adds a function; [`Error::NameTaken`] or [`Error::Full`] leave the list unchanged. Its actuator is latched if the unit is.
     pub fn add_function(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
         self.add_signature(definition.signature(), attributes, handler)
     }
 
-    /// As [`add_function`](Self::add_function), by a signature.
+    /// As [`add_function`](Self::add_function), with a signature.
     pub fn add_signature(
         &mut self,
         signature: Signature<'_>,
@@ -33,13 +32,13 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         Ok(slot)
     }
 
-    /// Puts another function in the place of the one of its name; [`Error::UnknownFunction`] or [`Error::Full`] leave
-    /// the list unchanged. What it moves is latched where the one before it was.
+    /// Replaces the function of this name; [`Error::UnknownFunction`] or [`Error::Full`] leave the list unchanged. Its actuator
+    /// is latched if that of the previous function was.
     pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
         self.replace_signature(definition.signature(), attributes, handler)
     }
 
-    /// As [`replace`](Self::replace), by a signature.
+    /// As [`replace`](Self::replace), with a signature.
     pub fn replace_signature(
         &mut self,
         signature: Signature<'_>,
@@ -56,8 +55,8 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         self.swap(signature, attributes, handler)
     }
 
-    /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`]. Where what it moved is latched and no
-    /// other function moves it, all that is added later is, until a reset of all.
+    /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`]. If its actuator is latched and no other
+    /// function moves it, functions added later are latched, until a reset of all.
     pub fn remove(&mut self, name: &str) -> Result<(Slot, H), Error> {
         let (slot, handler) = self.take(name)?;
         if let Some(lease) = handler.lease().filter(|lease| !self.moves(lease)) {
@@ -66,7 +65,7 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         Ok((slot, handler))
     }
 
-    /// Whether a function of the list has this lease.
+    /// Whether any function in the list has this lease.
     fn moves(&self, lease: &Lease) -> bool {
         self.iter().filter_map(|function| function.handler.lease()).any(|known| core::ptr::eq(known, lease))
     }

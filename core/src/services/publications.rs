@@ -7,25 +7,24 @@ use crate::error::{Error, Limit};
 use crate::services::run_times::RunTimes;
 use crate::storage::Storage;
 
-/// A function that one identity may see.
+/// A function that is visible to one identity.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PublishedToOne {
     identity: Identity,
     slot: Slot,
 }
 
-/// What the unit knows of its functions beside their list: to whom it shows them, and how long they run.
+/// What a unit keeps about its functions beside their list: who sees them, and their run times.
 pub struct Publications<S: Storage> {
     to_all: S::Slice<bool>,
     to_one: S::Slice<Option<PublishedToOne>>,
     version: u32,
-    /// How long the unit's functions run.
+    /// The functions' run times, for admission.
     pub(crate) run_times: RunTimes,
 }
 
 impl<S: Storage> Publications<S> {
-    /// A record with one flag per function of the unit's list, and as many functions shown to single nodes as there are
-    /// slots in `to_one`.
+    /// Tables with one flag per function of the unit's list, and one slot in `to_one` for each function shown to a single node.
     pub fn new(to_all: S::Slice<bool>, to_one: S::Slice<Option<PublishedToOne>>) -> Self {
         Self { to_all, to_one, version: 0, run_times: RunTimes::default() }
     }
@@ -60,7 +59,7 @@ impl<S: Storage> Publications<S> {
         }
     }
 
-    /// Another one after each change.
+    /// Differs after each change.
     pub(crate) const fn version(&self) -> u32 {
         self.version
     }

@@ -1,4 +1,4 @@
-//! Calls of this unit that wait for a reply, and the gate that keeps the minimum interval.
+//! This unit's calls that wait for a reply, and the check of the minimum interval.
 
 use crate::config::{EMERGENCY_CALLS, Priority};
 use crate::distribution::function_list::{Generation, Slot};
@@ -6,11 +6,11 @@ use crate::error::{Error, Limit};
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
-/// Names a request within its session; rises with each one.
+/// Names a request within its session. Each request has a higher one than the last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CallId(pub u32);
 
-/// The place of a call among those of its link, in the order in which they were made.
+/// The position of a call among those of its link, in the order in which they were made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Made(u32);
 
@@ -27,62 +27,59 @@ pub struct Pending {
     pub(crate) slot: Slot,
     pub(crate) generation: Generation,
     pub(crate) deadline: Instant,
-    /// The class of a call whose function has a lease, which is released when the call fails.
+    /// The class of a call whose function has a lease: the call is released if it fails.
     pub(crate) leased: Option<Priority>,
-    /// The class that the call was made in.
+    /// The class of the call.
     pub(crate) class: Priority,
-    /// The call has ended, and its release has yet to be sent in the stream.
+    /// The call has ended, and its release has not been sent in the stream yet.
     pub(crate) release_unsent: bool,
 }
 
-/// The table of calls in flight to one peer: lent slots, found by id without a search, and a few of its own that are kept
-/// for emergencies.
+/// The table of calls in flight to one peer: lent slots, indexed by id, and a few reserved for emergencies.
 pub struct Requests<S: Storage> {
     pending: S::Slice<Option<Pending>>,
-    /// Those of `pending` that are taken.
+    /// How many slots of `pending` are taken.
     in_flight: usize,
-    /// Emergencies that found all of `pending` taken.
+    /// Emergencies that found no free slot in `pending`.
     urgent: [Option<Pending>; EMERGENCY_CALLS],
     next_id: u32,
-    /// How many calls have been made, those among them that wait until they can be sent.
+    /// How many calls have been made, including those that wait to be sent.
     made: u32,
     last_request: Option<Instant>,
 }
 
 impl<S: Storage> Requests<S> {
-    /// A table with as many slots as were lent.
+    /// A table with these slots.
     pub fn new(pending: S::Slice<Option<Pending>>) -> Self {
         Self { pending, in_flight: 0, urgent: [None; EMERGENCY_CALLS], next_id: 1, made: 0, last_request: None }
     }
 
-    /// [`Error::TooSoon`] when `interval` has not passed since the last request.
+    /// [`Error::TooSoon`] if `interval` has not passed since the last request.
     pub(crate) fn gate(&self, now: Instant, interval: Duration) -> Result<(), Error> {
         let Some(last) = self.last_request else { return Ok(()) };
         let wait = (last + interval).since(now);
         if wait == Duration::ZERO { Ok(()) } else { Err(Error::TooSoon { wait }) }
     }
 
-    /// Notes that a request went out, for the gate.
+    /// Records that a request was sent, for [`gate`](Self::gate).
     pub(crate) fn sent(&mut self, now: Instant) {
         self.last_request = Some(now);
     }
 
-    /// An id for a request that expects no reply. `None` when the ids ran out.
+    /// An id for a request without a reply. `None` if the ids are used up.
     pub(crate) fn next_id(&mut self) -> Option<CallId> {
         let id = self.next_id;
         self.next_id = id.checked_add(1)?;
         Some(CallId(id))
     }
 
-    /// A call is made, which may wait for room before it is sent. They are no more than ids, of which the last one ends the
-    /// link.
+    /// Numbers a call, which may be sent later. Cannot overflow: calls are no more than ids, and the link ends at the last id.
     pub(crate) fn make(&mut self) -> Made {
         self.made = self.made.saturating_add(1);
         Made(self.made)
     }
 
-    /// The place of a call that is sent now: the one that it was given when it was made. One of an earlier link to the peer was
-    /// made before all of this one.
+    /// The number of a call that is sent now: the one that it got when it was made, or a new one if that was of an earlier link.
     pub(crate) fn made(&mut self, earlier: Option<Made>) -> Made {
         match earlier {
             Some(made) if made.0 <= self.made => made,
@@ -90,12 +87,12 @@ impl<S: Storage> Requests<S> {
         }
     }
 
-    /// The newest id that was given; 0 before the first.
+    /// The newest id; 0 before the first.
     pub(crate) const fn newest(&self) -> CallId {
         CallId(self.next_id.saturating_sub(1))
     }
 
-    /// An id and a slot for a call; an emergency finds one when all others have none.
+    /// An id and a slot for a call; an emergency may take a reserved slot.
     pub(crate) fn open(
         &mut self,
         slot: Slot,
@@ -117,7 +114,7 @@ impl<S: Storage> Requests<S> {
         if self.in_flight >= self.pending.len() {
             return if is_urgent { self.open_urgent(&pending(CallId(0))) } else { Err(Error::Full(Limit::Calls)) };
         }
-        // The slot follows from the id, so an id whose slot is taken is passed over; one is free, so the loop ends.
+        // An id determines its slot, so skip ids whose slot is taken. One is free, so the loop finds it.
         for _ in 0..self.pending.len() {
             let Some(id) = self.next_id() else { return Ok(None) };
             let Some(place) = self.place(id) else { continue };
@@ -130,7 +127,7 @@ impl<S: Storage> Requests<S> {
         Err(Error::Full(Limit::Calls))
     }
 
-    /// A slot for an emergency beside a table that is full.
+    /// A reserved slot for an emergency when the table is full.
     #[cold]
     fn open_urgent(&mut self, pending: &Pending) -> Result<Option<CallId>, Error> {
         let free = self.urgent.iter().position(Option::is_none).ok_or(Error::Full(Limit::Calls))?;
@@ -141,12 +138,12 @@ impl<S: Storage> Requests<S> {
         Ok(Some(id))
     }
 
-    /// Ends a call and frees its slot. `None` when it had ended already.
+    /// Ends a call and frees its slot. `None` if it had ended before.
     pub(crate) fn close(&mut self, id: CallId) -> Option<Pending> {
         self.take(id, false)
     }
 
-    /// Takes a call that waits for its reply, or else one whose release is still to be sent.
+    /// Removes a call that waits for its reply, or one whose release has yet to be sent.
     fn take(&mut self, id: CallId, release_unsent: bool) -> Option<Pending> {
         let is_meant = |pending: &mut Pending| pending.id == id && pending.release_unsent == release_unsent;
         if let Some(pending) = self.place(id).and_then(|place| place.take_if(is_meant)) {
@@ -168,7 +165,7 @@ impl<S: Storage> Requests<S> {
         due.and_then(|id| self.close(id))
     }
 
-    /// Ends any one call, as when the link is gone.
+    /// Ends any one call, because the link has ended.
     pub(crate) fn interrupt(&mut self) -> Option<CallId> {
         let id = self.waiting().map(|pending| pending.id).min()?;
         self.close(id).map(|pending| pending.id)
@@ -189,7 +186,7 @@ impl<S: Storage> Requests<S> {
         self.pending.iter().chain(&self.urgent).flatten()
     }
 
-    /// Keeps a call that was closed just now in its slot until its release has been sent.
+    /// Keeps a call that was just closed in its slot until its release has been sent.
     pub(crate) fn keep_unsent_release(&mut self, pending: Pending) {
         let kept = Some(Pending { release_unsent: true, ..pending });
         match self.place(pending.id) {
@@ -197,12 +194,12 @@ impl<S: Storage> Requests<S> {
                 *place = kept;
                 self.in_flight = self.in_flight.saturating_add(1);
             }
-            // It was an emergency's, and another call has the slot of its id.
+            // It was an emergency in a reserved slot, and another call has the slot of its id.
             _ => self.urgent.iter_mut().filter(|place| place.is_none()).take(1).for_each(|place| *place = kept),
         }
     }
 
-    /// A call whose release is still to be sent, and its class.
+    /// A call whose release has yet to be sent, and its class.
     pub(crate) fn unsent_release(&self) -> Option<(CallId, Priority)> {
         let due = self.all().find(|pending| pending.release_unsent)?;
         due.leased.map(|class| (due.id, class))
@@ -213,8 +210,8 @@ impl<S: Storage> Requests<S> {
         self.take(id, true);
     }
 
-    /// Moves to more slots: a multiple of those before, since the slot of an id follows from their number. Returns the
-    /// slots that are not needed any more, which are the new ones where they do not fit.
+    /// Moves to more slots: a multiple of the present number, since ids determine slots modulo that number. Returns the unused
+    /// slots: the new ones if they do not fit.
     pub(crate) fn grow(&mut self, mut pending: S::Slice<Option<Pending>>) -> S::Slice<Option<Pending>> {
         let times = pending.len().checked_rem(self.pending.len());
         if pending.len() < self.pending.len() || times.is_some_and(|rest| rest != 0) {
@@ -235,18 +232,18 @@ impl<S: Storage> Requests<S> {
         self.pending.len()
     }
 
-    /// The slots, all empty.
+    /// The slots, cleared for the next session.
     pub(crate) fn into_slots(mut self) -> S::Slice<Option<Pending>> {
         self.pending.iter_mut().for_each(|slot| *slot = None);
         self.pending
     }
 
-    /// Calls that wait for a reply.
+    /// How many calls wait for a reply.
     pub fn in_flight(&self) -> usize {
         self.in_flight.saturating_add(self.urgent.iter().flatten().count())
     }
 
-    /// When the first call that waits times out.
+    /// When the first waiting call times out.
     pub(crate) fn deadline(&self) -> Instant {
         self.waiting().map(|pending| pending.deadline).min().unwrap_or(Instant::FAR_FUTURE)
     }

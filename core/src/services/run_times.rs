@@ -1,4 +1,5 @@
-//! How long the unit's functions run: what admission ([`Scheduling::Admission`](crate::config::Scheduling::Admission)) goes by.
+//! Run times of the unit's functions, from which admission ([`Scheduling::Admission`](crate::config::Scheduling::Admission))
+//! predicts missed deadlines.
 
 use crate::ability::{ADMISSION, Begins, State};
 use crate::distribution::function_list::{Generation, Slot};
@@ -6,13 +7,13 @@ use crate::host::mailman::LinkId;
 use crate::services::calls::{CallHead, Ticket};
 use crate::time::{Duration, Instant};
 
-/// Functions whose average is kept; one more takes the place of the one that ran longest ago.
+/// How many functions have an average; another one replaces the one that ran longest ago.
 const FUNCTIONS: usize = 8;
-/// A run moves the average by one part in so many of the difference.
+/// Weight of a new run in the moving average: one part in this many.
 const WEIGHT: u64 = 8;
-/// Once in so long a call begins although it seems too late: only runs show what a function takes now.
+/// How often a call may begin although it seems too late: only a run shows what the function takes now.
 const PROBE: Duration = Duration::from_secs(1);
-/// After so long another call is measured in place of one that has not ended: its link may be gone.
+/// After this time another call is measured instead of one that has not ended, whose link may be gone.
 const MEASURED_FOR: Duration = Duration::from_secs(60);
 
 /// A call that runs, among those of all links.
@@ -22,18 +23,18 @@ type Running = (LinkId, Ticket);
 #[derive(Clone, Copy, Debug)]
 struct RunTime {
     function: (Slot, Generation),
-    /// As of `ran`.
+    /// Valid at `ran`.
     average: Duration,
-    /// When a measured call of it ended last.
+    /// When the last measured run ended.
     ran: Instant,
-    /// When a call of it began last although its average said that it would be too late.
+    /// When a call last began although the average said that it would be too late.
     probed: Option<Instant>,
-    /// The call that is measured, and since when. One at a time, so that what each call keeps does not grow.
+    /// The call being measured, and its start. One per function, so that each running call stores nothing.
     measured: Option<(Running, Instant)>,
 }
 
 impl RunTime {
-    /// Halved for each second in which nothing was measured: what was slow once is tried again.
+    /// The average, halved for each second without a measurement, so that a function that was slow is tried again.
     fn average(&self, now: Instant) -> Duration {
         let until = self.measured.map_or(now, |(_, since)| since.min(now));
         let idle = until.since(self.ran).as_micros().checked_div(PROBE.as_micros()).unwrap_or(0);
@@ -47,12 +48,12 @@ impl Begins for Table {
     const BEGIN: &'static Self = &[None; FUNCTIONS];
 }
 
-/// The averages of a unit, measured with the calls of all its links. Where the build has no admission, it takes no room.
+/// The averages of a unit, measured over all its links. Takes no memory in a build without admission.
 #[derive(Default)]
 pub(crate) struct RunTimes(State<Table, { ADMISSION as usize }>);
 
 impl RunTimes {
-    /// Whether a call that comes now, or is to begin now, cannot make its deadline as far as its function's average shows.
+    /// Whether a call that arrives or would begin now is expected to miss its deadline, by the average of its function.
     pub(crate) fn is_too_late(&self, now: Instant, call: &CallHead) -> bool {
         let Some(times) = self.0.iter().flatten().find(|times| times.function == (call.slot, call.generation)) else {
             return false;
@@ -61,12 +62,12 @@ impl RunTimes {
         times.average(now) > call.deadline.since(now) && !is_due
     }
 
-    /// A call begins, on a link, under a ticket.
+    /// A call begins on a link.
     pub(crate) fn began(&mut self, now: Instant, call: &CallHead, running: Running) {
         let function = (call.slot, call.generation);
         self.0.change(|table| {
             let known = table.iter().position(|place| place.is_some_and(|times| times.function == function));
-            // Else a free place, or that of the function that ran longest ago.
+            // Otherwise a free entry, or that of the function that ran longest ago.
             let oldest = || {
                 let ran = |(_, place): &(usize, &Option<RunTime>)| place.map_or(Instant::START, |times| times.ran);
                 table.iter().enumerate().min_by_key(ran).map(|(index, _)| index)
@@ -85,7 +86,7 @@ impl RunTimes {
         });
     }
 
-    /// The handler of a call of this function is through.
+    /// The handler of a call has returned.
     pub(crate) fn ended(&mut self, now: Instant, function: (Slot, Generation), running: Running) {
         self.0.change(|table| {
             let Some(times) = table.iter_mut().flatten().find(|times| times.function == function) else { return };
@@ -95,7 +96,7 @@ impl RunTimes {
                 return;
             }
             let took = now.since(since);
-            // The first run after a pause counts alone.
+            // The first run after a pause replaces the average, which is out of date.
             times.average = if average == times.average && average != Duration::ZERO {
                 average - average.divided_by(WEIGHT) + took.divided_by(WEIGHT)
             } else {

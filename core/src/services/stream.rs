@@ -1,13 +1,13 @@
-//! Streams: named values that change. A unit publishes the newest value; each subscriber is sent it as often as it wants,
-//! never before a call, and never two of one stream at a time: what was not sent yet, the next value replaces.
+//! Streams: named values that change. A unit publishes the newest value; each subscriber gets it at its own interval, after
+//! pending calls. Nothing is queued: a new value replaces one that was not sent.
 //!
-//! A stream is a function without arguments whose [attributes](crate::distribution::function::Attributes::stream) say so, and
-//! whose handler has a [`Source`]. [`Newest`] is the value of one; a port puts a lock around it where it needs one.
+//! A stream is a function without arguments whose [attributes](crate::distribution::function::Attributes::stream) mark it, and
+//! whose handler has a [`Source`]. [`Newest`] stores the value; a port puts a lock around it if it needs one.
 //!
 //! # Ages
-//! Every value has an age that is never too low: it counts from publishing to sending on the publisher's clock, and from
-//! arrival on on the subscriber's. The way between, and the time in the send queue, are bounded as the age of a request
-//! is: by the subscriber's clock as the publisher last heard it. So an age is too high by the time that a keep-alive took.
+//! The age of a value is never underestimated. It counts from publishing to sending on the publisher's clock, and from arrival on
+//! the subscriber's. Queueing and travel are bounded like the age of a request: by the subscriber's clock as the publisher last
+//! received it. The age is therefore too high by at most the travel time of a keep-alive.
 
 use crate::bytes;
 use crate::distribution::block::{self, SliceWriter};
@@ -16,14 +16,14 @@ use crate::distribution::parameters::ParametersView;
 use crate::error::Error;
 use crate::time::{Duration, Instant};
 
-/// The newest value of a stream, as its source lends it.
+/// The newest value of a stream, lent by its source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Value<'v> {
-    /// Rises with each value.
+    /// Increases with each value.
     pub version: u32,
     /// When it was published.
     pub published: Instant,
-    /// How old it was then: of a value that is passed on.
+    /// Its age at that time: zero unless the value was received and passed on.
     pub age: Duration,
     /// The encoded values.
     pub block: &'v [u8],
@@ -36,15 +36,15 @@ impl Value<'_> {
     }
 }
 
-/// Where a unit keeps the newest value of one of its streams.
+/// Where a unit keeps the newest value of one stream.
 pub trait Source {
-    /// Another one for each value; 0 until there is one.
+    /// Differs for each value; 0 before the first.
     fn version(&self) -> u32;
     /// Lends the newest value, if there is one.
     fn newest(&self, look: &mut dyn FnMut(&Value<'_>));
 }
 
-/// The newest value of a stream, in the bytes that it is lent.
+/// Stores the newest value of a stream in lent bytes.
 #[derive(Clone, Debug)]
 pub struct Newest<B> {
     bytes: B,
@@ -55,15 +55,15 @@ pub struct Newest<B> {
 }
 
 impl<B: AsRef<[u8]> + AsMut<[u8]>> Newest<B> {
-    /// No value yet, and room for [`longest`](block::longest) bytes of the stream's results.
+    /// Without a value; `bytes` should hold the [`longest`](block::longest) results of the stream.
     pub const fn new(bytes: B) -> Self {
         Self { bytes, length: 0, version: 0, published: Instant::START, age: Duration::ZERO }
     }
 
-    /// Puts a new value in the place of the one before. `age` is zero for a value of this unit's own.
+    /// Replaces the value. `age` is zero for a value of this unit's own.
     ///
-    /// On an error the value before stays: [`Error::MissingArgument`], [`Error::WrongType`] and [`Error::WrongSize`] where
-    /// `values` are not what the stream declares, [`Error::TooLarge`] where the bytes are too few.
+    /// On an error the previous value stays: [`Error::MissingArgument`], [`Error::WrongType`] and [`Error::WrongSize`] if
+    /// `values` do not match the stream's signature, [`Error::TooLarge`] if there are too few bytes.
     pub fn publish(
         &mut self,
         now: Instant,
@@ -80,7 +80,7 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> Newest<B> {
         Ok(())
     }
 
-    /// The same for a value that is encoded: of a stream that is passed on.
+    /// As [`publish`](Self::publish), for the encoded value of a stream that is passed on.
     pub fn pass_on(&mut self, now: Instant, age: Duration, encoded: &[u8]) -> Result<(), Error> {
         let room = self.bytes.as_mut();
         let limit = room.len() as u32;
@@ -94,7 +94,7 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> Newest<B> {
         self.version = self.version.wrapping_add(1).max(1);
     }
 
-    /// Another one for each value; 0 until there is one.
+    /// Differs for each value; 0 before the first.
     pub const fn version(&self) -> u32 {
         self.version
     }

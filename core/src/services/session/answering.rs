@@ -1,4 +1,4 @@
-//! Calls of the peer: which one begins, and how it is answered or refused.
+//! Calls of the peer: which begins next, and how it is answered or refused.
 
 use super::details::DetailsPart;
 use super::granting::Granting;
@@ -18,9 +18,9 @@ use crate::services::calls::{CallHead, Cancelled, RunningCall, Ticket};
 use crate::services::{Context, Port};
 
 impl<P: Port> Session<P> {
-    /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
-    /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`, and
-    /// [`poll`](Self::poll) before it: what was stopped has its safe hook first.
+    /// Begins the next waiting call, with its arguments in `arguments`. Call [`poll`](Self::poll) first, since a safe hook that
+    /// is due precedes any handler. Then call this after [`receive`](Self::receive) and after each [`answer`](Self::answer) until
+    /// it returns `None`.
     pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Incoming> {
         while self.wire.phase == Phase::Live && !self.granting.obedience.waits {
             if let Ok(call) = self.begin_next(cx, arguments)? {
@@ -30,7 +30,7 @@ impl<P: Port> Session<P> {
         None
     }
 
-    /// The same for emergencies alone, for ports that run those apart from all other calls.
+    /// As [`next_call`](Self::next_call), for emergencies only: for ports that run these apart from other calls.
     pub fn next_emergency(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Incoming> {
         while self.has_next_emergency() {
             if let Ok(call) = self.begin_next(cx, arguments)? {
@@ -40,7 +40,7 @@ impl<P: Port> Session<P> {
         None
     }
 
-    /// Begins the next call that may begin, or refuses it; `None` when there is none.
+    /// Begins or refuses the next call that may begin; `None` if there is none.
     fn begin_next(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -55,7 +55,7 @@ impl<P: Port> Session<P> {
                 return Err(Error::Expired);
             }
             let function = functions.lookup(head.slot, head.generation)?;
-            // The table may have changed while the call waited.
+            // The access table may have changed while the call waited.
             if !decide_call(access, remote, function.name(), head.takes_over).is_allowed() {
                 return Err(Error::NotAllowed);
             }
@@ -68,29 +68,29 @@ impl<P: Port> Session<P> {
         Some(started)
     }
 
-    /// Whether [`next_call`](Self::next_call) would look at a call.
+    /// Whether [`next_call`](Self::next_call) has a call to begin or refuse.
     pub fn has_next_call(&self) -> bool {
         self.wire.phase == Phase::Live && !self.granting.obedience.waits && self.calls.can_begin()
     }
 
-    /// Whether a moving call waits until the claim that it is made under is stored: a port that does not poll the session in turn
-    /// with its calls looks at those when this has changed.
+    /// Whether a moving call waits until its claim is stored. A port that does not poll before each `next_call` checks for calls
+    /// again when this changes.
     pub const fn awaits_claim(&self) -> bool {
         self.granting.obedience.waits
     }
 
-    /// Whether [`next_emergency`](Self::next_emergency) would look at a call.
+    /// Whether [`next_emergency`](Self::next_emergency) has a call to begin or refuse.
     pub fn has_next_emergency(&self) -> bool {
         self.wire.phase == Phase::Live && self.calls.has_next_emergency()
     }
 
-    /// Whether a request that comes now would be kept if it cannot run at once. A port that stops looking at what it has
-    /// read while there is no room lets a peer that sends faster than its calls run feel it, in place of refusing.
+    /// Whether a request that cannot begin at once could be queued. While not, a port can leave received bytes unread, so that
+    /// flow control slows the peer down, instead of having its requests refused.
     pub fn has_call_room(&self) -> bool {
         self.calls.has_room(self.wire.constraints.calls_per_peer, self.wire.constraints.message_size as usize)
     }
 
-    /// Begins a call of a function that has these attributes.
+    /// Begins a call of a function with these attributes.
     pub(super) fn begin(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -98,12 +98,12 @@ impl<P: Port> Session<P> {
         attributes: &Attributes,
     ) -> Result<Incoming, Error> {
         let lease = attributes.lease;
-        // A command that waited for its turn is no longer wanted once its lease has been given up.
+        // The caller released the function while this call waited.
         if lease.is_some() && self.wire.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
         self.admit(cx, &head)?;
-        // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
+        // Take a slot first, then the lease: a lease without a slot would last until it expires, since no call would end it.
         let ticket = self.calls.begin(&head, attributes.reset, is_emergency(attributes, head.priority))?;
         let order = match lease.map_or(Ok(None), |length| self.granting.grant(&mut self.wire, cx, &head, length)) {
             Ok(order) => order,
@@ -121,8 +121,8 @@ impl<P: Port> Session<P> {
         Ok(Incoming { ticket, slot, priority, wants_reply, deadline, order })
     }
 
-    /// Answers a call. [`Error::Full`] when the answer cannot be kept now: the call stays open, to be answered again
-    /// when the stream has taken bytes. A call that was answered, or whose link has ended, is passed over.
+    /// Answers a call. [`Error::Full`] if the answer cannot be queued now: the call stays open, and the port tries again when the
+    /// stream has taken bytes. Has no effect on a call that was answered, or whose link has ended.
     pub fn answer(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -132,7 +132,7 @@ impl<P: Port> Session<P> {
         self.answer_with(cx, ticket, result, None)
     }
 
-    /// One piece of code for answers with and without details.
+    /// Not generic, so that answers with and without details share the code.
     pub(super) fn answer_with(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -141,18 +141,18 @@ impl<P: Port> Session<P> {
         failure: Option<&Failure>,
     ) -> Result<(), Error> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
-        // Before the answer leaves: what waits for room in the stream is not the function's time.
+        // Measure before sending: waiting for capacity in the stream is not part of the function's run time.
         if self.is_measured(head.priority, false) {
             let (now, function, running) = (cx.now, (head.slot, head.generation), (self.wire.link.id(), ticket));
             cx.hub.enter(&mut |hub| hub.publications.run_times.ended(now, function, running));
         }
-        // Before the answer leaves: one that says it was reset is true.
+        // Reset before the answer is sent, so that the answer is true when it arrives.
         let result = if head.resets {
             result.and_then(|results| Granting::reset_orders(&mut self.wire, cx, &head).map(|()| results))
         } else {
             result
         };
-        // A call that failed wants nothing any more, so what it started stops now: also where its answer has no room yet.
+        // A failed call wants no motion: stop what it started now, even if the answer cannot be queued yet.
         if result.is_err() {
             self.granting.cut_call(&mut self.wire, cx, head.id);
         }
@@ -162,7 +162,7 @@ impl<P: Port> Session<P> {
                 Ok(_) => Ok(()),
                 Err(error) => DetailsPart::send_failure(&mut self.wire, cx, &head, error, failure.filter(|_| DETAILS)),
             };
-            // Returned before the call is closed: the port tries again, and the lease goes on meanwhile.
+            // Return before the call is closed: the port tries again, and the lease continues meanwhile.
             if let Err(error @ Error::Full(_)) = sent {
                 return Err(error);
             }
@@ -174,18 +174,17 @@ impl<P: Port> Session<P> {
         Ok(())
     }
 
-    /// As [`answer`](Self::answer) with [`ServiceError::Failed`], and tells the caller text and values as well: as much of it
-    /// as fits and as the signature declares.
+    /// As [`answer`](Self::answer) with [`ServiceError::Failed`], plus text and values as far as they fit and are declared.
     pub fn answer_failed(&mut self, cx: &mut Context<'_, P>, ticket: Ticket, failure: &Failure) -> Result<(), Error> {
         self.answer_with(cx, ticket, Err(failure.error().into()), Some(failure))
     }
 
-    /// Tells the caller of a running call how far it is. Nothing is sent, and nothing is wrong, where it does not want to know or
-    /// the call has ended.
+    /// Sends progress of a running call to its caller. Does nothing if the caller has not asked for progress, or the call has
+    /// ended.
     ///
-    /// [`Error::Full`] where the stream has no room now or the last progress was just sent: the port keeps the newest values, and
-    /// tries again after the next [`poll`](Self::poll), or with newer ones. Other errors say that the values do not fit the
-    /// signature, or the peer.
+    /// [`Error::Full`] if the stream has no capacity, or progress was sent less than the minimum interval ago: the port keeps the
+    /// newest values, and tries again after the next [`poll`](Self::poll), or with newer values. Other errors: the values do not
+    /// match the signature, or are too long for the peer.
     pub fn progress(&mut self, cx: &mut Context<'_, P>, ticket: Ticket, values: &ParametersView) -> Result<(), Error> {
         self.details.progress(&mut self.wire, &self.calls, cx, ticket, values)
     }
@@ -195,7 +194,7 @@ impl<P: Port> Session<P> {
         self.calls.call(ticket).is_none()
     }
 
-    /// Whether the caller of a running call has given it up; also where the call has ended.
+    /// Whether the caller has given up a call; also `true` if the call has ended.
     pub fn is_cancelled(&self, ticket: Ticket) -> bool {
         self.calls.call(ticket).is_none_or(|head| head.cancelled != Cancelled::No)
     }
@@ -204,13 +203,13 @@ impl<P: Port> Session<P> {
         SCHEDULING && self.wire.constraints.scheduling != Scheduling::Fifo
     }
 
-    /// Whether the average of a call's function counts.
+    /// Whether admission considers the run times of a call's function.
     fn is_measured(&self, class: Priority, keeps_order: bool) -> bool {
         let admits = ADMISSION && self.wire.constraints.scheduling == Scheduling::Admission;
         admits && !keeps_order && class != Priority::Emergency
     }
 
-    /// Refuses a call that cannot make its deadline any more.
+    /// Refuses a call that is not expected to make its deadline.
     pub(super) fn admit(&mut self, cx: &mut Context<'_, P>, head: &CallHead) -> Result<(), Error> {
         let (now, mut is_too_late) = (cx.now, false);
         if self.is_measured(head.priority, head.keeps_order) {
@@ -222,7 +221,7 @@ impl<P: Port> Session<P> {
         Ok(())
     }
 
-    /// A call that waits is refused in favour of one with an earlier deadline that came later. Whether that can wait now.
+    /// Refuses the waiting call with the latest deadline if the newcomer's is earlier. Returns whether the newcomer can wait now.
     pub(super) fn displace(&mut self, cx: &mut Context<'_, P>, newcomer: &CallHead, length: usize) -> bool {
         if !self.goes_by_deadline() {
             return false;
@@ -235,7 +234,7 @@ impl<P: Port> Session<P> {
         displaced.is_some()
     }
 
-    /// Gives up on answering a call whose answer could not be kept.
+    /// Closes a call whose answer could not be queued.
     pub fn drop_answer(&mut self, ticket: Ticket) {
         if self.calls.end(ticket) {
             self.wire.link.counters.count(LinkCounter::RepliesDropped);
@@ -251,7 +250,7 @@ impl<P: Port> Session<P> {
         let functions = cx.functions;
         let specs = match functions.lookup(head.slot, head.generation) {
             Ok(function) => function.signature.results(),
-            // The function was replaced while it ran. Its results have the layout of the old signature, which the caller cannot read.
+            // The function was replaced while it ran. The caller cannot decode results of the old signature.
             Err(_) => return self.wire.send_error(cx, head.id, head.priority, true, Error::ResultLost),
         };
         let Ok(length) = block::measure(specs, results) else {
@@ -315,12 +314,12 @@ impl<P: Port> Session<P> {
     }
 }
 
-/// Whether a call has its slots of emergencies: its class alone does not make it one.
+/// Whether a call may use the slots for emergencies: both the call and its function have to be of that class.
 pub(super) fn is_emergency(attributes: &Attributes, priority: Priority) -> bool {
     priority == Priority::Emergency && attributes.priority == Priority::Emergency
 }
 
-/// Puts a call's arguments, and room for its results, into the lent parameters.
+/// Decodes a call's arguments, and reserves capacity for its results, in the lent parameters.
 pub(super) fn read_arguments(
     signature: Signature<'_>,
     block: &[u8],

@@ -1,7 +1,7 @@
-//! What is told of a call beside its results: why it failed, what it tells while it runs, and that its caller has given it up.
+//! Details of a call beside its results: the reason of its failure, its progress, and notice that its caller has given it up.
 //!
-//! Nothing of it is in the way of anything else. A failure loses its values and then its text where they do not fit, and never its
-//! code; progress is sent when nothing waits to be sent, or not at all; a cancellation is heard once, and has no answer but that of its call.
+//! Details never delay anything else. A failure that does not fit loses its values first, then its text, never its code. Progress
+//! is sent only when the send queue is empty. A cancellation is sent once, and acknowledged only by the call's answer.
 
 use super::wire::{Phase, Wire};
 use super::{Event, Results, due};
@@ -24,23 +24,23 @@ use crate::time::Instant;
 /// The details of one link.
 #[derive(Clone, Copy)]
 pub(super) struct OfCalls {
-    /// Calls that run were given up, and the port has yet to be told.
+    /// Running calls were given up, of which the port has not been notified.
     cancelled: bool,
-    /// Those of the failure that came last.
+    /// Details of the failure that was received last.
     failure: Option<Recorded>,
-    /// When progress may be sent again.
+    /// Earliest time for the next progress message.
     progress_due: Instant,
-    /// The port has progress that was not due.
+    /// The port keeps progress that was not sent.
     progress_waits: bool,
 }
 
-/// Where the details of a failure lie.
+/// Where the details of a failure are.
 #[derive(Clone, Copy)]
 struct Recorded {
     message: Span,
     step: u32,
     code: u16,
-    /// The function, where the call waited for its reply.
+    /// The function, if the call waited for its reply.
     function: Option<(Slot, Generation)>,
 }
 
@@ -59,11 +59,11 @@ impl OfCalls {
     }
 }
 
-/// The part, which a build may leave out.
+/// The details of a link; without state in builds that leave them out.
 pub(super) type DetailsPart = State<OfCalls, { DETAILS as usize }>;
 
 impl DetailsPart {
-    /// Changes the details of the link, and with them what is due.
+    /// Changes the state and updates its deadline.
     fn put<P: Port>(&mut self, wire: &mut Wire<P>, change: impl FnOnce(&mut OfCalls)) {
         self.change(change);
         if DETAILS {
@@ -71,7 +71,7 @@ impl DetailsPart {
         }
     }
 
-    /// Text and values of the failure that came last.
+    /// Takes text and values of the failure that was received last.
     pub(super) fn failure<P: Port>(&mut self, wire: &mut Wire<P>, lent: &[u8]) -> Option<Failure> {
         let Recorded { message, code, function, .. } =
             self.get_mut()?.failure.take().filter(|recorded| recorded.step == wire.step)?;
@@ -90,7 +90,7 @@ impl DetailsPart {
         Some(failure)
     }
 
-    /// Before the message is dealt with, since the call is forgotten then.
+    /// Records a failure's details before the message is processed, since that closes the call.
     pub(super) fn note_failure<P: Port>(
         &mut self,
         wire: &Wire<P>,
@@ -110,8 +110,7 @@ impl DetailsPart {
         self.change(|details| details.failure = Some(Recorded { message, step: wire.step, code, function }));
     }
 
-    /// Answers with an error. What exceeds a limit is left out, the values first; so is all but the code where there is no
-    /// room in the stream.
+    /// Answers with an error. Leaves out what exceeds a limit, values first; if the stream is full, all but the code.
     pub(super) fn send_failure<P: Port>(
         wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
@@ -163,7 +162,7 @@ impl DetailsPart {
         sent
     }
 
-    /// Tells the caller of a running call how far it is.
+    /// Sends the progress of a running call to its caller.
     pub(super) fn progress<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -186,7 +185,7 @@ impl DetailsPart {
             return Err(Error::TooLarge { limit });
         }
         if cx.now >= self.progress_due && wire.link.queued() > 0 {
-            // What gathers goes first, and nothing is to wait behind what this sends.
+            // Flush gathered messages first. If anything remains queued, wait: progress must not delay other messages.
             wire.flush(cx);
             if wire.link.queued() > 0 {
                 self.put(wire, |details| details.progress_due = cx.now + PROGRESS_INTERVAL);
@@ -228,8 +227,7 @@ impl DetailsPart {
         reported.filter(|_| is_known).and_then(Details::of).map(|reported| Event::Progress(id, reported))
     }
 
-    /// The peer has given a call up. What it moves ends as if it were released; if it runs, its handler is told; if it has not
-    /// begun, it does not.
+    /// The peer has given a call up: its motion ends as if released. Notifies a running handler; a waiting call will not begin.
     pub(super) fn cancelled<P: Port>(&mut self, wire: &mut Wire<P>, calls: &mut Calls<P::Storage>, cancel: Release) {
         let Release { call, class } = cancel;
         match calls.cancel(class, call) {
@@ -245,7 +243,7 @@ impl DetailsPart {
         }
     }
 
-    /// What the port is to be told, from `Session::poll`.
+    /// Returns a notification for the port; called by `Session::poll`.
     pub(super) fn poll<P: Port>(
         &mut self,
         wire: &mut Wire<P>,

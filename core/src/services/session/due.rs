@@ -1,31 +1,31 @@
-//! When each part of a session has something to do.
+//! Named deadlines, one per part of a session. Their minimum is the session's next wake-up.
 
 use crate::ability::{DETAILS, STREAMS};
 use crate::time::Instant;
 
-/// What has something to do when its time has come. Parts that a build can leave out stand last.
+/// The parts with a deadline. Those that a build can leave out come last.
 #[derive(Clone, Copy)]
 pub(super) enum Part {
     /// A granted lease ends.
     Leases,
     /// A call of this unit times out.
     Calls,
-    /// A release is tried again that the stream had no room for.
+    /// A release is retried that the stream had no capacity for.
     Releases,
-    /// One-way messages have gathered long enough.
+    /// Gathered one-way messages are sent.
     Gathered,
     /// A held lease is renewed.
     Renewals,
     KeepAlive,
-    /// The link gets new keys, or a step of that has taken too long.
+    /// The keys are renewed, or a renewal has timed out.
     Keys,
-    /// A claim is waited for, or a link gives way.
+    /// Waiting for a claim to be stored, or for a link to give way.
     Claims,
-    /// The peer was to be heard.
+    /// The peer should have been heard.
     Liveness,
-    /// A sample follows.
+    /// A sample is sent.
     Streams,
-    /// A handler is told that its call was cancelled, or a caller how far its call is.
+    /// A handler is notified of a cancellation, or a caller of progress.
     Details,
 }
 
@@ -42,7 +42,7 @@ impl Part {
     }
 }
 
-/// One deadline for each part, and the earliest of them.
+/// One deadline per part, and the earliest of them.
 pub(super) struct Due {
     at: [Instant; PARTS],
     next: Instant,
@@ -53,12 +53,12 @@ impl Due {
         Self { at: [Instant::FAR_FUTURE; PARTS], next: Instant::FAR_FUTURE }
     }
 
-    /// The earliest deadline of all.
+    /// The earliest deadline.
     pub(super) const fn next(&self) -> Instant {
         self.next
     }
 
-    /// When a part has something to do.
+    /// The deadline of one part.
     pub(super) fn at(&self, part: Part) -> Instant {
         self.at.get(part.index()).copied().unwrap_or(Instant::FAR_FUTURE)
     }
@@ -78,7 +78,7 @@ impl Due {
         }
     }
 
-    /// A part has something to do no later than at this time.
+    /// Moves a part's deadline forward to `at`, if it is later.
     #[inline(never)]
     pub(super) fn hasten(&mut self, part: Part, at: Instant) {
         self.set(part, self.at(part).min(at));

@@ -1,4 +1,6 @@
-//! Leases that the peer's calls hold on functions of this unit.
+//! Leases that the peer's calls hold on functions of this unit (docs/safety.md): granted with a call, prolonged by renewals,
+//! and ended by a release, a stop or time. The order of steps matters throughout: a safe hook must never stop a motion that
+//! began after it was due.
 
 use super::Event;
 use super::due::Part;
@@ -19,10 +21,10 @@ use crate::services::{Context, Port};
 use crate::storage::take_at;
 use crate::time::{Duration, Instant};
 
-/// Ends of leases that the peer is still to be told. One that finds no place is told when the peer renews it.
+/// Ends of leases that the peer has yet to be notified of. If this is full, the answer to its next renewal notifies it.
 type Ends = heapless::Vec<(u32, LeaseEnd), LEASES>;
 
-/// What calls of the peer move here, and under which claim.
+/// The peer's live orders, and the claim that they are made under.
 pub(super) struct Granting {
     pub(super) granted: heapless::Vec<Granted, LEASES>,
     ends: Ends,
@@ -34,13 +36,13 @@ impl Granting {
         Self { granted: heapless::Vec::new(), ends: Ends::new(), obedience: Obedience::new() }
     }
 
-    /// Whether something waits for room.
+    /// Whether a message waits for send capacity.
     pub(super) fn has_news(&self) -> bool {
         !self.ends.is_empty() || self.obedience.has_news
     }
 
-    /// A call begins the lease of its function, as of when it was made. It takes the place of an earlier call's at once,
-    /// but not that of a lease that is dead: its hook comes first.
+    /// Starts the lease of a call, counted from when the call was made. Replaces the lease of an earlier call of the peer at
+    /// once, unless that lease is dead: then its hook has to run first.
     pub(super) fn grant<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -60,7 +62,7 @@ impl Granting {
         let is_same = |known: &Granted| {
             known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))
         };
-        // It was overtaken on its way, in another class or on the other way: what was asked for last counts.
+        // A later call has begun already: this one was overtaken in another class, or on the other of stream and datagram.
         let moves_it = |slot| {
             let function = cx.functions.function(slot);
             slot == head.slot || function.is_some_and(|function| share_a_lease(service, Some(function.handler)))
@@ -70,8 +72,7 @@ impl Granting {
         }
         let known = self.granted.iter().position(is_same);
         let earlier = known.and_then(|index| self.granted.get(index)).copied();
-        // The safe hook of that lease is still to run, from `poll`. Granting now would let a new motion begin before it, and the hook
-        // would then stop the new one.
+        // That lease's safe hook has yet to run, from `poll`. A grant now would let a motion begin that this hook then stops.
         if earlier.is_some_and(|earlier| earlier.end <= cx.now) {
             return Err(Error::Busy);
         }
@@ -88,11 +89,11 @@ impl Granting {
             under,
             made: head.sent_at,
         };
-        // The service's word is changed before the table here: where it refuses, nothing of this session has changed.
+        // Write the service's lease before the table: if the service refuses, this session is unchanged.
         let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end, &claim)) {
             Ok(order) => order,
             Err(error) => {
-                // A reader has looked later than at `cx.now`, and has stopped the motion.
+                // A reader checked the lease with a later clock than `cx.now`, and has stopped the motion.
                 if let Some(index) = known.filter(|_| error == Error::Busy) {
                     self.cut_lease(wire, cx, index);
                 }
@@ -113,7 +114,7 @@ impl Granting {
         Ok(order)
     }
 
-    /// The caller still wants a call: its lease goes on, as of when the renewal was made.
+    /// Prolongs the lease of a call, counted from when the renewal was made.
     pub(super) fn renewed<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -123,7 +124,7 @@ impl Granting {
     ) {
         let Some(index) = self.granted.iter().position(|granted| granted.call == renewal.call) else {
             wire.link.counters.count(LinkCounter::RenewalsIgnored);
-            // A call that is on its way or waits for its turn has no lease yet.
+            // A call that is in flight or queued has no lease yet.
             let Renewal { call, class, .. } = *renewal;
             if calls.has_arrived(class, call) && !calls.is_waiting(class, call) {
                 self.notify_end(wire, cx, call, LeaseEnd::Expired);
@@ -131,7 +132,7 @@ impl Granting {
             return;
         };
         let Some(granted) = self.granted.get(index).copied() else { return };
-        // A function that has been replaced since started it, and nothing of it is prolonged.
+        // The call started a function that has been replaced since: do not prolong it.
         if cx.functions.lookup(granted.slot, granted.generation).is_err() {
             wire.link.counters.count(LinkCounter::RenewalsIgnored);
             return;
@@ -139,7 +140,7 @@ impl Granting {
         let Some(sent_at) = sent_at_earliest(cx.now, renewal.stamp, renewal.since) else { return };
         let wanted_at = Instant::from_micros(sent_at.as_micros().saturating_sub(renewal.age.as_micros()));
         let end = Lease::seen_end(wanted_at + granted.length);
-        // What was late on its way takes nothing away from what came before it, and revives nothing.
+        // A late renewal shortens nothing that an earlier one granted, and revives no dead lease.
         if end > granted.end && granted.end > cx.now {
             self.prolong(wire, cx, index, end);
         }
@@ -151,13 +152,12 @@ impl Granting {
         if service.is_some_and(|service| granted.order.is_none_or(|order| service.renew_lease(order, end))) {
             granted.end = end;
         } else {
-            // A reader has looked later than at `cx.now`, a call of another peer has taken the lease over, or the service is
-            // gone.
+            // A reader checked the lease with a later clock, a call of another peer has taken it over, or the service is gone.
             self.cut_lease(wire, cx, index);
         }
     }
 
-    /// The application has finished what an order of this lease started. `false` where no call of this peer has that order.
+    /// The application has finished what an order started. Returns `false` if no call of this peer has that order.
     pub(super) fn end_order<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -165,7 +165,7 @@ impl Granting {
         lease: &Lease,
         order: Order,
     ) -> bool {
-        // Not the function's newest one: it may have begun after the application saw that this one is done.
+        // Compare with this order, not the newest: another may have begun after the application saw that this one was done.
         let is_meant = |granted: &Granted| {
             granted.order == Some(order) && lease_of(cx, granted).is_some_and(|word| core::ptr::eq(word, lease))
         };
@@ -179,24 +179,24 @@ impl Granting {
         is_finished
     }
 
-    /// A call has failed here: the lease that it holds, if it does, expires at once.
+    /// Ends the lease of a call that has failed here, if it holds one.
     pub(super) fn cut_call<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, call: u32) {
         if let Some(index) = self.granted.iter().position(|granted| granted.call == call) {
             self.cut_lease(wire, cx, index);
         }
     }
 
-    /// A function that stops was called: what it stops is dead before its handler runs, and calls that were made before it
-    /// begin no more, on any link.
+    /// Executes a stop: ends the orders that it covers before its handler runs, and keeps calls that were made before it from
+    /// beginning, on any link.
     #[inline(never)]
     pub(super) fn stop_orders<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, header: &RequestHeader) {
         let latch = Latch { by: wire.identity().map_or(0, Identity::id), reason: 0 };
         let charge = service_of(cx, header.slot, header.generation).and_then(Service::lease);
-        // Before the services, which may be locked: another thread may add one now.
+        // Inhibit the unit before its services, whose locks may be held: another thread may add a service now.
         if charge.is_none() {
             cx.functions.stopped().inhibit(cx.now, latch);
         }
-        // The words of all first: a port may wait for one of its locks, behind which what stops is dead already.
+        // Write all leases first, which takes no lock: a port may wait for a service's lock below, when all motion has ended.
         Self::each_moved_by(cx, charge, &mut |service| {
             if let Some(lease) = service.lease() {
                 lease.inhibit(cx.now, latch);
@@ -209,15 +209,15 @@ impl Granting {
         wire.publishing.actuators_due = true;
     }
 
-    /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
-    /// call was made, which is [`Error::Inhibited`].
+    /// Executes a reset, whose handler has returned results. Fails with [`Error::Inhibited`] if the actuator was stopped again
+    /// after the reset was requested.
     #[inline(never)]
     pub(super) fn reset_orders<P: Port>(
         wire: &mut Wire<P>,
         cx: &Context<'_, P>,
         head: &RunningCall,
     ) -> Result<(), Error> {
-        // Its caller has been told that it failed, and may not know that anything may move again.
+        // The caller has seen the reset fail, and does not expect anything to move.
         if head.deadline <= cx.now || head.cancelled != Cancelled::No {
             return Err(Error::Expired);
         }
@@ -229,18 +229,17 @@ impl Granting {
             latched = latched.or_else(|| service.lease().and_then(Lease::latch));
         });
         Self::each_moved_by(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
-        // A stop of all has ended as well once each that it has stopped is reset.
+        // Resetting each stopped actuator ends a stop of all, too.
         if charge.is_none() || !any {
             cx.functions.stopped().reset(cx.now, head.sent_at);
         }
         latched.map_or(Ok(()), |latch| Err(latch.into()))
     }
 
-    /// The leased services that move what a function has in its charge: its own actuator, or all. One piece of code whatever
-    /// is done with them.
+    /// Calls `act` for each leased service that a stop or reset covers: those of its actuator, or all. Not generic, to save code.
     #[inline(never)]
     fn each_moved_by<P: Port>(cx: &Context<'_, P>, charge: Option<&Lease>, act: &mut dyn FnMut(&dyn Service)) {
-        // Also what this peer has not been shown.
+        // Including functions that this peer cannot see.
         for function in (0..cx.functions.places()).filter_map(|place| cx.functions.function(Slot(place))) {
             let lease = function.handler.lease();
             let is_meant = charge.is_none() || charge.zip(lease).is_some_and(|(one, other)| core::ptr::eq(one, other));
@@ -250,7 +249,7 @@ impl Granting {
         }
     }
 
-    /// The number that the functions of this unit which move the same thing have in common; 0 for one that shares nothing.
+    /// The number by which functions of this unit name the actuator that they share; 0 for a function that shares none.
     pub(super) fn actuator_of<P: Port>(wire: &Wire<P>, cx: &Context<'_, P>, service: &dyn Service) -> u8 {
         let shares = |slot: &Slot| {
             let function = cx.functions.function(*slot);
@@ -261,7 +260,7 @@ impl Granting {
         first.and_then(|first| u8::try_from(first.0.saturating_add(1)).ok()).unwrap_or(0)
     }
 
-    /// Ends the leases of services that are gone: their callers are told.
+    /// Ends the leases of services that were removed, and notifies their callers.
     pub(super) fn cut_gone<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         for index in 0..self.granted.len() {
             let granted = self.granted.get(index);
@@ -271,7 +270,7 @@ impl Granting {
         }
     }
 
-    /// Ends the leases that the peer may not hold any more.
+    /// Ends the leases that the access table no longer allows.
     pub(super) fn cut_forbidden<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         for index in 0..self.granted.len() {
             let Some(slot) = self.granted.get(index).map(|granted| granted.slot) else { return };
@@ -281,7 +280,7 @@ impl Granting {
         }
     }
 
-    /// Lets a lease expire at once.
+    /// Makes a lease expire now.
     pub(super) fn cut_lease<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, index: usize) {
         let Some(granted) = self.granted.get_mut(index) else { return };
         granted.end = cx.now;
@@ -292,8 +291,8 @@ impl Granting {
         }
     }
 
-    /// The caller gave up a call: its lease ends now, and its hook runs as if it had expired. If it waits for its turn, or is still on its
-    /// way, it does not begin.
+    /// Ends the lease of a call that its caller gave up; its hook runs as if it had expired. A call that is queued or still in
+    /// flight will not begin.
     pub(super) fn released<P: Port>(
         &mut self,
         calls: &mut Calls<P::Storage>,
@@ -305,7 +304,7 @@ impl Granting {
         self.end_released(cx, |granted| granted.call == call)
     }
 
-    /// The same for all calls of a function up to `id`.
+    /// The same for all calls of a function with ids up to `id`.
     pub(super) fn released_all<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -325,12 +324,12 @@ impl Granting {
     ) -> Option<Event> {
         let index = self.granted.iter().position(is_released);
         let granted = index.and_then(|index| take_at(&mut self.granted, index))?;
-        // What was dead before is not told as given up.
+        // If the lease had ended before, report that end and not the release.
         let how = if is_live(cx, &granted) { LeaseEnd::Released } else { how_it_died(cx, &granted) };
         if expire_granted(cx, &granted, how) { Some(Event::LeaseExpired(granted.slot)) } else { None }
     }
 
-    /// Whether a function stops what is dead and not yet safe, whichever link moved it: its handler waits for the hook.
+    /// Whether a stop covers a dead order whose safe hook has not run, of any link: then its handler waits for the hook.
     #[inline(never)]
     pub(super) fn awaits_hook<P: Port>(cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
         let mut awaits = false;
@@ -341,19 +340,19 @@ impl Granting {
         awaits
     }
 
-    /// No order of the peer is live, nothing is stopping, and no hook is due.
+    /// Whether the peer has no live order, nothing is stopping, and no hook is due.
     pub(super) fn is_quiet<P: Port>(&self, wire: &Wire<P>, cx: &Context<'_, P>) -> bool {
         let is_busy = |lease: &Lease| lease.awaits_hook() || lease.stage(cx.now) == Stage::Stopping;
         let functions = wire.publishing.all_slots().filter_map(|slot| cx.functions.function(slot));
         self.granted.is_empty() && !functions.filter_map(|function| function.handler.lease()).any(is_busy)
     }
 
-    /// Whether what a call of the peer moves was stopped: by the vehicle itself, or through another link.
+    /// Whether an order of the peer was stopped by the vehicle itself, or through another link.
     pub(super) fn was_stopped<P: Port>(&self, cx: &Context<'_, P>) -> bool {
         self.granted.iter().any(|granted| is_dead(cx, granted))
     }
 
-    /// Ends a lease that is due; its function, whose hook is to run.
+    /// Removes one lease that has ended; returns its function if the safe hook has to run.
     pub(super) fn expire_lease<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<Slot> {
         loop {
             let due = |granted: &Granted| granted.end <= cx.now || is_dead(cx, granted);
@@ -380,7 +379,7 @@ impl Granting {
         }
     }
 
-    /// Tells the peer of ends that there was no room for.
+    /// Notifies the peer of ends that waited for send capacity.
     pub(super) fn send_ends<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         while let Some(&(call, why)) = self.ends.last()
             && wire.send_control(cx, &Control::LeaseEnded { call, why })
@@ -394,7 +393,7 @@ fn lease_of<'c, P: Port>(cx: &Context<'c, P>, granted: &Granted) -> Option<&'c L
     service_of(cx, granted.slot, granted.generation).and_then(Service::lease)
 }
 
-/// Whether an order has been ended by others than its link, and its safe hook is due.
+/// Whether an order was ended other than by its link, and its safe hook is due.
 fn is_dead<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
     lease_of(cx, granted).zip(granted.order).is_some_and(|(lease, order)| lease.is_cut(order))
 }
@@ -403,13 +402,13 @@ fn is_live<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
     granted.end > cx.now && !is_dead(cx, granted)
 }
 
-/// How an order has ended that its caller had not given up.
+/// How an order ended that its caller had not given up.
 fn how_it_died<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> LeaseEnd {
     let is_inhibited = lease_of(cx, granted).is_some_and(Lease::is_inhibited);
     if is_inhibited { LeaseEnd::Stopped } else { LeaseEnd::Expired }
 }
 
-/// Whether two services move the same thing.
+/// Whether two services move the same actuator.
 fn share_a_lease(one: Option<&dyn Service>, other: Option<&dyn Service>) -> bool {
     let leases = one.and_then(Service::lease).zip(other.and_then(Service::lease));
     leases.is_some_and(|(one, other)| core::ptr::eq(one, other))
@@ -419,8 +418,8 @@ fn service_of<'c, P: Port>(cx: &Context<'c, P>, slot: Slot, generation: Generati
     cx.functions.lookup(slot, generation).ok().map(|function| function.handler)
 }
 
-/// Whether the safe hook is to run: not when a call of another peer holds the lease now, whose motion goes on, and not when
-/// the service is gone, with which its hook has run.
+/// Ends an order; returns whether the safe hook has to run. Not if a call of another peer has taken over the lease, since its
+/// motion continues, nor if the service was removed, since its hook ran then.
 pub(super) fn expire_granted<P: Port>(cx: &Context<'_, P>, granted: &Granted, how: LeaseEnd) -> bool {
     let service = service_of(cx, granted.slot, granted.generation);
     service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(cx.now, order, how)))

@@ -1,7 +1,7 @@
-//! Leases that calls of this unit hold at the peer.
+//! Leases that this unit's calls hold at the peer: renewed while somebody wants the motion, then released (docs/safety.md).
 //!
-//! A call *holds* a lease as long as this unit renews it. It is *released* when the peer is told that the call is not
-//! wanted, wherever it is: when it has failed, and when its caller *cancels* it.
+//! A call *holds* a lease while this unit renews it. It is *released* when it fails or its caller *cancels* it: the peer is
+//! notified, whether the call is in flight, queued or running there. A release is retried until the stream has taken it.
 
 use super::due::Part;
 use super::wire::{Phase, Wire};
@@ -20,20 +20,20 @@ use crate::services::{Context, Port};
 use crate::storage::take_at;
 use crate::time::{Duration, Instant};
 
-/// A held lease is renewed this often within its length, so that lost renewals do not end it.
+/// Renewals per length of a lease: a few lost ones do not end it.
 const RENEWALS_PER_LEASE: u64 = 4;
-/// A heart beats so often within the length of a lease at least.
+/// Least number of beats of a heart in the length of a lease.
 const BEATS_PER_LEASE: u64 = 2;
-/// Renewals of a lease are so far apart at least, as those of one of 20 ms. A shorter one, which a peer may publish, ends
-/// before it is renewed: its renewals would fill the network.
+/// Least interval between renewals, as for a lease of 20 ms. A peer may publish a shorter lease, whose renewals would flood the
+/// network: it ends before it is renewed.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(5);
-/// After this a release that the stream had no room for is tried again, if the stream has not become writable before.
+/// When a release is retried that the stream had no capacity for, unless the stream becomes writable earlier.
 const RETRY: Duration = Duration::from_millis(20);
 
-/// Releases of whole functions that are still to be sent in the stream: the function, and the newest call.
+/// Releases of whole functions that are not in the stream yet: the function, and the newest call that is released.
 type Releases = heapless::Vec<(Slot, CallId), LEASES>;
 
-/// Calls of leased functions that the peer has answered and not ended: by this they are released, renewed or not.
+/// Answered calls of leased functions whose lease the peer has not ended. Needed to release them, whether renewed or not.
 type Answered = heapless::Vec<AnsweredCall, LEASES>;
 
 #[derive(Clone, Copy)]
@@ -47,13 +47,13 @@ fn between_renewals(lease: Duration) -> Duration {
     lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_INTERVAL)
 }
 
-/// Calls of this unit to the peer: those that wait for a reply, and the leases that they hold there.
+/// This unit's calls to the peer: those that wait for a reply, and the leases that they hold there.
 pub(super) struct Calling<P: Port> {
     pub(super) requests: Requests<P::Storage>,
     pub(super) held: heapless::Vec<Held, LEASES>,
     answered: Answered,
     releases: Releases,
-    /// The newest call that was to move something.
+    /// The newest call of a function with a lease.
     pub(super) last_order: Option<(Slot, CallId)>,
 }
 
@@ -68,7 +68,7 @@ impl<P: Port> Calling<P> {
         }
     }
 
-    /// Ends one call whose deadline has passed.
+    /// Times out one call whose deadline has passed.
     pub(super) fn expire_call(&mut self, wire: &mut Wire<P>, now: Instant) -> Option<Pending> {
         let expired = self.requests.expire(now);
         if expired.is_none() {
@@ -77,19 +77,19 @@ impl<P: Port> Calling<P> {
         expired
     }
 
-    /// Whether this unit renews the lease of a call.
+    /// Whether this unit is renewing the lease of a call.
     pub(super) fn holds(&self, call: CallId) -> bool {
         self.held.iter().any(|held| held.call == call && held.is_renewed())
     }
 
-    /// How long the leases that calls of a function hold last; `None` where none is renewed.
+    /// How much of a function's leases is left, counted from the last answer to a renewal; `None` if none is renewed.
     pub(super) fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
         let of_slot = self.held.iter().filter(|held| held.slot == slot && held.is_renewed());
         of_slot.map(|held| (held.answered + held.length()).since(now)).max()
     }
 
-    /// Whether a call of a function could be renewed. [`Error::Full`] when there is no room, and no earlier call of the same
-    /// function and of the same origin that would give way; [`Error::SlowHeart`] for one that would let the lease end between two beats.
+    /// Whether a call of this function could be renewed. [`Error::Full`] if the table is full and has no earlier call of the
+    /// same function and origin to replace; [`Error::SlowHeart`] if the heart's period is longer than half of the lease.
     pub(super) fn check_held(&self, lease: Duration, options: &RequestOptions, slot: Slot) -> Result<(), Error> {
         let slowest = lease.divided_by(BEATS_PER_LEASE);
         if let Renew::Heart(beats) = options.renew
@@ -102,14 +102,14 @@ impl<P: Port> Calling<P> {
         if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
     }
 
-    /// An operator's calls and the program's do not give way to each other.
+    /// The oldest renewed call of a function. An operator's calls and the program's do not replace each other.
     fn oldest_held(&self, slot: Slot, operator: bool) -> Option<usize> {
         let is_same = |held: &Held| held.slot == slot && held.operator == operator && held.is_renewed();
         let of_slot = self.held.iter().enumerate().filter(|(_, held)| is_same(held));
         of_slot.min_by_key(|(_, held)| held.call).map(|(index, _)| index)
     }
 
-    /// Renews the lease that a call has begun, or will begin, from here on.
+    /// Renews the lease of a call from now on; the call itself may not have begun.
     pub(super) fn hold_lease(
         &mut self,
         wire: &mut Wire<P>,
@@ -119,7 +119,7 @@ impl<P: Port> Calling<P> {
         lease: Duration,
         renew: Renew,
     ) {
-        // Not refused: the new call may be the one that stops what the earlier ones started, whose leases it takes over.
+        // Replace the oldest and do not refuse: the new call may be one that stops what the earlier calls started.
         if self.held.is_full()
             && let Some(oldest) = self.oldest_held(header.slot, header.operator)
         {
@@ -133,8 +133,8 @@ impl<P: Port> Calling<P> {
         wire.due.hasten(Part::Renewals, next);
     }
 
-    /// Renews what is due. What the peer has not answered for the length of a lease is not renewed blindly: it is released,
-    /// and returned, one at a time.
+    /// Sends the renewals that are due. A lease whose renewals the peer has not answered for the length of the lease is
+    /// released instead, and returned, one in each call.
     pub(super) fn renew_leases(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<Event> {
         let (stamp, since) = wire.clock.stamp(cx.now);
         let now = cx.now;
@@ -149,11 +149,11 @@ impl<P: Port> Calling<P> {
                 return Some(Event::LeaseEnded { call, slot, why: LeaseEnd::Unanswered });
             }
             held.next = now + between_renewals(length);
-            // A heart that does not beat renews nothing. Whether it is too late when it beats again is for the peer to say.
+            // A heart that has not beaten within the lease renews nothing. The peer decides whether a later beat is too late.
             let Some(age) = held.renew.age(now).filter(|age| *age < length) else { continue };
             let renewal = Renewal { call: held.call.0, class: held.class, stamp, since, age };
             let body = SessionBody::renewal(&renewal);
-            // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
+            // By datagram and in the stream: neither a lost datagram nor a retransmission in the stream may stop a vehicle.
             wire.send_datagram(cx, &body, &[]);
             wire.link.send_frame(&Frame::Session(&body));
         }
@@ -163,14 +163,14 @@ impl<P: Port> Calling<P> {
         None
     }
 
-    /// The peer has answered a renewal.
+    /// Notes an answer to a renewal.
     pub(super) fn was_renewed(&mut self, now: Instant, call: CallId) {
         if let Some(held) = self.held.iter_mut().find(|held| held.call == call) {
             held.answered = now;
         }
     }
 
-    /// A heart has stopped: what names it is released.
+    /// A heart has stopped: releases the calls that name it.
     pub(super) fn release_beats(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, beats: Beats) {
         let of_it = |held: &&Held| held.renew == Renew::Heart(beats) && held.is_renewed();
         while let Some(call) = self.held.iter().find(of_it).map(|held| held.call) {
@@ -178,10 +178,10 @@ impl<P: Port> Calling<P> {
         }
     }
 
-    /// The peer has answered a call with results.
+    /// Notes that the peer has answered a call with results.
     pub(super) fn note_answered(&mut self, pending: &Pending) {
         let Pending { id: call, slot, leased: Some(class), .. } = *pending else { return };
-        // The peer says of each one when it has ended, and of more than there is room for it has refused some.
+        // The peer reports the end of each lease, and refuses calls beyond its own table, so the oldest entry is obsolete.
         if self.answered.is_full() {
             let oldest = self.answered.iter().enumerate().min_by_key(|(_, known)| known.call);
             oldest.map(|(index, _)| index).and_then(|index| take_at(&mut self.answered, index));
@@ -195,18 +195,18 @@ impl<P: Port> Calling<P> {
         take_at(&mut self.answered, index)
     }
 
-    /// The peer has ended the lease of a call.
+    /// Forgets a call whose lease the peer has ended.
     pub(super) fn stop_renewing(&mut self, call: CallId) -> Option<Held> {
         self.take_answered(call);
         let index = self.held.iter().position(|held| held.call == call && held.is_renewed())?;
         take_at(&mut self.held, index)
     }
 
-    /// The caller does not want a call any more.
+    /// Gives a call up for its caller.
     pub(super) fn cancel(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId) {
         let pending = self.requests.close(id);
         if let Some(pending) = &pending {
-            // Its caller may have noticed the time-out before this session was polled.
+            // The caller may have noticed the time-out before this session was polled.
             let is_late = pending.deadline <= cx.now;
             let counter = if is_late { LinkCounter::CallsTimedOut } else { LinkCounter::CallsCancelled };
             wire.link.counters.count(counter);
@@ -215,21 +215,20 @@ impl<P: Port> Calling<P> {
         self.release_call(wire, cx, id, pending);
     }
 
-    /// As [`cancel`](Self::cancel), but the call stays open for its answer.
+    /// As [`cancel`](Self::cancel), but leaves the call open for its answer.
     pub(super) fn cancel_but_wait(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId) {
         let Some(&pending) = self.requests.waiting_for(id) else { return };
         Self::send_cancel(wire, cx, &pending);
         if let Some(class) = pending.leased {
-            // Not tried again: the cancellation releases as well, and nothing is renewed from here on.
+            // Need not be retried: the cancellation releases as well, and no renewal follows.
             self.stop_renewing(id);
             Self::send_release(wire, cx, id, class);
         }
     }
 
-    /// The peer is told that a call has no caller any more. In the stream alone, and at most once: what such a call moves is
-    /// released as well, which is not lost.
+    /// Tells the peer that a call has no caller any more. Sent once, in the stream only: the release ends motion, and is retried.
     pub(super) fn send_cancel(wire: &mut Wire<P>, cx: &mut Context<'_, P>, pending: &Pending) {
-        // A stop is not taken back: its handler runs, however late it comes.
+        // A stop cannot be withdrawn: its handler runs, however late.
         let stops = wire.theirs.function(pending.slot).is_some_and(|function| function.attributes.stop);
         if DETAILS && wire.phase == Phase::Live && !stops {
             let body = SessionBody::cancel(&Release { call: pending.id.0, class: pending.class });
@@ -238,7 +237,7 @@ impl<P: Port> Calling<P> {
         }
     }
 
-    /// Releases a call that has failed or was cancelled. `pending` is what was known of it while it waited for its reply.
+    /// Releases a call that has failed or was cancelled. `pending` is its entry, if it was still waiting for its reply.
     pub(super) fn release_call(
         &mut self,
         wire: &mut Wire<P>,
@@ -251,11 +250,11 @@ impl<P: Port> Calling<P> {
         let waited = pending.and_then(|pending| pending.leased);
         let class = held.map(|held| held.class).or(waited).or(answered.map(|known| known.class));
         let Some(class) = class else { return };
-        // A link that is not live needs no release: the callee ends all leases of the link by itself.
+        // If the link is not live, no release is needed: the callee ends all leases of a link that it loses.
         if wire.phase != Phase::Live || Self::send_release(wire, cx, id, class) {
             return;
         }
-        // Kept in the place that the call had: a release that is lost would let the vehicle drive on to the end of its lease.
+        // Keep the release for a retry in the slot that the call had: without it the motion would last as long as the lease.
         match (pending, held) {
             (Some(pending), _) => self.requests.keep_unsent_release(pending),
             (None, Some(held)) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
@@ -269,7 +268,7 @@ impl<P: Port> Calling<P> {
         if wire.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        // Renewals stop first, whether or not the peer can be told: at the latest the lease's end stops what runs.
+        // Stop renewing first, whether or not the release can be sent: what runs ends with its lease at the latest.
         self.held.retain(|held| held.slot != slot || !held.is_renewed());
         let newest = self.requests.newest();
         if Self::send_release_all(wire, cx, slot, newest) {
@@ -279,7 +278,7 @@ impl<P: Port> Calling<P> {
         self.keep_release(slot, newest)
     }
 
-    /// Calls of a function up to this one are still to be released in the stream.
+    /// Keeps a release of a function's calls up to this one for a retry.
     fn keep_release(&mut self, slot: Slot, newest: CallId) -> Result<(), Error> {
         match self.releases.iter_mut().find(|(known, _)| *known == slot) {
             Some((_, id)) => *id = newest.max(*id),
@@ -288,7 +287,7 @@ impl<P: Port> Calling<P> {
         Ok(())
     }
 
-    /// Sends the releases that there was no room for, as far as there is now.
+    /// Retries the releases that the stream had no capacity for.
     pub(super) fn send_releases(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         if wire.due.at(Part::Releases) == Instant::FAR_FUTURE {
             return;
@@ -323,7 +322,7 @@ impl<P: Port> Calling<P> {
         Self::send_both_ways(wire, cx, &SessionBody::release_all(slot, id.0))
     }
 
-    /// As a datagram and in the stream; `false` when the stream has no room.
+    /// Sends a body by datagram and in the stream; `false` if the stream has no capacity.
     fn send_both_ways(wire: &mut Wire<P>, cx: &mut Context<'_, P>, body: &[u8]) -> bool {
         wire.send_datagram(cx, body, &[]);
         let kept = wire.link.send_frame(&Frame::Session(body));

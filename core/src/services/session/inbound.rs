@@ -1,4 +1,4 @@
-//! The way up: bytes become frames, frames messages, messages events.
+//! The receive path: bytes become frames, frames messages, messages events.
 
 use super::answering::{is_emergency, read_arguments};
 use super::details::DetailsPart;
@@ -30,7 +30,7 @@ use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
 use crate::storage::LEFT_BY_WAITING;
 
-/// On which of the two ways between two units something came.
+/// How something reached this unit.
 #[derive(Clone, Copy)]
 enum Way {
     Stream,
@@ -40,25 +40,25 @@ enum Way {
 /// Result of [`Session::receive`].
 #[derive(Clone, Copy, Debug)]
 pub struct Receipt {
-    /// How many of the lent bytes are used up.
+    /// How many of the lent bytes were consumed.
     pub consumed: usize,
-    /// What they led to.
+    /// The event that they caused.
     pub event: Option<Event>,
-    /// The rest is to be offered again later: no message buffer is free, or the hub has not decided yet.
+    /// Offer the rest again later: no message buffer is free, or the hub has not decided about the peer yet.
     pub paused: bool,
 }
 
-/// Where the results of a call lie until the session next receives; [`Session::results`] shows them.
+/// Where a call's results are, until the next [`Session::receive`]; [`Session::results`] reads them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Results {
     pub(super) slot: Slot,
     pub(super) generation: Generation,
     pub(super) block: Span,
-    /// Refuses those of an earlier [`receive`](Session::receive), whose place may hold other bytes by now.
+    /// Detects that the session has received since: other bytes may lie there by now.
     pub(super) step: u32,
 }
 
-/// The results of a call, still in the buffer that they came in.
+/// The results of a call, still in the receive buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct ReplyBlock<'b> {
     pub(super) signature: Signature<'b>,
@@ -84,8 +84,8 @@ impl<'b> ReplyBlock<'b> {
         self.signature
     }
 
-    /// Bytes of a `Parameters` that holds all of its values. What lists hold is not known from the signature: it is no more than
-    /// the block.
+    /// Capacity in bytes of a `Parameters` that holds all values. The signature does not say how long lists are, but together
+    /// they are no longer than the block.
     pub fn parameters_bytes(&self) -> u32 {
         let block = u32::try_from(self.bytes.len()).unwrap_or(u32::MAX);
         self.specs.parameters_bytes().saturating_add(block)
@@ -97,16 +97,16 @@ impl<'b> ReplyBlock<'b> {
     }
 }
 
-/// Longest block of an emergency, whose message has its header as well.
+/// Longest block of an emergency request: the message has a header, too.
 const EMERGENCY_BLOCK_BYTES: u32 = (EMERGENCY_BYTES - REQUEST_BYTES) as u32;
 
 impl<P: Port> Session<P> {
-    /// Takes bytes that the port has read from the stream. Call it again with the rest, and finally with nothing, until
+    /// Takes bytes that the port has read from the stream. Call it again with the rest, and finally with an empty slice, until
     /// it consumes nothing and returns no event.
     ///
-    /// The arguments of a call that may run at once are put into `arguments`; without them, or when more bytes follow
-    /// that must be looked at first, the call waits for [`next_call`](Self::next_call). Nothing that follows comes before
-    /// an emergency, and one alone has a place to wait: it begins at once.
+    /// Arguments of a call that may begin at once are decoded into `arguments`. Without them, or if more bytes follow that have
+    /// to be examined first, the call is queued for [`next_call`](Self::next_call). An emergency begins at once: nothing behind
+    /// it can have precedence.
     pub fn receive(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -116,7 +116,7 @@ impl<P: Port> Session<P> {
         self.wire.step = self.wire.step.wrapping_add(1);
         match self.wire.phase {
             Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
-            // What follows the hello is not looked at before the hub has decided: a request of a peer that is refused must not run.
+            // Read nothing after the hello until the hub has decided: a request of a peer that it refuses must not run.
             Phase::Deciding => {
                 return Receipt { consumed: 0, event: None, paused: true };
             }
@@ -126,7 +126,7 @@ impl<P: Port> Session<P> {
             Ok(received) => received,
             Err(reason) => {
                 match self.wire.phase {
-                    // All that can go wrong before the proof looks the same from outside, so that nothing is learned from the reason.
+                    // All failures before the proof look the same from outside, so that an attacker learns nothing from them.
                     Phase::Proving { .. } => self.wire.fail(cx),
                     _ => self.wire.close(cx, reason),
                 }
@@ -137,20 +137,19 @@ impl<P: Port> Session<P> {
         let Some(inbound) = received.inbound else {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
-        // What a later version says shows no life that this one understands; of a session body it is known once it is read.
+        // A frame of a later version is no sign of life, since this unit cannot read it; a session body is judged once decoded.
         if !matches!(inbound, Inbound::Skipped | Inbound::Session(_)) {
             self.wire.heard(cx.now);
         }
         let is_emergency = matches!(inbound, Inbound::Message(Priority::Emergency, _));
-        // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
-        // in the same bytes is reached first.
+        // Begin a call only if no bytes follow it, else queue it: an emergency further back in these bytes comes first.
         let at_once = is_emergency || received.consumed == lent.len();
         let event = self.digest(cx, inbound, lent, arguments.filter(|_| at_once));
         Receipt { consumed: received.consumed, event, paused: received.paused }
     }
 
-    /// Takes the body of a datagram that is [for the session](datagram::for_session) of this link, with the nonce that it names.
-    /// It is opened where it is; one of another session is dropped, and counted.
+    /// Takes the body of a datagram that is [for the session](datagram::for_session) of this link, and the nonce in its header.
+    /// Decrypts it in place; one of another session is dropped and counted.
     pub fn datagram(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -158,7 +157,7 @@ impl<P: Port> Session<P> {
         nonce: u64,
         body: &mut [u8],
     ) -> Option<Event> {
-        // Under a seal the nonce and the seal tell whose it is, and its source may be another address of the host, or a NAT's.
+        // In secured mode nonce and seal identify the sender: its source may be another address of that host, or a NAT's.
         let is_of_peer = self.wire.mode() == Mode::Secured || from.is_of_host(&self.wire.peer_address);
         if self.wire.phase != Phase::Live || nonce != self.wire.nonce || !is_of_peer {
             self.wire.link.counters.count(LinkCounter::DatagramsDropped);
@@ -178,14 +177,13 @@ impl<P: Port> Session<P> {
         self.session_body(cx, Span::lent(body.len()), body, Way::Datagram)
     }
 
-    /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
-    /// [`Error::ResultLost`] when the peer has replaced the function, or the session has received since then.
+    /// The results that an [`Event::Reply`] refers to; `lent` is the slice lent to the [`receive`](Self::receive) that returned
+    /// it. [`Error::ResultLost`] if the peer has replaced the function, or the session has received since.
     pub fn results<'b>(&'b self, results: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
         self.wire.results(results, lent)
     }
 
-    /// Results that were copied from a [`ReplyBlock`] for a caller that reads them later; [`Error::ResultLost`] where the function
-    /// was changed meanwhile.
+    /// Reads results that the port has copied from a [`ReplyBlock`]; [`Error::ResultLost`] if the function has changed since.
     pub fn kept_results<'b>(
         &'b self,
         slot: Slot,
@@ -195,13 +193,14 @@ impl<P: Port> Session<P> {
         self.wire.kept_results(slot, generation, bytes)
     }
 
-    /// What an [`Event::Progress`] tells, as [`results`](Self::results) shows the results of a call.
+    /// The values of an [`Event::Progress`], read as [`results`](Self::results) reads results.
     pub fn progress_values<'b>(&'b self, values: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
         self.wire.progress(values, lent)
     }
 
-    /// Text and values of the failure that an [`Event::Reply`] or [`Event::Failed`] has just told; `None` where it has none.
-    /// Values come with replies alone. `lent` is what was lent to the [`receive`](Self::receive) that returned the event.
+    /// Text and values of the failure that the last event, an [`Event::Reply`] or [`Event::Failed`], reported; `None` if the
+    /// Text and values of the failure in the last event, an [`Event::Reply`] or [`Event::Failed`]; `None` if the peer sent none.
+    /// Only replies carry values. `lent` is the slice lent to the [`receive`](Self::receive) that returned the event.
     pub fn failure(&mut self, lent: &[u8]) -> Option<Failure> {
         self.details.failure(&mut self.wire, lent)
     }
@@ -214,7 +213,7 @@ impl<P: Port> Session<P> {
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
         match (inbound, self.wire.phase) {
-            // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
+            // Before encryption anyone on the path can send this: do not take it for the peer's decision, and go on searching.
             (Inbound::Refuse(_), _) if !self.wire.link.cipher().is_sealing() => {
                 proving::ended_in_clear(&mut self.wire, None);
                 None
@@ -235,7 +234,7 @@ impl<P: Port> Session<P> {
                 if proving::hello_arrived(&mut self.wire, cx, until, span, lent) { self.consult(cx) } else { None }
             }
             (Inbound::Proof(span), Phase::Proving { .. }) => {
-                // The peer reads the list once it has decided to take this unit.
+                // Publish now; the peer processes the list once it has admitted this unit.
                 if proving::proof_arrived(&mut self.wire, cx, span, lent) {
                     self.publish(cx);
                 }
@@ -254,7 +253,7 @@ impl<P: Port> Session<P> {
             (Inbound::Confirm(span), Phase::Live) if P::RENEWS_KEYS => {
                 self.renewal.confirmation_arrived(&mut self.wire, cx, span, lent)
             }
-            // Answered in the stream as well: only a reply that has passed the same queue shows that the stream moves.
+            // Answer in the stream, too: only a reply that has passed the send queue shows that the stream makes progress.
             (Inbound::Ping, Phase::Live) => {
                 self.wire.link.send_frame(&Frame::Pong);
                 self.wire.flush(cx);
@@ -279,14 +278,14 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Does what a session body says, which shows life if it can be read.
+    /// Processes a session body. One that can be decoded is a sign of life.
     fn session_body(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8], way: Way) -> Option<Event> {
         let body = SessionBody::decode(self.wire.link.view(span, lent));
         if body.is_some() {
             match way {
                 Way::Stream => self.wire.liveness.heard(cx.now),
                 Way::Datagram if self.wire.liveness.heard_datagram(cx.now) => {
-                    // The peer is told at once that its datagrams come.
+                    // Tell the peer at once that its datagrams arrive.
                     self.wire.due.set(Part::KeepAlive, cx.now);
                 }
                 Way::Datagram => {}
@@ -347,7 +346,7 @@ impl<P: Port> Session<P> {
                 }
                 None
             }
-            // Nothing of an ability that is off: none is decoded, or nothing was asked for.
+            // This build lacks the ability, so it asked for none of these and does not decode them.
             Some(SessionBody::Cancel(_) | SessionBody::Renewed(_) | SessionBody::Message(..)) | None => {
                 self.unreadable_datagram()
             }
@@ -402,7 +401,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Does what the items of a control message say, in their order. One of which a program is told is the last.
+    /// Processes the items of a control message in order. An item that yields an event has to be the last one.
     fn controls_arrived(&mut self, cx: &mut Context<'_, P>, items: Span, lent: &[u8]) -> Option<Event> {
         let (mut left, mut event) = (self.wire.link.view(items, lent).len(), None);
         while left > 0 && event.is_none() && self.wire.phase == Phase::Live {
@@ -416,13 +415,13 @@ impl<P: Port> Session<P> {
 
     fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Span, Error>) -> Option<Event> {
         let Some(pending) = self.calling.requests.close(id) else {
-            // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
+            // The call has timed out or was cancelled, and its lease was released then. Late results are dropped.
             self.wire.link.counters.count(LinkCounter::RepliesLate);
             return None;
         };
         match result {
             Err(error) => {
-                // The call failed at the peer, but a lease may have begun there before it did: it is not renewed any more.
+                // The call failed at the peer, perhaps after its lease had begun there: release it.
                 self.calling.release_call(&mut self.wire, cx, id, Some(pending));
                 Some(Event::Reply(id, Err(error)))
             }
@@ -434,7 +433,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Does what the first item says; returns how many bytes of items are left.
+    /// Processes the first item; returns how many bytes of items are left.
     fn control_arrived(&mut self, cx: &mut Context<'_, P>, items: Span, lent: &[u8]) -> (usize, Option<Event>) {
         let mut items = Items::new(self.wire.link.view(items, lent));
         let Some(item) = items.next() else { return (0, None) };
@@ -538,31 +537,31 @@ impl<P: Port> Session<P> {
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
         self.wire.link.counters.count(LinkCounter::RequestsReceived);
-        // First of all: a copy of a request must not even be refused, or its refusal could overtake the answer of the original.
+        // Detect duplicates before anything else: refusing a copy could overtake the answer of the original.
         let seen = self.calls.note(priority, header.id);
         if seen == Seen::Before {
             self.wire.link.counters.count(LinkCounter::RequestsRepeated);
             return None;
         }
-        // Once for all that a request needs of it.
+        // Look the function up once; the checks below share the result.
         let function = cx.functions.lookup(header.slot, header.generation);
         let length = self.wire.link.view(block, lent).len();
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
-            // The handler of a function that stops waits where a safe hook is to run first: `poll` comes before `next_call`.
-            // A moving call waits until the claim that it is made under is stored.
+            // A stop's handler waits if a safe hook has to run first: `poll` returns the hook before `next_call` returns the
+            // handler. A moving call waits until its claim is stored.
             let waits = function.attributes.stop && Granting::awaits_hook(cx, header.slot, header.generation)
                 || function.attributes.lease.is_some()
                     && self.granting.obedience.may_move(&mut self.wire, cx).is_none();
             let arguments = arguments.filter(|_| !waits && self.calls.is_idle(priority));
             let bytes = self.wire.link.view(block, lent);
             match arguments {
-                // The arguments are checked before the call begins: a lease must not start for a request that is refused.
+                // Decode the arguments before the call begins: no lease may start for a request that is refused.
                 Some(arguments) => {
                     read_arguments(function.signature, bytes, arguments)?;
                     self.begin(cx, head, function.attributes).map(Some)
                 }
                 None => {
-                    // A buffer that the request lies in is back in the pool at once.
+                    // If the request lies in a pool buffer, that buffer is free again as soon as the request is queued.
                     let left = LEFT_BY_WAITING.saturating_sub(usize::from(block.is_in_buffer()));
                     let waits = self.calls.wait(cx.buffers, left, head, bytes);
                     if waits.is_ok() || !self.displace(cx, &head, length) {
@@ -582,7 +581,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Everything that can be said of a request without looking at its arguments.
+    /// Checks a request without decoding its arguments.
     fn check_request<'f>(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -592,7 +591,7 @@ impl<P: Port> Session<P> {
         length: usize,
         function: Result<Function<'f, dyn Service>, Error>,
     ) -> Result<(CallHead, Function<'f, dyn Service>), Error> {
-        // First of all what a stop stops, however late it is and whatever its handler has to wait for, or is refused for.
+        // A stop takes effect first, even if it is late, has to wait, or its handler is refused below.
         let stops = function.as_ref().ok().filter(|function| function.attributes.stop);
         if let Some(function) =
             stops.filter(|_| self.wire.publishing.advertised(header.slot, header.generation) == Advertised::Now)
@@ -606,7 +605,7 @@ impl<P: Port> Session<P> {
         if header.unknown != 0 {
             return Err(Error::Unsupported);
         }
-        // The limit may have become lower while the request was on its way.
+        // The limit may have been lowered while the request was in flight.
         let limit = match priority {
             Priority::Emergency => self.wire.constraints.message_size.min(EMERGENCY_BLOCK_BYTES),
             _ => self.wire.constraints.message_size,
@@ -615,13 +614,13 @@ impl<P: Port> Session<P> {
             return Err(Error::TooLarge { limit });
         }
         let sent_at = sent_at_earliest(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
-        // Counted from the earliest time at which it can have been sent: a command that was held up is never taken for a fresh one.
-        // A stop never comes too late.
+        // Count from the earliest time at which it can have been sent, so that a delayed command is never taken for a new one.
+        // A stop is never too late.
         let deadline = if stops.is_some() { cx.now } else { sent_at } + header.remaining;
         if deadline <= cx.now && stops.is_none() {
             return Err(Error::Expired);
         }
-        // By what this peer was told, not by what the unit offers: a function that was shown to another node stays unknown here.
+        // Judge by what this peer was shown: a function that is published to another node only is unknown here.
         let function = match self.wire.publishing.advertised(header.slot, header.generation) {
             Advertised::Never => return Err(Error::UnknownFunction),
             Advertised::Earlier => return Err(Error::StaleFunction),
@@ -650,7 +649,7 @@ impl<P: Port> Session<P> {
             sent_at,
             number: header.number,
         };
-        // Before another call is refused in its favour.
+        // Before a waiting call is displaced in favour of this one.
         self.admit(cx, &head)?;
         let is_emergency = is_emergency(function.attributes, priority);
         let admitted = self.calls.admit(header.slot, is_emergency, self.wire.constraints.calls_per_peer);

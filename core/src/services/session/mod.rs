@@ -1,8 +1,9 @@
-//! One link to one peer: the s_unit's session with its manager, and each peer of an m_unit.
+//! One link to one peer: an s_unit has one session, with its manager; an m_unit has one for each peer.
 //!
-//! A [`Session`] turns bytes into [`Event`]s and requests into bytes. It never waits: the port lends it a [`Context`],
-//! runs the handler of an [`Event::Incoming`] outside of any lock, and brings the answer with [`Session::answer`]. It asks the
-//! unit's [`Hub`](super::hub::Hub) by itself, through the [`Door`](super::hub::Door) in its context.
+//! A [`Session`] is a state machine without I/O: it turns received bytes into [`Event`]s and requests into bytes. It never
+//! waits: the port lends it a [`Context`], runs the handler of an [`Event::Incoming`] outside of any lock, and passes the
+//! results to [`Session::answer`]. It reaches the unit's [`Hub`](super::hub::Hub) through the context's
+//! [`Door`](super::hub::Door).
 //!
 //! # What a port does
 //! - bytes arrive: [`Session::receive`] until they are consumed and nothing more comes out, then [`Session::next_call`]
@@ -67,22 +68,22 @@ use proving::{reply_to_hello, send_hello};
 use timing::PeerClock;
 use wire::{Phase, Wire, close_code, close_reason};
 
-/// Longest frame body of a peer that has proven nothing: with its header too short to need a buffer of the pool.
+/// Longest frame body that an unauthenticated peer may send; with its header it needs no buffer of the pool.
 const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - HEADER_BYTES - 1;
-/// A challenge goes in the stream and in so many datagrams: one lost segment or datagram must not make a live peer look
-/// dead, and its place go to a duplicate.
+/// A challenge is one frame in the stream and this many datagrams: a single lost segment or datagram must not make a live peer
+/// look dead, or a duplicate of it would get its link.
 const CHALLENGE_DATAGRAMS: usize = 3;
-/// Most that a chunk adds to its piece of a message, without sealing.
+/// Most bytes that framing adds to one chunk, without sealing.
 const FRAME_BYTES: usize = HEADER_BYTES + 6;
-/// Messages of the protocol itself fit this, however small `message_size` is.
+/// Least capacity for a message: the protocol's own messages fit, however small `message_size` is.
 const LEAST_MESSAGE_BYTES: usize = 512;
 
-/// What a session begins with.
+/// The initial settings of a session.
 #[derive(Clone, Debug)]
 pub struct SessionConfig<E> {
     /// The link's index.
     pub link: LinkId,
-    /// This unit opens the connection, as opposed to: it accepted one.
+    /// `true` if this unit opens the connection, `false` if it accepted one.
     pub dialed: bool,
     /// The other end of the stream.
     pub address: E,
@@ -92,9 +93,9 @@ pub struct SessionConfig<E> {
     pub constraints: Constraints,
 }
 
-/// The slices that one session lives in.
+/// The memory that one session uses.
 pub struct SessionStorage<S: Storage> {
-    /// [`LINK_BUFFER_BYTES`] for partial frames.
+    /// [`LINK_BUFFER_BYTES`] bytes for partial frames.
     pub small: S::Slice<u8>,
     /// One slot per call in flight to the peer.
     pub pending: S::Slice<Option<Pending>>,
@@ -110,24 +111,24 @@ pub struct SessionStorage<S: Storage> {
 
 /// What happened on a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-// A wide tag: the rest is then moved in words, and not byte by byte.
+// A 32-bit tag lets the compiler copy events by words instead of bytes.
 #[repr(u32)]
 pub enum Event {
-    /// Both ends have accepted each other: the link is live, and has told the peer what is published to it.
+    /// Both ends have accepted each other: the link is live, and this unit's published functions are on their way to the peer.
     Joined,
-    /// A call whose arguments are in the lent parameters: run its handler, then [`Session::answer`].
+    /// Run the handler of this call, whose arguments are in the lent parameters, then call [`Session::answer`].
     Incoming(Incoming),
-    /// The end of a call of this unit; [`Session::results`] shows what it returned.
+    /// A call of this unit has ended; [`Session::results`] reads its results.
     Reply(CallId, Result<Results, Error>),
-    /// An asynchronous request was refused by the peer, or its service failed.
+    /// The peer refused a request that expects no reply, or its service failed.
     Failed(CallId, Error),
     /// The peer's list of functions changed.
     ListChanged,
-    /// The peer has read this unit's list up to `serial`, and keeps no room for `skipped` functions of it.
+    /// The peer has processed this unit's list up to `serial`; `skipped` functions did not fit its table.
     Acknowledged {
         /// As returned by [`Session::publish`].
         serial: u32,
-        /// Functions that the peer keeps no room for.
+        /// How many functions did not fit.
         skipped: u16,
     },
     /// A lease on a function of this unit ended without being renewed: run its safe hook before anything else.
@@ -141,32 +142,32 @@ pub enum Event {
         /// Why.
         why: LeaseEnd,
     },
-    /// The peer tells the state of what a function of it moves: before its list is complete for one that has had an order
-    /// or is inhibited, and when that changes, within a keep-alive interval.
+    /// The peer reports the state of an actuator: before its list is complete, if the actuator has had an order or is inhibited,
+    /// and within a keep-alive interval of each change.
     Actuator {
         /// The peer's function.
         slot: Slot,
         /// Its state.
         state: ActuatorState,
     },
-    /// What a call of this unit tells while it runs; [`Session::progress_values`] shows the values.
+    /// Progress of a running call of this unit; [`Session::progress_values`] reads the values.
     Progress(CallId, <Details as Ability>::Of<Results>),
-    /// The caller has given up a call that runs: its handler is to be told, and the answer reaches no one.
+    /// The caller has given up a running call: notify its handler. The answer will be dropped.
     Cancelled(<Details as Ability>::Of<Ticket>),
     /// A value of a stream of the peer.
     Sample(<Streams as Ability>::Of<Sample>),
-    /// What became of a subscription to a stream of the peer; after an error it has ended.
+    /// The peer granted or ended a subscription to one of its streams; an error ends it.
     Subscribed(Slot, <Streams as Ability>::Of<Result<GrantedStream, Error>>),
     /// The peer answered a [`Session::ping`].
     Answered,
-    /// The link has ended; every call in flight and every lease has been reported before.
+    /// The link has ended. All calls in flight and all leases have been reported before this event.
     Closed(CloseReason),
 }
 
 /// A call of the peer that is to be run now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Incoming {
-    /// Answers it.
+    /// Passed to [`Session::answer`] with the results.
     pub ticket: Ticket,
     /// The function of this unit's list.
     pub slot: Slot,
@@ -174,9 +175,9 @@ pub struct Incoming {
     pub priority: Priority,
     /// Whether the caller waits for an answer.
     pub wants_reply: bool,
-    /// After this nobody waits for the answer.
+    /// When the caller stops waiting for the answer.
     pub deadline: Instant,
-    /// Its hold of the service's lease, if there is one.
+    /// The call's order, if its service has a lease.
     pub order: Option<Order>,
 }
 
@@ -206,7 +207,7 @@ impl<P: Port> Session<P> {
         let proven = cipher.is_sealing();
         let mut link = Link::new(link, cipher, storage.small, chunk_limit, message_limit(&constraints));
         if !proven {
-            // Whoever has proven nothing gets no more than the link's own bytes.
+            // An unauthenticated peer is limited to the link's own buffer, so that it cannot use up the pool.
             link.set_chunk_limit(UNPROVEN_BYTES);
         }
         let mut wire = Wire {
@@ -245,8 +246,8 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The slices that the session lived in, for the next one: so a port without an allocator opens link after link.
-    /// For a session that has ended; of one that has not, what is in flight is forgotten without a word.
+    /// Returns the session's slices for the next session, so that a port without an allocator can reuse them. Call it on a
+    /// session that has ended; otherwise calls in flight are dropped without an event.
     pub fn into_storage(mut self, buffers: &mut dyn Buffers<P::Storage>) -> SessionStorage<P::Storage> {
         self.wire.link.release(buffers);
         self.calls.release(buffers);
@@ -261,48 +262,48 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// This unit opened the connection.
+    /// Whether this unit opened the connection.
     pub const fn dialed(&self) -> bool {
         self.wire.dialed()
     }
 
-    /// Both ends have accepted each other.
+    /// Whether both ends have accepted each other.
     pub fn is_live(&self) -> bool {
         self.wire.phase == Phase::Live
     }
 
-    /// The link has ended and everything about it has been reported.
+    /// Whether the link has ended and all its events have been returned.
     pub fn is_ended(&self) -> bool {
         self.wire.phase == Phase::Ended
     }
 
-    /// The peer has proven who it is, or has said it where nobody has to prove it. Of links that have not come so far, the
-    /// oldest gives way to a new one.
+    /// Whether the peer has authenticated itself; in plain mode, whether its hello has come. When a unit has too many links, the
+    /// oldest that has not got so far makes way for a new one.
     pub const fn is_proven(&self) -> bool {
         self.wire.remote.is_some() && !matches!(self.wire.phase, Phase::Proving { .. })
     }
 
-    /// The peer's hello, once it has come. It may be anybody's as long as the peer [is not proven](Self::is_proven).
+    /// The peer's hello, once it has come. Not authenticated until [`is_proven`](Self::is_proven).
     pub fn hello(&self) -> Option<&Hello> {
         self.wire.hello()
     }
 
-    /// The version of the protocol that the link uses, once the peer's hello has come.
+    /// The protocol version of the link, once the peer's hello has come.
     pub fn version(&self) -> Option<u8> {
         self.wire.remote.as_ref().map(|remote| remote.version)
     }
 
-    /// The peer's identity, once it has told it. It may be anybody's as long as the peer [is not proven](Self::is_proven).
+    /// The peer's identity, once its hello has come. Not authenticated until [`is_proven`](Self::is_proven).
     pub fn identity(&self) -> Option<&Identity> {
         self.wire.identity()
     }
 
-    /// The peer, from joining on.
+    /// The peer's identity, once it has joined.
     pub fn peer(&self) -> Option<&Identity> {
         self.wire.identity().filter(|_| self.wire.joined)
     }
 
-    /// The peer's boot epoch, once it has told it.
+    /// The peer's boot epoch, once its hello has come.
     pub fn epoch(&self) -> Option<Epoch> {
         self.wire.hello().map(|hello| hello.epoch)
     }
@@ -312,7 +313,7 @@ impl<P: Port> Session<P> {
         self.wire.peer_address
     }
 
-    /// This unit's constraints, as this link keeps them.
+    /// This unit's constraints on this link.
     pub const fn constraints(&self) -> &Constraints {
         &self.wire.constraints
     }
@@ -327,7 +328,7 @@ impl<P: Port> Session<P> {
         &self.wire.theirs
     }
 
-    /// What happened on this link.
+    /// This link's counters.
     pub const fn counters(&self) -> &Counters<LinkCounter, { LinkCounter::COUNT }> {
         &self.wire.link.counters
     }
@@ -337,17 +338,17 @@ impl<P: Port> Session<P> {
         self.calling.last_order
     }
 
-    /// Calls of this unit that wait for a reply.
+    /// How many calls of this unit wait for a reply.
     pub fn calls_in_flight(&self) -> usize {
         self.calling.requests.in_flight()
     }
 
-    /// Whether a call of the peer moves something here.
+    /// Whether the peer holds a lease on any function of this unit.
     pub fn moves(&self) -> bool {
         !self.granting.granted.is_empty()
     }
 
-    /// Calls of the peer that run or wait here.
+    /// How many calls of the peer run or wait here.
     pub const fn calls_held(&self) -> u16 {
         self.calls.held()
     }
@@ -357,12 +358,12 @@ impl<P: Port> Session<P> {
         self.wire.liveness.silent_for(now)
     }
 
-    /// How long ago something came in the stream: what it told is as old at least.
+    /// How long ago bytes last came in the stream: a lower bound of the age of what the peer said in it.
     pub fn stream_silent_for(&self, now: Instant) -> Duration {
         self.wire.liveness.stream_silent_for(now)
     }
 
-    /// Whether session datagrams of the peer come; `None` while that is not known.
+    /// Whether the peer's session datagrams arrive; `None` while that is unknown.
     pub const fn hears_datagrams(&self) -> Option<bool> {
         match (self.wire.liveness.hears(), self.wire.liveness.is_deaf()) {
             (false, false) => None,
@@ -370,13 +371,13 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Whether those of this unit come to the peer, as it told last.
+    /// Whether this unit's datagrams reach the peer, by its last report.
     pub const fn is_heard(&self) -> bool {
         self.wire.liveness.is_heard()
     }
 
-    /// More bytes of the stream are there, and the port does not read them for now: the peer is told, which otherwise takes the
-    /// stream for dead. Until the next [`receive`](Self::receive).
+    /// Notes that the port leaves bytes of the stream unread until the next [`receive`](Self::receive). The peer is notified: it
+    /// would otherwise declare the stream dead.
     pub const fn hold_back(&mut self) {
         self.wire.holds = true;
     }
@@ -386,18 +387,18 @@ impl<P: Port> Session<P> {
         self.wire.link.queued()
     }
 
-    /// Bytes wait for the stream to become writable. Those that gather do not: they have a deadline.
+    /// Whether bytes wait for the stream to become writable. Gathered messages do not count: a deadline sends them.
     pub fn wants_to_write(&self) -> bool {
         self.wire.link.wants_to_write()
     }
 
-    /// Whether anything is kept of the bytes that came. Otherwise [`receive`](Self::receive) has nothing more to say after
-    /// it has taken all of them, and need not be called with nothing.
+    /// Whether received bytes are buffered here. If not, [`receive`](Self::receive) returns nothing more once it has consumed
+    /// its input, and the final call with an empty slice can be skipped.
     pub fn holds_received(&self) -> bool {
         self.wire.link.holds_received()
     }
 
-    /// The connection is open: the one who dialed introduces itself first.
+    /// The connection is open: the end that dialled sends its hello first.
     pub fn connected(&mut self, cx: &mut Context<'_, P>) {
         self.wire.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
         if self.wire.dialed() {
@@ -405,7 +406,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The hub takes the peer. The link is live from here on, unless it ends here.
+    /// Completes the handshake after the hub has admitted the peer. The link is live then, unless sending failed.
     fn accept(&mut self, cx: &mut Context<'_, P>) {
         if !self.wire.dialed() {
             reply_to_hello(&mut self.wire, cx);
@@ -419,7 +420,7 @@ impl<P: Port> Session<P> {
         debug!("link {} is live", self.wire.link.id().0);
     }
 
-    /// The peer has said who it is, or has proven it: what becomes of the link?
+    /// Asks the hub whether to admit a peer that has said, or proven, who it is.
     pub(super) fn consult(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         let Some(remote) = &self.wire.remote else { return None };
         let (now, link, from, hello) = (cx.now, self.wire.link.id(), self.wire.peer_address, &remote.hello);
@@ -433,7 +434,7 @@ impl<P: Port> Session<P> {
         None
     }
 
-    /// The peer is alive, for which the hub may have asked.
+    /// Reports a sign of life to the hub, if the hub asked for one.
     pub(super) fn show_life(&mut self, cx: &mut Context<'_, P>) {
         if core::mem::take(&mut self.wire.challenged) && !self.has_given_way(cx) {
             let (now, link) = (cx.now, self.wire.link.id());
@@ -441,7 +442,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Does what the hub wants of this link because of another one. What it comes too late for, it passes over.
+    /// Does what the hub wants of this link because of another link. A directive that no longer applies has no effect.
     pub fn direct(&mut self, cx: &mut Context<'_, P>, directive: Directive) -> Option<Event> {
         match directive {
             Directive::Challenge => self.challenge(cx),
@@ -457,7 +458,7 @@ impl<P: Port> Session<P> {
         None
     }
 
-    /// The hub has taken the peer, which is told what is published to it.
+    /// The hub has admitted the peer: the link goes live and published functions are sent.
     fn admitted(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         if self.wire.phase != Phase::Deciding {
             return None;
@@ -475,13 +476,13 @@ impl<P: Port> Session<P> {
         Some(Event::Joined)
     }
 
-    /// Makes what the hub has published to the peer visible to it, as it is now and as far as the access table lets it be
-    /// seen. Returns the serial that comes back with [`Event::Acknowledged`].
+    /// Sends the peer what the hub has published to it, as far as the access table lets the peer see it. Returns the serial that
+    /// [`Event::Acknowledged`] will carry.
     pub fn publish(&mut self, cx: &mut Context<'_, P>) -> u32 {
         let Some(remote) = &self.wire.remote else { return 0 };
         let (functions, publishing, identity) = (cx.functions, &mut self.wire.publishing, &remote.hello.identity);
         cx.hub.enter(&mut |hub| {
-            // What was hidden since the last time is withdrawn: a change that comes before the link is live reaches it only here.
+            // Withdraw what became hidden: a change from before the link was live had no other way to reach this link.
             for slot in publishing.all_slots() {
                 let is_visible = hub.publications.is_visible(identity, slot);
                 publishing.want(slot, functions.generation(slot).filter(|_| is_visible));
@@ -491,8 +492,8 @@ impl<P: Port> Session<P> {
         self.end_of_changes(cx)
     }
 
-    /// Whether anything was published since the last [`publish`](Self::publish) here: where others publish meanwhile, a port
-    /// looks once more when they find the link.
+    /// Whether something was published since the last [`publish`](Self::publish) of this link. A port with several threads checks
+    /// this when a new link becomes visible to them, since a publication may have missed it.
     pub fn is_behind(&self, cx: &mut Context<'_, P>) -> bool {
         let mut newest = self.wire.publishing.version;
         cx.hub.enter(&mut |hub| newest = hub.publications.version());
@@ -504,12 +505,12 @@ impl<P: Port> Session<P> {
         self.wire.refuse(cx, Refusal::NoKey);
     }
 
-    /// Ends the link in an orderly way; [`poll`](Self::poll) reports what was in flight.
+    /// Ends the link with a close frame; [`poll`](Self::poll) then reports the calls and leases that were open.
     pub fn close(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) {
         self.wire.close(cx, reason);
     }
 
-    /// The connection below has ended.
+    /// The connection below the link has ended.
     pub fn disconnected(&mut self, reason: CloseReason) {
         self.wire.end(reason);
     }
@@ -539,64 +540,64 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Asks the peer for a sign of life and measures how long it takes: [`Event::Answered`] comes with it, and
-    /// [`round_trip`](Self::round_trip) tells. A ping before it that has not been answered is given up.
+    /// Sends a ping and measures the round trip: [`Event::Answered`] follows, then [`round_trip`](Self::round_trip) is new.
+    /// Replaces a ping that is still unanswered.
     ///
     /// [`Error::NotConnected`] on a link that is not live, [`Error::Full`] where the stream has no room.
     pub fn ping(&mut self, cx: &mut Context<'_, P>) -> Result<(), Error> {
         self.pings.ping(&mut self.wire, cx)
     }
 
-    /// How long the answer to the last [`ping`](Self::ping) took, once it has come.
+    /// The round trip of the last answered [`ping`](Self::ping).
     pub fn round_trip(&self) -> Option<Duration> {
         self.pings.round_trip()
     }
 
-    /// Makes the keys of a secured link anew each time they are as old as `span`, or up to an eighth younger, instead of
+    /// Renews the keys of a secured link when they are between 7/8 of `span` and `span` old, instead of
     /// [`HANDSHAKE_LIFE`](crate::config::HANDSHAKE_LIFE); at least
-    /// [`SHORTEST_HANDSHAKE_LIFE`](crate::config::SHORTEST_HANDSHAKE_LIFE). Holds from the next handshake on, for the end that
-    /// dialled: the other one follows.
+    /// [`SHORTEST_HANDSHAKE_LIFE`](crate::config::SHORTEST_HANDSHAKE_LIFE). Takes effect with the next handshake, at the end that
+    /// dialled; the other end follows.
     pub fn renew_every(&mut self, span: Duration) {
         self.renewal.renew_every(span);
     }
 
-    /// This unit's claim is another one: the peer is told.
+    /// Sends this unit's new claim to the peer.
     pub fn announce_claim(&mut self, cx: &mut Context<'_, P>) {
         self.granting.obedience.has_news = true;
         self.pump(cx);
     }
 
-    /// Wants values of a stream of the peer, at least `interval` apart; the peer may grant a longer one, which comes as
-    /// [`Event::Subscribed`]. Of several calls for one stream the last one counts. The subscription ends with the link, and when
-    /// the peer publishes another stream in its place: a port subscribes again with [`Event::ListChanged`], which changes nothing
-    /// where nothing has changed. [`Error::UnknownFunction`] where the peer has no such stream, [`Error::NotConnected`].
+    /// Subscribes to a stream of the peer, with values at least `interval` apart; [`Event::Subscribed`] has the interval that
+    /// the peer granted, perhaps a longer one. A repeated call replaces the earlier one. A subscription ends with the link, and
+    /// when the peer replaces the stream: a port subscribes again at each [`Event::ListChanged`], which is a no-op if nothing
+    /// changed. Errors: [`Error::UnknownFunction`] if the peer has no such stream, [`Error::NotConnected`].
     pub fn subscribe(&mut self, cx: &mut Context<'_, P>, stream: &str, interval: Duration) -> Result<Slot, Error> {
         self.streaming.wish(&mut self.wire, cx, stream, Some(interval))
     }
 
-    /// Wants no more values of a stream of the peer.
+    /// Ends a subscription to a stream of the peer.
     pub fn unsubscribe(&mut self, cx: &mut Context<'_, P>, stream: &str) {
-        // Where there is no such stream, none comes.
+        // If the peer has no such stream, there is nothing to end.
         let _ = self.streaming.wish(&mut self.wire, cx, stream, None);
     }
 
-    /// A stream of this unit has a new value: [`poll`](Self::poll) then sends it where it is due. Whether the peer has any
-    /// subscription.
+    /// Notes a new value of a stream of this unit, which [`poll`](Self::poll) sends when it is due. Returns whether the peer
+    /// subscribes to any stream.
     pub fn stream_changed(&mut self, now: Instant) -> bool {
         self.streaming.changed(&mut self.wire, now)
     }
 
-    /// Streams of this unit that the peer is subscribed to.
+    /// How many streams of this unit the peer subscribes to.
     pub fn subscriptions(&self) -> u16 {
         self.streaming.active()
     }
 
-    /// Requests a function of the peer. With `wants_reply`, its end comes as [`Event::Reply`]
-    /// under the returned id; without, only a failure comes back.
+    /// Requests a function of the peer. With `wants_reply`, [`Event::Reply`] ends the call, with the returned id; without,
+    /// only a failure is reported, as [`Event::Failed`].
     ///
-    /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::Mismatch`], [`Error::MissingArgument`], [`Error::WrongType`],
-    /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
-    /// [`Error::SlowHeart`], [`Error::NotConnected`].
+    /// Nothing was sent if it returns an error: [`Error::UnknownFunction`], [`Error::Mismatch`], [`Error::MissingArgument`],
+    /// [`Error::WrongType`], [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`],
+    /// [`Error::Full`], [`Error::SlowHeart`], [`Error::NotConnected`].
     pub fn request(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -613,50 +614,49 @@ impl<P: Port> Session<P> {
         result
     }
 
-    /// A call is made that may have to wait for room: in [`RequestOptions::made`] it keeps its place among those that move the
-    /// same thing, and is refused as [`Error::Replaced`] behind a later one.
+    /// Numbers a call that may have to wait before it can be sent. Passed in [`RequestOptions::made`], the number keeps the
+    /// call's place among those for one actuator: it is refused as [`Error::Replaced`] if a later one has begun.
     pub fn make(&mut self) -> Made {
         self.calling.requests.make()
     }
 
-    /// Whether this unit renews the lease of a call.
+    /// Whether this unit is renewing the lease of a call.
     pub fn holds(&self, call: CallId) -> bool {
         self.calling.holds(call)
     }
 
-    /// How long the leases that calls of a function hold last, counted from when the last answer to a renewal came; `None` where
-    /// none is renewed. An answer names its call and not its renewal, of which several may be on their way: one that was held up
-    /// makes this too long by as much.
+    /// How much of a function's leases is left, counted from the last answer to a renewal; `None` if none is renewed. An answer
+    /// names its call, not which renewal it answers: if an answer to an earlier renewal was delayed, the value is too high by
+    /// that delay.
     pub fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
         self.calling.lease_left(now, slot)
     }
 
-    /// A heart has stopped: what names it is released.
+    /// A heart has stopped: releases the calls that name it.
     pub fn release_beats(&mut self, cx: &mut Context<'_, P>, beats: Beats) {
         self.calling.release_beats(&mut self.wire, cx, beats);
     }
 
-    /// The caller does not want a call any more: its reply, should it still come, counts as late, and the lease that it
-    /// holds, or would begin, is released. Other calls are untouched. Also for a call that has been answered and holds a
-    /// lease.
+    /// Gives a call up. A reply that still comes counts as late, and the lease that the call holds, or would get, is released.
+    /// Works for an answered call that holds a lease, too. Other calls are not affected.
     pub fn cancel(&mut self, cx: &mut Context<'_, P>, id: CallId) {
         self.calling.cancel(&mut self.wire, cx, id);
     }
 
-    /// The caller gives a call up, and still wants to hear its answer: the handler is told and what it moves stops, as by
-    /// [`cancel`](Self::cancel), which ends the call where no answer comes in time.
+    /// As [`cancel`](Self::cancel), but still reports the answer: the handler is notified and its motion stops. If no answer
+    /// comes in time, end the call with [`cancel`](Self::cancel).
     pub fn cancel_but_wait(&mut self, cx: &mut Context<'_, P>, id: CallId) {
         self.calling.cancel_but_wait(&mut self.wire, cx, id);
     }
 
-    /// Releases all calls of a function of the peer, those that are on their way as well: what they started stops.
+    /// Releases all calls of a function of the peer, including requests still on their way: what they started stops.
     ///
-    /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.
+    /// [`Error::Full`] if no release can be sent now. Renewals have ended all the same, and the port may try again.
     pub fn release(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> Result<(), Error> {
         self.calling.release(&mut self.wire, cx, slot)
     }
 
-    /// Writes what has gathered now.
+    /// Writes the gathered one-way messages now.
     pub fn flush_gathered(&mut self, cx: &mut Context<'_, P>) {
         self.wire.flush(cx);
     }
@@ -666,8 +666,8 @@ impl<P: Port> Session<P> {
         self.calling.requests.slots()
     }
 
-    /// Lends more slots for calls of this unit, a multiple of those before. Returns the slots that are not needed any
-    /// more: the new ones if they are no such multiple.
+    /// Lends more slots for calls of this unit: a multiple of the present number. Returns the slots that are now unused, which
+    /// are the new ones if they are not such a multiple.
     pub fn lend_calls(
         &mut self,
         pending: <P::Storage as Storage>::Slice<Option<Pending>>,
@@ -675,13 +675,12 @@ impl<P: Port> Session<P> {
         self.calling.requests.grow(pending)
     }
 
-    /// Slots for calls of the peer that run here, and how many calls of it run or wait.
+    /// How many slots there are for running calls of the peer, and how many of its calls run or wait.
     pub fn running_slots(&self) -> (usize, u16) {
         (self.calls.slots(), self.calls.held())
     }
 
-    /// Lends more slots for calls of the peer that run here. Returns the slots that are not needed any more: the new ones if
-    /// they are fewer than before.
+    /// Lends more slots for running calls of the peer. Returns the unused slots: the new ones if they are fewer than before.
     pub fn lend_running(
         &mut self,
         running: <P::Storage as Storage>::Slice<Option<RunningCall>>,
@@ -689,18 +688,17 @@ impl<P: Port> Session<P> {
         self.calls.grow(running)
     }
 
-    /// Lets the peer's list grow to so many functions, and so many bytes of signatures, where the storage has an allocator.
+    /// Sets how many functions, and bytes of signatures, the peer's list may grow to if the storage has an allocator.
     pub const fn let_list_grow(&mut self, functions: usize, bytes: usize) {
         self.wire.theirs.let_grow(functions, bytes);
     }
 
-    /// Functions of this unit's own list that the peer can be told of.
+    /// How many functions of this unit's list can be published on this link.
     pub fn publication_slots(&self) -> usize {
         self.wire.publishing.slots()
     }
 
-    /// Lends more slots for functions of this unit's own list. Returns the slots that are not needed any more: the new
-    /// ones if they are fewer.
+    /// Lends more slots for functions of this unit's own list. Returns the unused slots: the new ones if they are fewer.
     pub fn lend_publications(
         &mut self,
         publications: <P::Storage as Storage>::Slice<Publication>,
@@ -708,13 +706,13 @@ impl<P: Port> Session<P> {
         self.wire.publishing.grow(publications)
     }
 
-    /// The application has finished what an order of this lease started: no renewal keeps it alive, no hook runs. `false` where
-    /// no call of this peer has that order, or it has ended before: that one was not finished, and its hook runs.
+    /// The application has finished what this order started: it is no longer renewed, and its hook does not run. Returns `false`
+    /// if no call of this peer has that order, or if it ended before it was finished: then its hook runs.
     pub fn end_order(&mut self, cx: &mut Context<'_, P>, lease: &Lease, order: Order) -> bool {
         self.granting.end_order(&mut self.wire, cx, lease, order)
     }
 
-    /// Whether the peer has read this unit's list up to `serial`.
+    /// Whether the peer has processed this unit's list up to `serial`.
     pub fn is_acknowledged(&self, serial: u32) -> bool {
         self.wire.publishing.is_acknowledged(serial)
     }
@@ -725,9 +723,9 @@ impl<P: Port> Session<P> {
         self.end_of_changes(cx)
     }
 
-    /// The access table of the context is another one than before: the peer is told what it may see from here on,
-    /// leases end that it may not hold any more, and of what it has published this unit sees what it may. For a live link; before that, what is published is under the new table anyway.
-    /// Returns the serial that comes back with [`Event::Acknowledged`].
+    /// Applies a changed access table to a live link: publishes what the peer may see now, ends leases that it may no longer
+    /// hold, and hides those of its functions that it may not publish. A link that goes live later uses the new table anyway.
+    /// Returns the serial that [`Event::Acknowledged`] will carry.
     pub fn access_changed(&mut self, cx: &mut Context<'_, P>) -> u32 {
         self.wire.publishing.fill_buckets();
         self.granting.cut_forbidden(&mut self.wire, cx);
@@ -743,12 +741,12 @@ impl<P: Port> Session<P> {
         serial
     }
 
-    /// Whether the peer was told of everything up to the unit's newest publication, or will be as soon as there is room.
+    /// Whether all publications up to the unit's newest have been sent to the peer or are queued for it.
     pub(super) fn is_advertised(&self, cx: &mut Context<'_, P>) -> bool {
         self.wire.publishing.has_begun() && !self.is_behind(cx)
     }
 
-    /// Changes the limits of this unit; the peer is told.
+    /// Changes this unit's limits and sends them to the peer.
     pub fn set_constraints(&mut self, cx: &mut Context<'_, P>, constraints: Constraints) {
         self.wire.constraints = constraints;
         self.wire.link.set_message_limit(message_limit(&constraints));
@@ -761,7 +759,7 @@ fn message_limit(constraints: &Constraints) -> usize {
     (constraints.message_size as usize).saturating_add(LONGEST_HEADER_BYTES).max(LEAST_MESSAGE_BYTES)
 }
 
-/// Bytes that a pool buffer needs so that a message of `message_size` fits, framed, in chunks of any allowed size.
+/// Size of a pool buffer that holds a message of `message_size`, framed, whatever the chunk size and with `overhead` per frame.
 pub const fn buffer_bytes(message_size: u32, overhead: usize) -> usize {
     let total = (message_size as usize).saturating_add(LONGEST_HEADER_BYTES);
     let total = if total < LEAST_MESSAGE_BYTES { LEAST_MESSAGE_BYTES } else { total };

@@ -1,5 +1,5 @@
-//! What the claim of a link's manager means for its calls: moving ones wait until it is stored, and the link ends when a manager
-//! with a higher claim wants to command and nothing moves.
+//! What the claim of a link's manager means for its calls (docs/concepts.md, "Two managers of one identity"): moving calls wait
+//! until it is stored, and the link ends for a manager with a higher claim once nothing moves.
 
 use super::Phase;
 use super::due::Part;
@@ -11,20 +11,20 @@ use crate::distribution::message::Control;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
-/// How often it is looked at what is waited for.
+/// Polling interval while waiting.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// The peer's claim, as far as its calls have to do with it.
+/// The peer's claim, as far as its calls depend on it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Obedience {
-    /// The hub lets moving calls begin under this claim: it need not be asked again.
+    /// The hub has allowed moving calls under this claim, so need not be asked again.
     may_move: Option<Claim>,
-    /// A moving call waits until the hub lets it begin.
+    /// A moving call waits for the hub's permission.
     pub(super) waits: bool,
-    /// A manager with a higher claim wants to command: until when the peer has to answer, and its orders go on.
-    /// In the far future where none does.
+    /// For a manager with a higher claim: until when the peer has to show life, and until when its orders may continue. Both in
+    /// the far future if there is none.
     gives_way: (Instant, Instant),
-    /// This unit's own claim was raised, which the peer has not been told.
+    /// This unit has raised its own claim, and the peer has not been notified.
     pub(super) has_news: bool,
 }
 
@@ -54,7 +54,7 @@ impl Obedience {
         self.may_move = None;
     }
 
-    /// The claim under which a moving call of the peer may begin. Without one it waits, and the port is asked to store the peer's.
+    /// The claim under which a moving call of the peer may begin. `None` makes the call wait until the port has stored the claim.
     pub(super) fn may_move<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<Claim> {
         if self.may_move.is_none()
             && let Some(remote) = &wire.remote
@@ -69,7 +69,7 @@ impl Obedience {
         self.may_move
     }
 
-    /// A manager with a higher claim wants to command. Whether that is news, so that the peer is to show whether it is alive.
+    /// A manager with a higher claim wants to command. Returns `true` the first time: then the peer is to show that it is alive.
     pub(super) fn give_way<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
         let is_news = wire.phase == Phase::Live && !self.gives_way();
         if is_news {
@@ -79,7 +79,7 @@ impl Obedience {
         is_news
     }
 
-    /// Looks at what is waited for. Where the link gives way: until when the peer has to answer, and its orders go on.
+    /// Checks what is waited for. If the link gives way, returns the time limits for the peer to show life and for its orders.
     pub(super) fn poll<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<(Instant, Instant)> {
         wire.due.set(Part::Claims, Instant::FAR_FUTURE);
         if self.waits {

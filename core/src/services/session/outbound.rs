@@ -1,4 +1,4 @@
-//! The way down: a request becomes a message, checked against what the peer published and the limits that it told.
+//! The send path: a request is checked against what the peer published and its limits, then becomes a message.
 
 use super::due::Part;
 use super::holding::Calling;
@@ -17,42 +17,42 @@ use crate::services::requests::{CallId, Made};
 use crate::services::{Context, Port};
 use crate::time::Duration;
 
-/// How a request travels.
+/// How a request is sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Delivery {
-    /// In the stream: it arrives, in order, or the caller learns that it may not have.
+    /// In the stream: it arrives in order, or the caller gets an error that it may not have arrived.
     #[default]
     Reliable,
-    /// In one datagram, at most [`DATAGRAM_BYTES`]: now or never. Only for requests that want no reply. As long as the peer has not
-    /// told that datagrams come, as right behind a join or where a firewall drops them, it goes in the stream.
+    /// In one datagram of at most [`DATAGRAM_BYTES`], not retransmitted; only for requests without a reply. Sent in the stream as
+    /// long as it is unknown whether datagrams reach the peer: right after joining, or behind a firewall.
     BestEffort,
 }
 
-/// How a request is made; the default suits most.
+/// Options of a request; the default suits most.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RequestOptions {
-    /// The caller waits no longer, and the callee begins no later, than this; the constraint's value if none.
+    /// How long the caller waits, and until when the callee may begin; the constraint `request_timeout` if `None`.
     pub timeout: Option<Duration>,
-    /// The class; the function's own if none.
+    /// The priority class; the function's own if `None`.
     pub priority: Option<Priority>,
     /// Stream or datagram.
     pub delivery: Delivery,
-    /// How long what the call starts is wanted, if its function has a lease.
+    /// How long the call keeps renewing its lease, if its function has one.
     pub renew: Renew,
-    /// Take over what another caller moves, in place of [`Error::Held`].
+    /// Take over an actuator that another caller holds, instead of failing with [`Error::Held`].
     pub take_over: bool,
-    /// An operator makes it, and not the unit's program: each of them holds for itself what it moves.
+    /// Made by an operator and not by the unit's program: the two hold actuators separately.
     pub operator: bool,
-    /// Its place among the calls of its link, where it was [made](super::Session::make) before it is sent; now if none.
+    /// The call's place among those of its link, if it was [made](super::Session::make) before it is sent; now if `None`.
     pub made: Option<Made>,
-    /// Tell what the call tells while it runs, if its function declares that.
+    /// Request progress reports, if the function declares them.
     pub progress: bool,
-    /// Once it is given up its answer is still waited for, so long at most; zero for not at all. Only on Linux.
+    /// How long a call that is given up still waits for its answer; zero for not at all. Only on Linux.
     pub answer_within: Duration,
 }
 
 impl RequestOptions {
-    /// The default, for constants.
+    /// The default options, as a constant.
     pub const fn new() -> Self {
         Self {
             timeout: None,
@@ -67,7 +67,7 @@ impl RequestOptions {
         }
     }
 
-    /// The default, for a call of a leased function whose motion is wanted so long.
+    /// The default options with this renewal, for a function with a lease.
     pub const fn renewing(renew: Renew) -> Self {
         Self { renew, ..Self::new() }
     }
@@ -85,12 +85,12 @@ struct Checked {
     priority: Priority,
     length: usize,
     lease: Option<Duration>,
-    /// It has a place where other calls find none.
+    /// It may use the slots reserved for emergencies.
     is_urgent: bool,
 }
 
 impl<P: Port> Calling<P> {
-    /// Sends a request, or nothing of it.
+    /// Sends a request; on an error nothing is sent.
     pub(super) fn request(
         &mut self,
         wire: &mut Wire<P>,
@@ -100,7 +100,7 @@ impl<P: Port> Calling<P> {
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
-        // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
+        // Check everything before taking an id: each id that is skipped shortens the callee's window for duplicates.
         let mut checked = self.check(wire, cx, callee, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
         let held = checked.lease.filter(|_| options.renew != Renew::Never);
@@ -126,7 +126,7 @@ impl<P: Port> Calling<P> {
             Delivery::BestEffort if wire.liveness.is_heard() => Self::send_best_effort(wire, cx, &checked, parameters),
             _ => Self::send_reliable(wire, cx, &checked, parameters),
         };
-        // Nothing of the message has left, since a message that does not fit is refused before its first byte.
+        // No byte has been sent: a message that does not fit is refused as a whole.
         if let Err(error) = sent {
             self.requests.close(id);
             return Err(error);
@@ -163,7 +163,7 @@ impl<P: Port> Calling<P> {
         let length = block::measure(function.signature.arguments(), parameters)?;
         Self::check_length(wire, priority, options.delivery, length)?;
         if wants_reply {
-            // Known before anything runs at the peer: a call whose results could not be kept must not move a vehicle.
+            // Check this before sending: a call whose results do not fit here must not move a vehicle.
             block::check_results_fit(function.signature.results(), parameters)?;
             if options.delivery == Delivery::BestEffort {
                 return Err(Error::BadConstraint);
@@ -215,26 +215,27 @@ impl<P: Port> Calling<P> {
     ) -> Result<(), Error> {
         let Checked { header, priority, length, .. } = checked;
         let total = REQUEST_BYTES.saturating_add(*length);
-        // Beside the stream, which may be blocked; both copies have one id, and the callee runs it once.
+        // A second copy by datagram, since the stream may be blocked. Both have one id, so the callee runs the call once.
         let has_left = *priority == Priority::Emergency && Self::send_emergency_datagram(wire, cx, header, parameters);
-        // A caller that waits is not kept waiting for others, and an emergency for no one.
+        // Gather one-way messages only: a caller is waiting for a reply, and an emergency waits for nothing.
         let hold = !header.wants_reply && *priority != Priority::Emergency && wire.may_gather(cx.now);
         let Wire { link, theirs, .. } = wire;
         let signature = theirs.function(header.slot).ok_or(Error::StaleFunction)?.signature;
-        // The piece of code that also sends answers.
+        // The same instantiation that sends answers, to save code.
         let write: &mut dyn FnMut(&mut ChunkWriter<'_>) = &mut |writer| {
             writer.put(&header.encode());
             block::write(signature.arguments(), parameters, writer);
         };
         let sent = link.send_message(cx.mailman, cx.buffers, *priority, total, hold, write);
         match wire.after_sending(cx, hold, sent) {
-            // What is before it in the stream are emergencies as well.
+            // The stream's queue is full of other emergencies, but the datagram has been sent.
             Err(Error::Full(_)) if has_left => Ok(()),
             sent => sent,
         }
     }
 
-    /// The second copy of an emergency; at-most-once removes the double. Whether it has left, to a peer that has told that datagrams come.
+    /// Sends the second copy of an emergency, which the callee drops as a duplicate of the first. Returns whether it was sent
+    /// to a peer that receives datagrams.
     fn send_emergency_datagram(
         wire: &mut Wire<P>,
         cx: &mut Context<'_, P>,
@@ -266,7 +267,7 @@ impl<P: Port> Calling<P> {
     }
 }
 
-/// Writes header and block; returns their length.
+/// Encodes header and block; returns their length.
 fn write_message(
     out: &mut [u8],
     header: &RequestHeader,

@@ -10,7 +10,7 @@ use crate::services::access::{Access, Decision, Principal, Verb};
 use crate::services::lease::Service;
 use crate::services::{Context, Port};
 
-/// What the table says about the peer; without a table everything is allowed.
+/// The table's decision about the peer; without a table everything is allowed.
 pub(super) fn decide<E>(
     access: Option<&dyn Access>,
     remote: Option<&Remote<E>>,
@@ -24,7 +24,7 @@ pub(super) fn decide<E>(
     }
 }
 
-/// Whether the peer may make this call; taking over is a right of its own.
+/// Whether the peer may make this call; taking over is a separate right.
 pub(super) fn decide_call<E>(
     access: Option<&dyn Access>,
     remote: Option<&Remote<E>>,
@@ -37,7 +37,7 @@ pub(super) fn decide_call<E>(
     decide(access, remote, function, Verb::Call)
 }
 
-/// Whether the peer sees a function: one that it may call, or list.
+/// Whether the peer may see a function: it may call or list it.
 pub(super) fn may_see<P: Port>(wire: &Wire<P>, cx: &Context<'_, P>, slot: Slot) -> bool {
     cx.table().is_none() || may(wire, cx, slot, Verb::Call) || may(wire, cx, slot, Verb::List)
 }
@@ -47,7 +47,7 @@ pub(super) fn may<P: Port>(wire: &Wire<P>, cx: &Context<'_, P>, slot: Slot, verb
     function.is_none_or(|function| decide(cx.table(), wire.remote.as_ref(), function.name(), verb).is_allowed())
 }
 
-/// A request has arrived for a function that the peer was told of, and there is a table: may it be called, and so soon?
+/// Whether the peer may call a published function now, by the table and its rate.
 pub(super) fn permit_call<P: Port>(
     wire: &mut Wire<P>,
     cx: &Context<'_, P>,
@@ -58,7 +58,7 @@ pub(super) fn permit_call<P: Port>(
     match decide_call(cx.table(), wire.remote.as_ref(), function.name(), takes_over) {
         Decision::Denied => Err(Error::NotAllowed),
         Decision::Allowed { rate: None, .. } => Ok(()),
-        // A stop never comes too often, nor does another emergency.
+        // Neither a stop nor another emergency is limited by a rate.
         Decision::Allowed { .. } if function.attributes.is_urgent(priority) => Ok(()),
         Decision::Allowed { rate: Some(rate), .. } => match wire.publishing.bucket(function.slot) {
             Some(bucket) => bucket.take(cx.now, rate),
@@ -67,14 +67,14 @@ pub(super) fn permit_call<P: Port>(
     }
 }
 
-/// Whether what the peer publishes is shown here.
+/// Whether this unit accepts a function that the peer publishes.
 pub(super) fn may_publish<P: Port>(
     cx: &Context<'_, P>,
     remote: Option<&Remote<P::Endpoint>>,
     refusals: &mut Refusals,
     signature: &[u8],
 ) -> bool {
-    // What cannot be read is refused by the list.
+    // A signature that cannot be decoded is refused by the list.
     let Some(signature) = cx.table().and_then(|_| Signature::decode(signature).ok()) else { return true };
     let allowed = decide(cx.table(), remote, signature.name(), Verb::Publish).is_allowed();
     if !allowed {
@@ -83,7 +83,7 @@ pub(super) fn may_publish<P: Port>(
     allowed
 }
 
-/// Says in the log what was refused, once a second at most.
+/// Logs a refusal, at most once a second.
 pub(super) fn log_refusal<P: Port>(
     cx: &Context<'_, P>,
     remote: Option<&Remote<P::Endpoint>>,

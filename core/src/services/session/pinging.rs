@@ -1,4 +1,4 @@
-//! Round trips of the protocol itself, with no function involved.
+//! Round trips of the protocol itself, which involve no function.
 
 use super::Phase;
 use super::wire::Wire;
@@ -7,11 +7,11 @@ use crate::host::frame::Frame;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
-/// Answers come in the order of the pings. One that has not come after this was never sent: a link whose peer is silent
-/// for so long has ended.
+/// Pings have no number; their answers come in order. An unanswered ping older than this is taken as never sent: with a peer
+/// silent for so long the link would have ended.
 const FORGOTTEN: Duration = Duration::from_secs(10);
 
-/// Pings in the stream and their answers, which carry no number.
+/// Pings in the stream that wait for their answers.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pings {
     unanswered: u16,
@@ -19,11 +19,11 @@ pub(super) struct Pings {
     own: Own,
 }
 
-/// The ping that somebody asked for.
+/// The ping that the application asked for.
 #[derive(Clone, Copy, Debug)]
 enum Own {
     None,
-    /// So many answers come up to its own.
+    /// Its answer is the `behind`th from now.
     Sent {
         at: Instant,
         behind: u16,
@@ -46,7 +46,7 @@ impl Pings {
         self.last = now;
     }
 
-    /// An answer has come; whether it is the one that somebody waits for.
+    /// Counts an answer; returns whether it is the one that the application waits for.
     pub(super) fn answered(&mut self, now: Instant) -> bool {
         self.unanswered = self.unanswered.saturating_sub(1);
         let Own::Sent { at, behind } = self.own else { return false };
@@ -58,7 +58,7 @@ impl Pings {
         is_own
     }
 
-    /// A ping before it that has not been answered is given up.
+    /// Replaces an earlier ping that is still unanswered.
     pub(super) fn ping<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Result<(), Error> {
         if wire.phase != Phase::Live {
             return Err(Error::NotConnected);
@@ -72,7 +72,7 @@ impl Pings {
         Ok(())
     }
 
-    /// How long the answer to the last ping that somebody asked for took, once it has come.
+    /// The round trip of the last ping that the application asked for, once it is answered.
     pub(super) fn round_trip(&self) -> Option<Duration> {
         match self.own {
             Own::Answered { took } => Some(took),
@@ -80,7 +80,7 @@ impl Pings {
         }
     }
 
-    /// Puts a ping into the stream; `false` where there is no room.
+    /// Puts a ping into the stream; `false` if there is no capacity.
     pub(super) fn send<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
         let accepted = wire.link.send_frame(&Frame::Ping);
         if accepted {

@@ -1,7 +1,7 @@
-//! How a link begins: both ends introduce themselves, and on a secured link prove that they have the key of the pair.
+//! How a link begins: hellos, then in secured mode the proof that both ends have the pair's key (Noise `NNpsk0`; docs/wire.md).
 //!
-//! Until the peer's first sealed frame has opened, what it says costs a bounded time and the link's own bytes, and reaches
-//! nobody: no limit, no clock and no decision of the node depends on it.
+//! Until the peer's first sealed frame has been opened, what it sends takes bounded time and only the link's own buffer, and
+//! affects nothing else: no limit, no clock and no decision of the node.
 
 use super::due::Part;
 use super::wire::{Phase, Remote, Wire};
@@ -15,7 +15,7 @@ use crate::host::secure::Secure;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
-/// Longest hello frame.
+/// Length of the longest hello frame.
 const HELLO_BYTES: usize = 320;
 
 pub(super) fn send_hello<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
@@ -36,10 +36,10 @@ pub(super) fn send_hello<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
     wire.flush(cx);
 }
 
-/// Proves to the peer that this unit has the pair's key, and waits for the same from it. If it does not come, the link
-/// ends with [`CloseReason::BadProof`], [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`].
+/// Sends this unit's handshake message and waits for the peer's. If none comes, the link ends with [`CloseReason::BadProof`],
+/// [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`].
 ///
-/// The end that was dialled begins: it is the first one to have both hellos, which the proof covers.
+/// The dialled end begins: it is the first to have both hellos, which the handshake authenticates as its prologue.
 fn prove<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>, until: Instant) {
     let Some(credentials) = wire.credentials(cx) else { return };
     let begins = !wire.dialed();
@@ -65,7 +65,7 @@ pub(super) fn hello_arrived<P: Port>(
         Err(error) => {
             wire.link.counters.count(LinkCounter::FramesRefused);
             if matches!(error, HelloError::Version(_)) && !wire.dialed() {
-                // The other end learns our versions from our hello.
+                // Send our hello all the same: the other end learns from it which versions we speak.
                 send_hello(wire, cx);
             }
             wire.refuse(cx, refusal_of(error));
@@ -92,9 +92,8 @@ pub(super) fn hello_arrived<P: Port>(
     false
 }
 
-/// The peer's message of the proof. To the end that dialled it proves the peer, since it covers this link's fresh nonce:
-/// that end answers, confirms that it has the keys, and says what it has published. The peer reads the list once it has
-/// decided to take this unit.
+/// Processes the peer's handshake message. To the dialling end it authenticates the peer, since it covers this link's fresh
+/// nonce: that end answers, confirms its keys and publishes its list, which the peer processes once it has admitted this unit.
 pub(super) fn proof_arrived<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>, span: Span, lent: &[u8]) -> bool {
     match wire.link.answer(span, lent) {
         Ok(answer) => send_proof(wire, cx, answer.as_ref().map(|answer| &answer[..])),
@@ -107,7 +106,7 @@ pub(super) fn proof_arrived<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>
     false
 }
 
-/// The peer's first sealed frame has opened: it is who it says it is.
+/// The peer's first sealed frame has been opened: its identity is authentic.
 pub(super) fn confirmation_arrived<P: Port>(
     wire: &mut Wire<P>,
     cx: &mut Context<'_, P>,
@@ -123,7 +122,7 @@ pub(super) fn confirmation_arrived<P: Port>(
     true
 }
 
-/// The hub has taken the peer: it is told so with this end's hello, or on a secured link with its confirmation.
+/// The hub has admitted the peer: replies with this end's hello, or in secured mode with its confirmation.
 pub(super) fn reply_to_hello<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
     match wire.mode() {
         Mode::Plain => send_hello(wire, cx),
@@ -131,9 +130,9 @@ pub(super) fn reply_to_hello<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P
     }
 }
 
-/// What a peer that has proven nothing says about the end of the link is no more than its end. That it has no use for this
-/// end's proof is counted, and told where it has dialled: most often one of the two has another key. An end that dialled
-/// goes on searching.
+/// A refusal or close frame from a peer that is not authenticated only ends the link; its reason is not believed. If it says that
+/// this end's proof is bad, count it and, if the peer dialled, report it: most likely one of the two has another key. A dialling
+/// end goes on searching.
 pub(super) fn ended_in_clear<P: Port>(wire: &mut Wire<P>, reason: Option<CloseReason>) {
     wire.link.counters.count(LinkCounter::FarewellsInClear);
     if reason == Some(CloseReason::BadProof) && matches!(wire.phase, Phase::Proving { .. }) {
@@ -145,7 +144,7 @@ pub(super) fn ended_in_clear<P: Port>(wire: &mut Wire<P>, reason: Option<CloseRe
     wire.end(CloseReason::Unproven);
 }
 
-/// What the hello told counts from here on.
+/// The contents of the hello are used from here on.
 fn peer_known<P: Port>(wire: &mut Wire<P>, now: Instant) {
     let Some(Remote { hello, heard, .. }) = &wire.remote else { return };
     wire.liveness = Liveness::new(now, Duration::from_millis(u64::from(hello.keep_alive)));
@@ -154,7 +153,7 @@ fn peer_known<P: Port>(wire: &mut Wire<P>, now: Instant) {
     wire.phase = Phase::Deciding;
 }
 
-/// Sends nothing that is longer than the peer takes.
+/// Adopts the peer's limit on frames.
 fn limit_to_peer<P: Port>(wire: &mut Wire<P>) {
     let chunk_size = wire.hello().map_or(MINIMUM_CHUNK_BYTES, |hello| usize::from(hello.limits.chunk_size));
     wire.link.set_peer_limits(chunk_size);
@@ -169,7 +168,7 @@ fn send_proof<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>, message: Opt
     }
 }
 
-/// Confirms that this end has the keys, to a peer that has proven itself: what follows may be as long as it takes.
+/// Confirms this end's keys to an authenticated peer. Later frames may be as long as the peer accepts.
 fn send_confirmation<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
     limit_to_peer(wire);
     let confirmation = wire.link.cipher().confirmation();

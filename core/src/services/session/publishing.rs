@@ -1,4 +1,4 @@
-//! Which of this unit's functions one peer has been told of, and what it is still to be told.
+//! What one peer knows of this unit's functions, and the notifications that it has yet to get.
 
 use super::LEAST_MESSAGE_BYTES;
 use super::granting::Granting;
@@ -18,20 +18,20 @@ use crate::services::{Context, Port};
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
-/// One of this unit's functions, as one peer sees it.
+/// One of this unit's functions as one peer sees it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Publication {
     wanted: Option<Generation>,
     advertised: Option<Generation>,
-    /// It has been visible at some time, so a call of it is stale rather than unknown.
+    /// It was visible at some time, so a call of it is refused as stale and not as unknown.
     ever: bool,
-    /// The peer has released its requests up to this one.
+    /// The peer has released its requests with ids up to this one.
     released: u32,
-    /// The highest number of a request that began an order.
+    /// The highest number of a request that began an order. Later arrivals with lower numbers are refused as replaced.
     ordered: u32,
-    /// What the peer has left of the rate that it may call at.
+    /// The rest of the peer's rate limit.
     bucket: Bucket,
-    /// Of a stream.
+    /// The peer's subscription, if this is a stream.
     subscription: State<Subscription, { STREAMS as usize }>,
 }
 
@@ -43,37 +43,37 @@ pub(super) enum Advertised {
     Never,
 }
 
-/// What one peer is to be told.
+/// Everything that one peer is to be notified of.
 pub(super) struct Publishing<S: Storage> {
     table: S::Slice<Publication>,
-    /// The highest number of a request that began an order of anything.
+    /// The highest number of a request that began an order, over all functions.
     newest_order: u32,
-    /// Of the unit's publications, when they were looked at last.
+    /// Version of the unit's publications when this link last read them.
     pub(super) version: u32,
     dirty: bool,
     serial: u32,
     end_due: bool,
-    /// The newest serial that the peer has read up to.
+    /// The newest serial that the peer has acknowledged.
     acknowledged: u32,
     acknowledgement_due: Option<u32>,
     limits_due: bool,
-    /// The peer may have been told another state of what is moved here.
+    /// The state of an actuator may differ from what the peer was sent.
     pub(super) actuators_due: bool,
-    /// What the peer was told, as a sum of all [`Lease::changes`], each at places of its own.
+    /// Combines all [`Lease::changes`] as they were last sent, to detect a change without storing each.
     actuators_reported: u32,
     pub(super) refusals: Refusals,
 }
 
-/// What the access table refused the peer, for the log.
+/// Requests that the access table refused, counted for the log.
 pub(super) struct Refusals {
-    /// Since the last line.
+    /// Since the last log line.
     count: u32,
-    /// The next line may be written from here on.
+    /// Earliest time of the next log line.
     next: Instant,
 }
 
 impl Refusals {
-    /// Counts one; how many there were since the last line, if there may be one now.
+    /// Counts a refusal; returns how many there were since the last log line, if a new line may be written.
     pub(super) fn count(&mut self, now: Instant) -> Option<u32> {
         self.count = self.count.saturating_add(1);
         (now >= self.next).then_some(self.count)
@@ -102,7 +102,7 @@ impl<S: Storage> Publishing<S> {
         }
     }
 
-    /// The table, with nothing in it.
+    /// The table, cleared for the next session.
     pub(super) fn into_table(mut self) -> S::Slice<Publication> {
         self.table.iter_mut().for_each(|publication| *publication = Publication::default());
         self.table
@@ -131,24 +131,24 @@ impl<S: Storage> Publishing<S> {
         }
     }
 
-    /// The places of this unit's functions.
+    /// The slots of this unit's functions.
     pub(super) fn all_slots(&self) -> impl Iterator<Item = Slot> + use<S> {
         (0..self.table.len()).map(|index| Slot(index as u16))
     }
 
-    /// The peer releases its requests up to `id`.
+    /// The peer releases its requests of a function up to `id`.
     pub(super) fn release(&mut self, slot: Slot, id: u32) {
         if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
             publication.released = publication.released.max(id);
         }
     }
 
-    /// Whether the peer has released request `id`, so that it does not begin.
+    /// Whether the peer has released request `id`, so that it must not begin.
     pub(super) fn is_released(&self, slot: Slot, id: u32) -> bool {
         self.table.get(usize::from(slot.0)).is_some_and(|publication| id <= publication.released)
     }
 
-    /// A request of this number has begun an order.
+    /// Records that the request with this number has begun an order.
     pub(super) fn note_order(&mut self, slot: Slot, number: u32) {
         self.newest_order = self.newest_order.max(number);
         if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
@@ -156,34 +156,34 @@ impl<S: Storage> Publishing<S> {
         }
     }
 
-    /// The functions of which a later request than this one has begun an order.
+    /// The functions of which a request with a higher number has begun an order.
     pub(super) fn ordered_after(&self, number: u32) -> impl Iterator<Item = Slot> {
         let table = if number < self.newest_order { &*self.table } else { &[] };
         let later = table.iter().enumerate().filter(move |(_, publication)| publication.ordered > number);
         later.map(|(index, _)| Slot(index as u16))
     }
 
-    /// What the peer has left of the rate of a function.
+    /// The rest of the peer's rate limit for a function.
     pub(super) fn bucket(&mut self, slot: Slot) -> Option<&mut Bucket> {
         self.table.get_mut(usize::from(slot.0)).map(|publication| &mut publication.bucket)
     }
 
-    /// What the peer wants of a stream.
+    /// The peer's subscription to a stream.
     pub(super) fn subscription(&mut self, slot: Slot) -> Option<&mut Subscription> {
         self.table.get_mut(usize::from(slot.0))?.subscription.get_mut()
     }
 
-    /// How many streams the peer is subscribed to.
+    /// How many streams the peer subscribes to.
     pub(super) fn count_subscriptions(&self) -> u16 {
         self.table.iter().filter(|publication| publication.subscription.is_active()).count() as u16
     }
 
-    /// Every rate is whole again.
+    /// Resets all rate limits.
     pub(super) fn fill_buckets(&mut self) {
         self.table.iter_mut().for_each(|publication| publication.bucket = Bucket::default());
     }
 
-    /// The peer is to see a function of this generation.
+    /// Sets which generation of a function the peer is to see, if any.
     pub(super) fn want(&mut self, slot: Slot, generation: Option<Generation>) {
         if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
             publication.wanted = generation;
@@ -199,12 +199,12 @@ impl<S: Storage> Publishing<S> {
         self.acknowledged = self.acknowledged.max(serial);
     }
 
-    /// Whether the peer has read this unit's list up to `serial`.
+    /// Whether the peer has processed this unit's list up to `serial`.
     pub(super) const fn is_acknowledged(&self, serial: u32) -> bool {
         self.acknowledged >= serial
     }
 
-    /// The peer is to see what has changed. Returns the serial that comes back when it has.
+    /// Ends a set of changes. Returns the serial that the peer's acknowledgement will carry.
     pub(super) const fn end_changes(&mut self) -> u32 {
         self.serial = self.serial.wrapping_add(1);
         self.dirty = true;
@@ -212,12 +212,12 @@ impl<S: Storage> Publishing<S> {
         self.serial
     }
 
-    /// Whether the peer was told of anything.
+    /// Whether publishing to this peer has begun.
     pub(super) const fn has_begun(&self) -> bool {
         self.serial != 0
     }
 
-    /// Whether something waits for room.
+    /// Whether any notification waits for capacity.
     pub(super) const fn has_news(&self) -> bool {
         let list = self.dirty || self.end_due || self.actuators_due;
         list || self.limits_due || self.acknowledgement_due.is_some()
@@ -227,7 +227,7 @@ impl<S: Storage> Publishing<S> {
         self.limits_due = true;
     }
 
-    /// The peer has old news of a function.
+    /// Publishes a function again to a peer whose information is out of date.
     pub(super) fn notify_again(&mut self, slot: Slot) {
         if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
             publication.advertised = None;
@@ -237,7 +237,7 @@ impl<S: Storage> Publishing<S> {
     }
 }
 
-/// Tells the peer what it is still to be told of this unit's list, as far as there is room, and that it has read its own.
+/// Sends changes of this unit's list as far as there is capacity, and acknowledges the peer's list.
 pub(super) fn send_list<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
     if let Some(serial) = wire.publishing.acknowledgement_due {
         let skipped = u16::try_from(wire.theirs.skipped()).unwrap_or(u16::MAX);
@@ -251,14 +251,14 @@ pub(super) fn send_list<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
     if wire.publishing.actuators_due && !wire.publishing.dirty {
         wire.publishing.actuators_due = !send_actuators(wire, cx);
     }
-    // The end of the list goes behind all of it: its acknowledgement says that the peer has read everything before.
+    // The end goes last: its acknowledgement tells that the peer has processed everything before it.
     if wire.publishing.end_due && !wire.publishing.dirty && !wire.publishing.actuators_due {
         let serial = wire.publishing.serial;
         wire.publishing.end_due = !wire.send_control(cx, &Control::ListEnd { serial });
     }
 }
 
-/// Tells the state of what each function moves, if it has changed; `false` when there was no more room.
+/// Sends the state of each actuator if any has changed; `false` if capacity ran out.
 fn send_actuators<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
     let functions = cx.functions;
     let moves = |slot| functions.function(slot).filter(|function| function.attributes.lease.is_some());
@@ -274,7 +274,7 @@ fn send_actuators<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool 
             continue;
         };
         let ActuatorState { latch, last } = function.handler.state();
-        // A link's nonce and a claim are their own caller's alone.
+        // Nonce and claim of another unit's order are none of this peer's business.
         let last = last.map(|last| if last.holder == peer { last } else { last.of_another() });
         if !wire.send_control(cx, &Control::Actuator { slot: slot.0, latch, last }) {
             return false;
@@ -284,7 +284,7 @@ fn send_actuators<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool 
     true
 }
 
-/// Tells the peer the limits of this unit, where they have changed.
+/// Sends this unit's limits if they have changed.
 pub(super) fn send_limits<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
     if wire.publishing.limits_due {
         let Limits { message_size, minimum_interval, calls, .. } = Limits::from(&wire.constraints);
@@ -292,7 +292,7 @@ pub(super) fn send_limits<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) 
     }
 }
 
-/// Sends each function whose news the peer does not have; `false` when there was no more room.
+/// Sends each function whose published generation has changed; `false` if capacity ran out.
 fn send_news<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
     for index in 0..wire.publishing.table.len() {
         let Some(&publication) = wire.publishing.table.get(index) else { break };
@@ -312,8 +312,7 @@ fn send_news<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
                     slot: slot.0,
                     generation: function.generation.0,
                     attributes: &Attributes { actuator, ..*function.attributes }.encode(),
-                    // One that the peer has no buffer for would end the link. Without one it counts as not kept there,
-                    // as any that it cannot read.
+                    // A signature longer than the peer's buffer would end the link. Without it, the function counts as skipped.
                     signature: [whole, least].into_iter().find(|one| may_hold(wire, one.len())).unwrap_or_default(),
                 };
                 wire.send_control(cx, &control)
@@ -325,7 +324,7 @@ fn send_news<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
         if function.is_some_and(|function| function.attributes.lease.is_some()) {
             (wire.publishing.actuators_due, wire.publishing.actuators_reported) = (true, 0);
         }
-        // Only once it is in the queue: after a full queue the loop begins again at the first function that is not told.
+        // Record it only once it is queued: after a full queue the loop restarts at the first function that was not sent.
         if let Some(publication) = wire.publishing.table.get_mut(index) {
             publication.advertised = wanted;
         }
@@ -333,7 +332,7 @@ fn send_news<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
     true
 }
 
-/// Whether the peer takes a message with a signature of this length.
+/// Whether the peer accepts a message with a signature of this length.
 fn may_hold<P: Port>(wire: &Wire<P>, length: usize) -> bool {
     let theirs = wire.hello().map_or(0, |hello| hello.limits.message_size);
     let limit = (theirs as usize).saturating_add(LONGEST_HEADER_BYTES).max(LEAST_MESSAGE_BYTES);

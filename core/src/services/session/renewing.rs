@@ -1,5 +1,4 @@
-//! New keys for a link that lives long: the proof of its beginning is made anew in its sealed frames, while calls, leases
-//! and emergencies go on.
+//! New keys for a long-lived link: the handshake is repeated inside its sealed frames, while calls and leases continue.
 //!
 //! ```text
 //! dialler                                        the other one
@@ -10,8 +9,8 @@
 //!   its datagrams go under the new key
 //! ```
 //!
-//! A turn is the last frame of its direction under the old keys, so each frame is opened with the keys that it was sealed
-//! with, however many are on their way. Only the end that dialled begins, so two renewals never meet.
+//! A turn is the last frame of its direction under the old keys, so the receiver knows for each frame in flight which keys it was
+//! sealed with. Only the end that dialled begins, so two renewals never collide.
 
 use super::Event;
 use super::due::Part;
@@ -29,22 +28,22 @@ use crate::time::{Duration, Instant};
 pub(super) struct Renewal {
     every: Duration,
     step: Step,
-    /// When datagrams under the key before are taken no longer.
+    /// Until when datagrams under the previous key are accepted.
     forget: Instant,
 }
 
-/// Where it stands.
+/// The state of the renewal.
 #[derive(Clone, Copy, Debug)]
 enum Step {
-    /// Nothing goes on. The end that dialled begins at this time; the other one lets it begin from then on.
+    /// Idle. The end that dialled begins at `due`; the other end accepts a renewal from `due` on.
     Resting { due: Instant },
-    /// This end's message waits for room in the stream.
+    /// This end's handshake message waits for send capacity.
     Telling { until: Instant, message: [u8; PROOF_BYTES] },
-    /// The peer is to go on.
+    /// Waiting for the peer.
     Awaiting { until: Instant },
-    /// The confirmation of the end that dialled waits for room in the stream.
+    /// The dialling end's confirmation waits for send capacity.
     Confirming { until: Instant },
-    /// The acknowledgement of the end that was dialled waits for room in the stream.
+    /// The dialled end's acknowledgement waits for send capacity.
     Acknowledging,
 }
 
@@ -66,14 +65,12 @@ impl Renewal {
         wire.due.set(Part::Keys, self.deadline(wire.dialed));
     }
 
-    /// Makes the keys of a secured link anew each time they are as old as `span`, or up to an eighth younger, instead of
-    /// [`HANDSHAKE_LIFE`]; at least [`SHORTEST_HANDSHAKE_LIFE`]. Holds from the next handshake on, for the end that dialled:
-    /// the other one follows.
+    /// Sets the lifetime of keys: see [`Session::renew_every`](super::Session::renew_every).
     pub(super) fn renew_every(&mut self, span: Duration) {
         self.every = span.max(SHORTEST_HANDSHAKE_LIFE);
     }
 
-    /// The link is live, or has new keys.
+    /// Schedules the next renewal: the link has just gone live or got new keys.
     pub(super) fn rest<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) {
         if wire.mode() == Mode::Plain {
             return;
@@ -83,14 +80,14 @@ impl Renewal {
         self.note_due(wire);
     }
 
-    /// Links that began together have nonces of their own.
+    /// Up to an eighth shorter than the set lifetime, by nonce, so that links that began together do not renew together.
     fn life_of_keys(&self, nonce: u64) -> Duration {
         let eighth = self.every.divided_by(8).as_micros();
         let less = (eighth >> 8).saturating_mul(nonce & 0xff);
         Duration::from_micros(self.every.as_micros().saturating_sub(less))
     }
 
-    /// Does what is due of the renewal.
+    /// Does what is due.
     pub(super) fn poll<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, moves: bool) {
         if !P::RENEWS_KEYS {
             return self.end_with_keys(wire, cx, moves);
@@ -100,7 +97,7 @@ impl Renewal {
             self.forget = Instant::FAR_FUTURE;
             self.note_due(wire);
         }
-        // Only the end that dialled begins: two handshakes at once on one link would each wait for the other's answer.
+        // Only the end that dialled begins: with two handshakes at once each end would wait for the other's answer.
         if let Step::Resting { due } = self.step {
             if wire.dialed() && (cx.now >= due || wire.link.cipher().is_worn()) {
                 self.begin(wire, cx, &[0; PROOF_BYTES]);
@@ -108,13 +105,13 @@ impl Renewal {
             return;
         }
         match cx.now >= self.deadline(wire.dialed()) {
-            // A peer that keeps the link alive and does not go on would leave it under worn keys for ever.
+            // Otherwise a peer could keep the link alive under worn keys by never continuing.
             true => wire.close(cx, CloseReason::HelloTimeout),
             false => self.pump(wire, cx),
         }
     }
 
-    /// In place of a renewal the end that dialled ends the link, to dial it again: as long as the keys last not while anything moves.
+    /// For builds without renewal: the dialling end ends the link, to dial anew. While anything moves, only if the keys are worn.
     fn end_with_keys<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, moves: bool) {
         let Step::Resting { due } = self.step else { return };
         if !wire.dialed() || cx.now < due && !wire.link.cipher().is_worn() {
@@ -128,7 +125,7 @@ impl Renewal {
         }
     }
 
-    /// Proves once more that this unit has the key of the pair; the end that was dialled answers the peer's `message`.
+    /// Starts the handshake anew; the end that was dialled answers the peer's `message`.
     fn begin<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, message: &[u8; PROOF_BYTES]) {
         let Some(credentials) = wire.credentials(cx) else { return };
         let begins = wire.dialed();
@@ -146,7 +143,7 @@ impl Renewal {
         }
     }
 
-    /// Sends what waits for room.
+    /// Sends what waited for capacity.
     pub(super) fn pump<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         if !P::RENEWS_KEYS {
             return;
@@ -162,14 +159,14 @@ impl Renewal {
             return;
         }
         match self.step {
-            // Until the same time as before.
+            // The time limit covers the whole handshake, so it is kept.
             Step::Telling { until, .. } | Step::Confirming { until } => self.step = Step::Awaiting { until },
             _ => self.rest(wire, cx.now),
         }
         wire.flush(cx);
     }
 
-    /// The last frame under the old keys, behind the message of the end that was dialled, and the first one under the new.
+    /// Sends the last frame under the old keys, after the dialled end's message, and the first frame under the new keys.
     fn send_turn<P: Port>(wire: &mut Wire<P>, message: Option<&[u8]>) -> bool {
         let confirmation = wire.link.cipher().confirmation();
         let confirm = Frame::Confirm(&confirmation);
@@ -179,7 +176,7 @@ impl Renewal {
         }
     }
 
-    /// A proof frame on a live link: the peer's message, or its turn.
+    /// A proof frame on a live link: the peer's handshake message, or its turn.
     pub(super) fn proof_arrived<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -196,7 +193,7 @@ impl Renewal {
                 }
                 return None;
             }
-            // Not before it is due: a handshake costs a board much computing, which a peer could otherwise ask for at will.
+            // Reject an early one: a handshake takes a board much computing time, which a peer could otherwise demand at will.
             (Some(first), Step::Resting { due }) if cx.now >= due && !wire.dialed() && message.len() == PROOF_BYTES => {
                 let first = *first;
                 self.begin(wire, cx, &first);
@@ -210,7 +207,7 @@ impl Renewal {
         None
     }
 
-    /// A confirm frame on a live link: the first one under the peer's new keys, or what acknowledges this end's.
+    /// A confirm frame on a live link: the first under the peer's new keys, or the acknowledgement of this end's.
     pub(super) fn confirmation_arrived<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -233,7 +230,7 @@ impl Renewal {
         None
     }
 
-    /// The peer has turned and confirmed. Its confirmation also says that it has that of an end that was dialled.
+    /// The peer has turned and confirmed. A dialling peer thereby also acknowledges this end's confirmation.
     fn confirmed_anew<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -252,7 +249,7 @@ impl Renewal {
         Ok(())
     }
 
-    /// The peer has the key of this end's datagrams.
+    /// The peer has the new key of this end's datagrams, which is used from now on.
     fn adopt_keys<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Result<(), CloseReason> {
         wire.link.cipher().acknowledged()?;
         if let Some(peer) = wire.identity() {
@@ -263,7 +260,7 @@ impl Renewal {
         Ok(())
     }
 
-    /// A datagram has been opened; the first one under a new key lets the one before go.
+    /// Notes an opened datagram. The first one under a new key starts the end of the previous key.
     pub(super) fn datagram_opened<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) {
         if P::RENEWS_KEYS && self.forget != Instant::FAR_FUTURE && wire.link.cipher().hears_newest() {
             self.forget = self.forget.min(now + PREVIOUS_KEY_LIFE);

@@ -1,8 +1,7 @@
-//! Streams on one link: samples of this unit's to the peer, and the peer's to this unit.
+//! Streams on one link: samples of this unit's streams to the peer, and of the peer's to this unit.
 //!
-//! State is the queue: a subscription knows which version the peer was sent last and when the next one may follow. A
-//! sample is made of what is newest when it is due and the stream is empty, so at most one waits at a time, and it is of
-//! the lowest class.
+//! There is no queue of samples: a subscription records which version was sent last and when the next may follow. A sample is
+//! made from the newest value when it is due and the send queue is empty, so that at most one waits, in the lowest class.
 
 use super::permitting::decide;
 use super::publishing::Advertised;
@@ -20,19 +19,19 @@ use crate::services::stream::{Source, Value};
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
-/// How long a sample waits for a buffer.
+/// How long to wait before retrying a sample that found no buffer.
 const RETRY: Duration = Duration::from_millis(10);
-/// A second in microseconds.
+/// One second in microseconds.
 const SECOND: u64 = 1_000_000;
 
-/// A value of a stream of the peer, in what was lent.
+/// A value of a stream of the peer, still in the lent bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sample {
     /// The peer's stream.
     pub slot: Slot,
-    /// Its age on arrival; never too low.
+    /// Its age on arrival; never underestimated.
     pub age: Duration,
-    /// The values: [`Session::results`](super::Session::results) shows them.
+    /// The values, for [`Session::results`](super::Session::results).
     pub values: Results,
 }
 
@@ -41,19 +40,19 @@ pub struct Sample {
 pub struct Granted {
     /// Least time between two values.
     pub interval: Duration,
-    /// Bytes of values of all its streams that the peer sends in a second.
+    /// Most bytes per second of all streams together that the peer sends.
     pub bytes: u32,
 }
 
-/// What the peer wants of one of this unit's streams.
+/// The peer's subscription to a stream of this unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Subscription {
-    /// In milliseconds, or [`NO_SUBSCRIPTION`].
+    /// Least interval between values in milliseconds, or [`NO_SUBSCRIPTION`].
     interval: u32,
-    /// Of the value that was sent last; 0 before.
+    /// The version that was sent last; 0 before the first.
     version: u32,
     generation: Generation,
-    /// What the peer is still to be told of it.
+    /// An answer that has yet to be sent to the peer.
     answer: Option<SubscriptionRefusal>,
     /// When the next value may follow.
     due: Instant,
@@ -75,11 +74,11 @@ impl Begins for Subscription {
 /// The streams of one link.
 #[derive(Clone, Copy)]
 pub(super) struct Streaming {
-    /// Subscriptions of the peer.
+    /// How many subscriptions the peer has.
     active: u16,
-    /// The slot that is looked at first: each stream has its turn where there is room for few.
+    /// The slot to begin with: streams take turns if not all samples can be sent.
     first: usize,
-    /// Up to here the peer has had the bytes that it may.
+    /// The byte limit is used up to this time; sending may continue after it.
     paid: Instant,
     answers_due: bool,
     wishes_due: bool,
@@ -90,12 +89,12 @@ impl Begins for Streaming {
         &Self { active: 0, first: 0, paid: Instant::START, answers_due: false, wishes_due: false };
 }
 
-/// When samples follow.
+/// When samples are sent next.
 #[derive(Clone, Copy)]
 pub(super) struct Pace {
-    /// The next one is due.
+    /// When the next sample is due.
     due: Instant,
-    /// They wait since then for the stream to be empty; in the far future where they do not.
+    /// Since when samples wait for the send queue to drain; in the far future if they do not.
     blocked: Instant,
 }
 
@@ -104,9 +103,9 @@ impl Begins for Pace {
 }
 
 impl Pace {
-    /// When a sample can be made, where so many bytes wait on the link.
+    /// When the next sample can be sent, if `queued` bytes wait on the link.
     pub(super) fn deadline(&self, queued: usize) -> Instant {
-        // What blocked the stream has gone out with something else, so that the port is not told that it takes bytes again.
+        // The queue may have drained with another write, without a writable notification: samples are due at once.
         if queued == 0 && self.blocked != Instant::FAR_FUTURE { self.blocked } else { self.due }
     }
 }
@@ -117,22 +116,22 @@ impl Streaming {
     }
 }
 
-/// What becomes of a sample that is due.
+/// The outcome of an attempt to send a sample.
 enum Attempt {
     Sent,
-    /// It may be sent then.
+    /// Not before this time.
     Later(Instant),
-    /// The stream is full.
+    /// The send queue is not empty.
     Blocked,
-    /// The subscription has ended, for this reason.
+    /// The subscription has ended for this reason.
     Ended(SubscriptionRefusal),
 }
 
-/// The part, which a build may leave out.
+/// The streams of a link; without state in builds that leave streams out.
 pub(super) type StreamsPart = State<Streaming, { STREAMS as usize }>;
 
 impl StreamsPart {
-    /// Wants values of a stream of the peer; without an interval, no more of them.
+    /// Subscribes to a stream of the peer, or ends the subscription if `interval` is `None`.
     pub(super) fn wish<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -157,7 +156,7 @@ impl StreamsPart {
         Ok(slot)
     }
 
-    /// A stream of this unit has a new value.
+    /// Schedules a new value of one of this unit's streams. Returns whether the peer has any subscription.
     pub(super) fn changed<P: Port>(&self, wire: &mut Wire<P>, now: Instant) -> bool {
         let wanted = self.active > 0;
         if wanted {
@@ -166,12 +165,12 @@ impl StreamsPart {
         wanted
     }
 
-    /// Streams of this unit that the peer is subscribed to.
+    /// How many streams of this unit the peer subscribes to.
     pub(super) fn active(&self) -> u16 {
         self.active
     }
 
-    /// Tells the peer what this unit wants of its streams, and what became of its own wishes.
+    /// Sends this unit's subscriptions, and answers to those of the peer.
     pub(super) fn pump<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         while P::CALLS && self.wishes_due {
             let Some((slot, generation, interval)) = wire.theirs.untold_wish() else {
@@ -191,7 +190,7 @@ impl StreamsPart {
         }
     }
 
-    /// Answers each subscription that is not; `false` when there was no more room.
+    /// Answers each subscription that has no answer yet; `false` if capacity ran out.
     fn send_answers<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> bool {
         let bytes = wire.constraints.stream_bytes;
         for slot in wire.publishing.all_slots() {
@@ -211,7 +210,7 @@ impl StreamsPart {
         true
     }
 
-    /// The peer wants values of a stream of this unit, or no more of them.
+    /// The peer subscribes to a stream of this unit, changes the interval, or unsubscribes.
     pub(super) fn subscription_arrived<P: Port>(
         &mut self,
         wire: &mut Wire<P>,
@@ -228,7 +227,7 @@ impl StreamsPart {
             wire.link.counters.add(LinkCounter::SubscriptionsRefused, 1);
         }
         let Some(subscription) = wire.publishing.subscription(slot) else { return };
-        // One that goes on at another pace has had the newest value.
+        // If only the interval changes, the peer already has the newest value.
         let (version, due) = match subscription.is_active() && subscription.generation == generation {
             true => (subscription.version, subscription.due.min(cx.now + millis(interval))),
             false => (0, cx.now),
@@ -242,7 +241,7 @@ impl StreamsPart {
         self.pump(wire, cx);
     }
 
-    /// Whether the peer may have a stream; its least interval in milliseconds.
+    /// Whether the peer may subscribe to a stream; returns the interval granted, in milliseconds.
     fn check_subscription<P: Port>(
         &self,
         wire: &mut Wire<P>,
@@ -261,7 +260,7 @@ impl StreamsPart {
         Ok(u32::from(stream.attributes.stream.unwrap_or(0)))
     }
 
-    /// A stream of this unit that the peer was told of.
+    /// A stream of this unit that was published to the peer.
     fn stream<'f, P: Port>(
         wire: &Wire<P>,
         cx: &Context<'f, P>,
@@ -281,8 +280,8 @@ impl StreamsPart {
         decide(cx.table(), wire.remote.as_ref(), stream.name(), Verb::Call)
     }
 
-    /// Sends each value that is due, as far as the stream is empty: so none is ever before a call that this end sends later, and
-    /// one that waits is the newest when it leaves.
+    /// Sends all samples that are due while the send queue stays empty. So no sample delays a call that this end sends later, and
+    /// each is the newest when it is sent.
     pub(super) fn send_samples<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         wire.pace_samples(*Pace::BEGIN);
         if self.active == 0 || wire.phase != Phase::Live {
@@ -329,7 +328,7 @@ impl StreamsPart {
         if due > cx.now {
             return Attempt::Later(due);
         }
-        // What gathers goes first.
+        // Flush gathered messages first.
         if wire.link.queued() > 0 {
             wire.flush(cx);
         }
@@ -365,7 +364,7 @@ impl StreamsPart {
             let made = micros(stamp).saturating_add(micros(since.as_micros()));
             let made = made.saturating_sub(micros(value.age_at(cx.now).as_micros()));
             let header = SampleHeader { slot, generation: subscription.generation, made };
-            // One that the peer cannot take is passed over, as the next one may be shorter.
+            // Skip a value that is too long for the peer; the next one may be shorter.
             let result = match value.block.len() > most {
                 true => Err(Error::TooLarge { limit: most as u32 }),
                 false => wire.send(cx, Priority::Low, total, &mut |writer| {
@@ -391,7 +390,7 @@ impl StreamsPart {
         }
         if let Some(span) = wire.publishing.subscription(slot) {
             span.version = version;
-            // Counted from when it was due, so that the pace holds where polls come late.
+            // Count from when this one was due, so that late polls do not lower the rate.
             let interval = millis(subscription.interval);
             span.due =
                 if subscription.due + interval > cx.now { subscription.due + interval } else { cx.now + interval };
@@ -399,7 +398,7 @@ impl StreamsPart {
         Attempt::Sent
     }
 
-    /// The peer is told that it has a stream no longer.
+    /// Ends a subscription of the peer, and notifies it.
     fn end_subscription<P: Port>(&mut self, wire: &mut Wire<P>, slot: Slot, why: SubscriptionRefusal) {
         if let Some(subscription) = wire.publishing.subscription(slot) {
             *subscription =
@@ -410,7 +409,7 @@ impl StreamsPart {
         self.change(|streaming| streaming.active = active);
     }
 
-    /// A value of a stream of the peer.
+    /// A sample of a stream of the peer has arrived.
     pub(super) fn sample_arrived<P: Port>(
         wire: &mut Wire<P>,
         now: Instant,
@@ -434,7 +433,7 @@ impl StreamsPart {
         Streams::of(Sample { slot, age, values }).map(Event::Sample)
     }
 
-    /// What became of a subscription of this unit.
+    /// The peer has answered a subscription of this unit.
     pub(super) fn subscription_answered<P: Port>(
         wire: &mut Wire<P>,
         slot: Slot,

@@ -1,4 +1,4 @@
-//! What a session does because time has passed: keep-alives, deadlines, leases, the end of a silent link.
+//! What a session does when time has passed: keep-alives, deadlines, ends of leases and of silent links.
 
 use super::due::Part;
 use super::granting::expire_granted;
@@ -14,17 +14,17 @@ use crate::services::lease::LeaseEnd;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
-/// A peer's clock as last heard, so that it can bound the age of what we send.
+/// The peer's clock as last received: sent back with requests, it lets the peer bound their age without synchronised clocks.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PeerClock {
     stamp: u64,
-    /// When the stamp came; in the far future while none has.
+    /// When the stamp arrived; in the far future before the first.
     heard: Instant,
 }
 
-/// A sample of the peer's clock counts for this long, however late the newer ones came.
+/// How long a sample is preferred to later ones that were delayed more.
 const SAMPLE_LIFE: Duration = Duration::from_secs(10);
-/// Part of the time since a sample by which the two clocks may have drifted apart.
+/// Assumed drift between both clocks: one part in this many.
 const DRIFT: u64 = 1_000;
 
 impl PeerClock {
@@ -32,10 +32,10 @@ impl PeerClock {
         Self { stamp: 0, heard: Instant::FAR_FUTURE }
     }
 
-    /// Notes the peer's clock. A sample that was held up on its way would make everything that is sent look old, so it
-    /// is passed over while a better one is fresh.
+    /// Takes a sample of the peer's clock. A delayed sample would make all requests look older than they are, so it is ignored
+    /// while a better one is fresh.
     pub(super) fn hear(&mut self, now: Instant, stamp: u64) {
-        // Before the first sample both are 0, so that one is taken.
+        // `elapsed` and `stamp` are 0 before the first sample, which is therefore taken.
         let elapsed = now.since(self.heard);
         let expected = Duration::from_micros(self.stamp) + elapsed - elapsed.divided_by(DRIFT);
         if Duration::from_micros(stamp) >= expected || elapsed >= SAMPLE_LIFE {
@@ -43,21 +43,21 @@ impl PeerClock {
         }
     }
 
-    /// (the stamp, time since it was heard).
+    /// The last stamp, and the time since it arrived.
     pub(super) fn stamp(&self, now: Instant) -> (u64, Duration) {
         (self.stamp, now.since(self.heard))
     }
 }
 
-/// The earliest time at which the peer can have made what it stamped so; `None` for a stamp that this clock has not reached, so never gave out.
+/// The earliest time at which the peer can have sent something with this stamp; `None` if this clock has not reached it yet.
 pub(super) fn sent_at_earliest(now: Instant, stamp: u64, since: Duration) -> Option<Instant> {
     let sent_at = Instant::from_micros(stamp) + since;
-    // The clocks drift: a sum that lies ahead means now.
+    // If the sum lies ahead, the clocks have drifted: take it as now.
     if Instant::from_micros(stamp) > now { None } else { Some(sent_at.min(now)) }
 }
 
 impl<P: Port> Session<P> {
-    /// When [`poll`](Self::poll) has something to do next.
+    /// When [`poll`](Self::poll) has to be called next.
     pub fn deadline(&self) -> Instant {
         match self.wire.phase {
             Phase::AwaitingHello { until } | Phase::Proving { until } => until,
@@ -71,7 +71,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Whether the table is what each part would say now. Of calls, leases and renewals it may say too early a time, and never too late.
+    /// Whether the table agrees with each part. For calls, leases and renewals it may be early, but never late.
     fn is_due_right(&self) -> bool {
         let due = &self.wire.due;
         let granted = self.granting.granted.iter().map(|granted| granted.end);
@@ -86,7 +86,7 @@ impl<P: Port> Session<P> {
             && (!DETAILS || due.at(Part::Details) == self.details.deadline())
     }
 
-    /// Does what is due. Returns one event at a time; call it until it returns `None`.
+    /// Does what is due and returns one event. Call it until it returns `None`.
     pub fn poll(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         match self.wire.phase {
             Phase::AwaitingHello { until } | Phase::Proving { until } => {
@@ -103,7 +103,7 @@ impl<P: Port> Session<P> {
     }
 
     fn poll_live(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        // Leases come first: what moves must stop before anything else is done.
+        // Leases first: motion must end before anything else is done.
         if (self.wire.due.has_come(Part::Leases, cx.now) || self.granting.was_stopped(cx))
             && let Some(slot) = self.granting.expire_lease(&mut self.wire, cx)
         {
@@ -125,7 +125,7 @@ impl<P: Port> Session<P> {
         {
             return Some(event);
         }
-        // From here on only frames are sent; what the port has to do for others was returned above, one event a call.
+        // All events were returned above, one per call. What follows only sends.
         if self.has_news() {
             self.pump(cx);
         }
@@ -170,7 +170,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Ends a link that gives way when nothing of it moves; whether it has.
+    /// Ends a link that is to give way to a higher claim, once nothing of it moves. Returns whether it has ended.
     pub(super) fn has_given_way(&mut self, cx: &mut Context<'_, P>) -> bool {
         let ends = self.granting.obedience.gives_way() && self.granting.is_quiet(&self.wire, cx);
         if ends {
@@ -179,7 +179,7 @@ impl<P: Port> Session<P> {
         ends
     }
 
-    /// Tells the peer what it is still to be told, as far as there is room.
+    /// Sends the peer all pending notifications, as far as there is capacity.
     pub(super) fn pump(&mut self, cx: &mut Context<'_, P>) {
         if !self.wire.may_advertise() {
             return;
@@ -193,14 +193,14 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Whether something waits for room.
+    /// Whether any notification waits for capacity.
     fn has_news(&self) -> bool {
         self.wire.publishing.has_news() || self.granting.has_news() || (STREAMS && self.streaming.has_news())
     }
 
-    /// Asks a peer that has missed a keep-alive for a sign of life, and gives it up when none comes.
+    /// Asks a peer that has missed a keep-alive for a sign of life, and ends the link if none comes in time.
     fn look_for_peer(&mut self, cx: &mut Context<'_, P>) {
-        // What is not read for now has come all the same.
+        // This unit leaves the stream unread, so its silence says nothing about the peer.
         if self.wire.holds && !self.wire.liveness.hears() {
             self.wire.heard(cx.now);
         }
@@ -217,7 +217,7 @@ impl<P: Port> Session<P> {
         }
         if look.deaf {
             self.wire.link.counters.count(LinkCounter::DatagramsMissing);
-            // The peer is told at once, in the stream: it sends its keep-alives there then.
+            // Tell the peer at once, in the stream, so that it sends its keep-alives there.
             self.wire.due.set(Part::KeepAlive, cx.now);
         }
         if look.ask {
@@ -229,12 +229,12 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The peer tells what comes of this unit there.
+    /// Evaluates the peer's report of what has reached it.
     pub(super) fn reported(&mut self, cx: &mut Context<'_, P>, report: Report) {
         let sent = self.wire.sent();
         if let Some(long) = self.wire.liveness.reported(cx.now, sent, report) {
             let reason = CloseReason::StreamDead { long };
-            // What the stream does not bring there: the peer need not find out by itself.
+            // Send the reason by datagram, since the stream does not reach the peer: else it would have to time out by itself.
             for _ in 0..CHALLENGE_DATAGRAMS {
                 self.wire.send_datagram(cx, &SessionBody::close(close_code(reason)), &[]);
             }
@@ -243,7 +243,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Reports what ended with the link, one by one: leases first.
+    /// Reports what ended with the link, one event per call: leases first.
     fn poll_ending(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) -> Option<Event> {
         while let Some(granted) = self.granting.granted.pop() {
             if expire_granted(cx, &granted, LeaseEnd::Expired) {
@@ -257,14 +257,14 @@ impl<P: Port> Session<P> {
         }
         self.wire.link.release(cx.buffers);
         self.calls.release(cx.buffers);
-        // Results that were not looked at were in a buffer that has gone back.
+        // Unread results were in a buffer that is now back in the pool.
         self.wire.step = self.wire.step.wrapping_add(1);
         self.wire.phase = Phase::Ended;
         Some(Event::Closed(reason))
     }
 
     fn send_keep_alive(&mut self, cx: &mut Context<'_, P>) {
-        // The peer counts by what it was told in the hello.
+        // The peer's timeout counts from the interval in the hello, even if the constraint has become longer.
         let reported = Duration::from_millis(self.wire.reported_keep_alive.into());
         let pause = self.wire.constraints.keep_alive.min(reported).max(Duration::from_millis(1));
         self.wire.due.set(Part::KeepAlive, cx.now + pause);
@@ -272,7 +272,7 @@ impl<P: Port> Session<P> {
         self.pump(cx);
         let body = SessionBody::keep_alive(cx.now.as_micros(), self.wire.report());
         self.wire.send_datagram(cx, &body, &[]);
-        // Where none come, none may arrive there either: the peer could not tell.
+        // Use the stream, too, unless datagrams pass both ways: the peer cannot notice that they no longer reach it.
         if !self.wire.liveness.is_heard() || !self.wire.liveness.hears() {
             self.wire.link.send_frame(&Frame::Session(&body));
             self.wire.flush(cx);

@@ -1,4 +1,4 @@
-//! What every part of a session may touch: the link with its sealing, the peer and its liveness, both lists, and what is due.
+//! What a session lends its parts: the link and its encryption, the peer and its liveness, function lists and deadlines.
 
 use super::due::{Due, Part};
 use super::publishing::Publishing;
@@ -26,19 +26,19 @@ use crate::time::{Duration, Instant};
 /// Longest session datagram.
 const LONGEST_DATAGRAM: usize =
     datagram::SESSION_HEADER_BYTES + SESSION_BODY_BYTES + DATAGRAM_BYTES + DATAGRAM_OVERHEAD;
-/// Gathered one-way messages go out when there are this many bytes of them.
+/// Gathered one-way messages are sent once they are this long together.
 const GATHERED_BYTES: usize = 8 * 1024;
 
-/// Where the link stands.
+/// The state of the link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Phase {
     /// The port is opening the connection, or waits for the peer's hello.
     AwaitingHello { until: Instant },
-    /// The peer is to prove that it has the key: with a message, then with a sealed frame.
+    /// The peer has to prove that it has the key: by its handshake message, then by a sealed frame (Noise NNpsk0).
     Proving { until: Instant },
-    /// The hub decides about the peer.
+    /// Waiting for the hub's decision about the peer.
     Deciding,
-    /// Both have accepted.
+    /// Both ends have admitted each other.
     Live,
     /// The link has ended; what was in flight is being reported.
     Ending(CloseReason),
@@ -46,49 +46,49 @@ pub(super) enum Phase {
     Ended,
 }
 
-/// What is known of the peer since its hello.
+/// What the peer's hello said.
 pub(super) struct Remote<E> {
     pub(super) hello: Hello,
     /// The highest version that both ends speak.
     pub(super) version: u8,
-    /// When its hello came.
+    /// When the hello arrived.
     pub(super) heard: Instant,
     /// Where its session datagrams go.
     pub(super) datagrams: E,
 }
 
-/// The link to the peer, which a session lends to each of its parts.
+/// The link, lent to each part of a session.
 pub(super) struct Wire<P: Port> {
     pub(super) link: Link<P::Storage, P::Cipher>,
     pub(super) phase: Phase,
     pub(super) dialed: bool,
     pub(super) nonce: u64,
     pub(super) fleet: Fleet,
-    /// The pause between keep-alives, in milliseconds, that this unit's hello has named.
+    /// The keep-alive interval in milliseconds that this unit's hello announced.
     pub(super) reported_keep_alive: u32,
     pub(super) constraints: Constraints,
     pub(super) remote: Option<Remote<P::Endpoint>>,
     pub(super) peer_address: P::Endpoint,
     pub(super) liveness: Liveness,
-    /// More of the stream is there and is not read for now.
+    /// Bytes of the stream are left unread for now.
     pub(super) holds: bool,
     /// The hub has taken the peer.
     pub(super) joined: bool,
-    /// The hub waits for a sign of life.
+    /// The hub waits for a sign of life to decide about a duplicate.
     pub(super) challenged: bool,
     pub(super) clock: PeerClock,
     pub(super) due: Due,
     pub(super) pace: State<Pace, { STREAMS as usize }>,
-    /// The last write, behind which one-way messages gather.
+    /// The last write: one-way messages within a short time after it are gathered.
     pub(super) last_write: Instant,
     pub(super) publishing: Publishing<P::Storage>,
     pub(super) theirs: TheirFunctionList<P::Storage>,
-    /// How often something was received, by which [`Results`](super::Results) are known to be the last ones.
+    /// Counts calls of `receive`: [`Results`](super::Results) of an earlier one are stale.
     pub(super) step: u32,
 }
 
 impl<P: Port> Wire<P> {
-    /// This unit opened the connection.
+    /// Whether this unit opened the connection.
     pub(super) const fn dialed(&self) -> bool {
         !P::MANAGES || self.dialed
     }
@@ -98,12 +98,12 @@ impl<P: Port> Wire<P> {
         self.remote.as_ref().map(|remote| &remote.hello)
     }
 
-    /// The peer's identity, once it has told it.
+    /// The peer's identity, once its hello has come.
     pub(super) fn identity(&self) -> Option<&Identity> {
         self.hello().map(|hello| &hello.identity)
     }
 
-    /// Ends the link in an orderly way.
+    /// Ends the link with a close frame.
     pub(super) fn close(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) {
         if matches!(reason, CloseReason::Protocol | CloseReason::Oversize) {
             self.link.counters.count(LinkCounter::FramesRefused);
@@ -112,11 +112,11 @@ impl<P: Port> Wire<P> {
         self.end(reason);
     }
 
-    /// The peer is not taken, and told why.
+    /// Refuses the peer and tells it why.
     pub(super) fn refuse(&mut self, cx: &mut Context<'_, P>, refusal: Refusal) {
         match refusal {
             Refusal::NoKey => {
-                // The code of a proof that failed: the peer need not know which of the two it was.
+                // Send the code of a failed proof: the peer need not know whether its key is missing or wrong.
                 self.link.counters.count(LinkCounter::KeysMissing);
                 self.farewell(cx, &Frame::Close(close_code(CloseReason::BadProof)));
             }
@@ -125,10 +125,10 @@ impl<P: Port> Wire<P> {
         self.end(CloseReason::Refused(refusal));
     }
 
-    /// A last frame, behind what is being written, as far as the network takes it now.
+    /// Sends a last frame after what is queued, as far as the network takes bytes now.
     pub(super) fn farewell(&mut self, cx: &mut Context<'_, P>, frame: &Frame<'_>) {
         if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
-            // What was accepted goes first: a frame would overtake it.
+            // Flush first: a frame would overtake queued messages.
             let _ = self.link.flush(cx.mailman, cx.buffers);
             self.send_frame(frame);
             let _ = self.link.flush(cx.mailman, cx.buffers);
@@ -152,7 +152,7 @@ impl<P: Port> Wire<P> {
         }
     }
 
-    /// Puts a frame into the stream, sealed if frames are.
+    /// Queues a frame for the stream, sealed once encryption has begun.
     pub(super) fn send_frame(&mut self, frame: &Frame<'_>) -> bool {
         if self.link.cipher().is_sealing() { self.link.send_frame(frame) } else { self.link.send_clear(frame) }
     }
@@ -161,18 +161,18 @@ impl<P: Port> Wire<P> {
         self.link.cipher().mode()
     }
 
-    /// Longest block that the peer takes.
+    /// Longest block that the peer accepts.
     pub(super) fn peer_message_size(&self) -> u32 {
         self.hello().map_or(0, |hello| hello.limits.message_size)
     }
 
-    /// Our own minimum interval or the peer's, whichever is longer.
+    /// The minimum interval: this unit's or the peer's, whichever is longer.
     pub(super) fn interval(&self) -> Duration {
         let theirs = self.hello().map_or(0, |hello| hello.limits.minimum_interval);
         self.constraints.minimum_interval.max(Duration::from_micros(u64::from(theirs)))
     }
 
-    /// One piece of code whatever is written, which is a third of what it would be for each kind.
+    /// Not generic over the writer: one instance has a third of the code size of one for each message.
     pub(super) fn send(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -203,7 +203,7 @@ impl<P: Port> Wire<P> {
         }
     }
 
-    /// Results that came in what was lent, or lie in the link.
+    /// Results that are in the lent bytes, or in a buffer of the link.
     pub(super) fn results<'b>(&'b self, results: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
         if results.step != self.step {
             return Err(Error::ResultLost);
@@ -211,7 +211,7 @@ impl<P: Port> Wire<P> {
         self.kept_results(results.slot, results.generation, self.link.view(results.block, lent))
     }
 
-    /// The same of values that a call tells while it runs.
+    /// As [`results`](Self::results), for the progress of a running call.
     pub(super) fn progress<'b>(&'b self, values: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
         let block = self.results(values, lent)?;
         Ok(ReplyBlock { specs: block.signature.progress(), ..block })
@@ -228,9 +228,8 @@ impl<P: Port> Wire<P> {
         Ok(ReplyBlock { signature, specs: signature.results(), bytes })
     }
 
-    /// What an attempt to send means for the messages that gather. A message that is refused leaves them where they
-    /// were: they go out now, because nothing else may come to take them along, and they hold the buffer that the next
-    /// attempt needs.
+    /// Updates the gathering of one-way messages after an attempt to send. If a message was refused, the gathered ones are sent
+    /// now: no later message may come to take them along, and they occupy the buffer that the retry needs.
     pub(super) fn after_sending(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -245,7 +244,7 @@ impl<P: Port> Wire<P> {
                 self.due.hasten(Part::Gathered, cx.now + GATHER);
                 return sent;
             }
-            // What is not held has taken with it what was.
+            // A message that is not held has taken the gathered ones along.
             Ok(()) if !hold => self.due.set(Part::Gathered, Instant::FAR_FUTURE),
             Ok(()) => self.flush(cx),
             Err(Error::Closed(reason)) => self.end(reason),
@@ -257,19 +256,19 @@ impl<P: Port> Wire<P> {
         sent
     }
 
-    /// Changes when samples follow.
+    /// Sets when samples are sent next.
     pub(super) fn pace_samples(&mut self, pace: Pace) {
         self.pace.change(|known| *known = pace);
         self.note_pace();
     }
 
-    /// What blocked samples may have gone out with something else, of which a port is not told.
+    /// A queue that blocked samples may have drained with another write, of which the port is not notified.
     #[inline(never)]
     fn note_pace(&mut self) {
         self.due.set(Part::Streams, self.pace.deadline(self.link.queued()));
     }
 
-    /// Something came in the stream.
+    /// Notes that the stream brought bytes.
     #[inline(never)]
     pub(super) fn heard(&mut self, now: Instant) {
         self.liveness.heard(now);
@@ -280,12 +279,12 @@ impl<P: Port> Wire<P> {
         self.due.set(Part::Liveness, self.liveness.deadline());
     }
 
-    /// Whether a one-way message made at `now` may wait for company.
+    /// Whether to hold back a one-way message made at `now`, so that later ones share its write.
     pub(super) fn may_gather(&self, now: Instant) -> bool {
         self.last_write != Instant::START && now < self.last_write + GATHER
     }
 
-    /// Whether the peer may be told what is published: it has proven itself to this end, which dialled, or the link is live.
+    /// Whether published functions may be sent: the link is live, or the peer that this end dialled has proven itself.
     pub(super) fn may_advertise(&mut self) -> bool {
         match self.phase {
             Phase::Live => true,
@@ -294,7 +293,7 @@ impl<P: Port> Wire<P> {
         }
     }
 
-    /// Sends a control message; `false` when there is no room, or nobody to send it to.
+    /// Sends a control message; `false` if there is no capacity, or the peer may not get one yet.
     pub(super) fn send_control(&mut self, cx: &mut Context<'_, P>, control: &Control<'_>) -> bool {
         if !self.may_advertise() {
             return false;
@@ -304,12 +303,12 @@ impl<P: Port> Wire<P> {
         self.send(cx, Priority::High, message.len(), &mut |writer| writer.put(message)).is_ok()
     }
 
-    /// Bytes written into the stream, as reports count them.
+    /// Bytes written to the stream so far, modulo 2^32 as in reports.
     pub(super) fn sent(&self) -> u32 {
         self.link.counters.value(LinkCounter::BytesSent) as u32
     }
 
-    /// What comes of the peer here.
+    /// A report of what has arrived from the peer.
     pub(super) fn report(&self) -> Report {
         Report {
             received: self.link.counters.value(LinkCounter::BytesReceived) as u32,
@@ -318,7 +317,7 @@ impl<P: Port> Wire<P> {
         }
     }
 
-    /// Sends a session datagram; `body` and `rest` follow each other in it. `false` when the network refused it.
+    /// Sends a session datagram of `body` followed by `rest`. `false` if the network refused it.
     pub(super) fn send_datagram(&mut self, cx: &mut Context<'_, P>, body: &[u8], rest: &[u8]) -> bool {
         let Some((to, header)) = self.datagram_header() else { return false };
         let (front, back) = self.link.cipher().datagram_room();
@@ -352,7 +351,7 @@ impl<P: Port> Wire<P> {
         Some((remote.datagrams, header))
     }
 
-    /// The key of the pair, with which each end is to prove who it is. The link ends where there is none.
+    /// The key of the pair, with which each end authenticates itself. Ends the link if there is none.
     pub(super) fn credentials(&mut self, cx: &mut Context<'_, P>) -> Option<<P::Cipher as Secure>::Credentials> {
         let Remote { hello, .. } = self.remote.as_ref()?;
         let credentials = cx.keys.credentials(hello);
@@ -364,7 +363,7 @@ impl<P: Port> Wire<P> {
         credentials
     }
 
-    /// Ends a link whose peer has not proven who it is.
+    /// Ends a link whose peer failed to authenticate itself.
     pub(super) fn fail(&mut self, cx: &mut Context<'_, P>) {
         self.link.counters.count(LinkCounter::ProofsFailed);
         self.close(cx, CloseReason::BadProof);
