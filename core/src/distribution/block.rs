@@ -1,9 +1,9 @@
 //! The encoding of a block of parameters: the values in the signature's order, without names, read in place.
 //!
-//! Every value starts at a multiple of 8 bytes from the block's start. Integers are 8 bytes each, little-endian;
-//! floats the same with their bits; truth values one byte each, 0 or 1, padded with zeros to 8; strings and bytes have
-//! their length as u32, four bytes of zero, then the bytes, padded with zeros to 8. There is one encoding of each
-//! list of values; anything else is malformed. Lists and records are in [`nested`].
+//! Every value starts at a multiple of 8 bytes from the block's start. Integers are 8 bytes each, little-endian; floats likewise
+//! by their bits; truth values one byte each, 0 or 1, padded with zeros to 8; strings and bytes are their length as u32, four
+//! zero bytes, then the bytes, padded with zeros to 8; [`nested`] has lists and records. The encoding is unique: anything else is
+//! malformed.
 
 use super::function::Signature;
 use super::nested::{self, is_canonical, split};
@@ -14,7 +14,7 @@ use crate::bytes::copy;
 use crate::config::VARIABLES;
 use crate::error::{Error, Limit};
 
-/// Where a block is written to. It has room: the length is checked before.
+/// The target of a block. It has enough capacity, since the length is checked before.
 pub trait Put {
     /// Appends `bytes`.
     fn put(&mut self, bytes: &[u8]);
@@ -52,8 +52,8 @@ const ZEROS: [u8; 8] = [0; 8];
 
 /// Checks `parameters` against `specs` and returns the length of their block in bytes.
 ///
-/// More variables than needed are allowed, and a string or bytes shorter than declared. The errors are
-/// [`Error::MissingArgument`], [`Error::WrongType`] and [`Error::WrongSize`], with the position among the specs.
+/// Extra variables are allowed, and so are strings and bytes shorter than declared. The errors, with an index among the specs:
+/// [`Error::MissingArgument`], [`Error::WrongType`] and [`Error::WrongSize`].
 ///
 /// ```
 /// use cara_core::distribution::{block, function::Definition, parameters::Parameters};
@@ -106,7 +106,7 @@ pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut imp
     }
 }
 
-/// The longest block that `specs` allow, in bytes; `None` where that exceeds the address space.
+/// The longest block of `specs` in bytes; `None` if that exceeds the address space.
 pub fn longest(specs: VariableSpecs<'_>) -> Option<usize> {
     specs.raw().try_fold(0_usize, |sum, spec| {
         if spec.kind.is_nested() {
@@ -124,10 +124,9 @@ pub fn check(specs: VariableSpecs<'_>, block: &[u8]) -> Result<(), Error> {
 
 /// Updates `parameters` with a block of results (paper, section 2: "the request will update the `pos` object").
 ///
-/// Variables of the same name take the new value; missing ones are added with their declared size. Everything is
-/// validated first, UTF-8 once: [`Error::ResultLost`] for a malformed block, since the service has run, or
-/// [`Error::ResultWouldNotFit`], [`Error::WrongType`],
-/// [`Error::WrongSize`] and [`Error::Full`] if the parameters can't hold the results. On any error they are unchanged.
+/// Variables of the same name take the new value; missing ones are added with their declared size. The whole block is validated
+/// first. Errors leave the parameters unchanged: [`Error::ResultLost`] for a malformed block, since the service has run;
+/// [`Error::ResultWouldNotFit`], [`Error::WrongType`], [`Error::WrongSize`] and [`Error::Full`] if the results do not fit.
 pub fn read(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
     let read = each(specs, block, |index, spec, value| {
@@ -142,8 +141,8 @@ pub fn read(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersV
     commit(specs, block, parameters)
 }
 
-/// Whether `parameters` can hold every result that `specs` allow, before the call is sent; the errors of [`read`]. How long
-/// a list gets is not known before: it is taken as empty.
+/// Checks before a call is sent whether `parameters` can hold all possible results; errors as for [`read`]. Lists count as empty,
+/// since their length is not known yet.
 pub fn check_results_fit(specs: VariableSpecs<'_>, parameters: &ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
     for (position, spec) in specs.raw().enumerate() {
@@ -156,10 +155,9 @@ pub fn check_results_fit(specs: VariableSpecs<'_>, parameters: &ParametersView) 
     room.check()
 }
 
-/// Replaces the variables of `parameters` by the arguments in a block, each with its declared size: what a service
-/// gets to see.
+/// Replaces the variables of `parameters` by the arguments in a block, each with its declared size, for a service.
 ///
-/// [`Error::Malformed`], or [`Error::Full`] if the parameters are too small; they may be empty after an error.
+/// [`Error::Malformed`], or [`Error::Full`] if the parameters are too small. They may be empty after an error.
 pub fn read_arguments(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     parameters.clear();
     let read = each(specs, block, |_, spec, value| parameters.add_with(spec, value));
@@ -169,10 +167,10 @@ pub fn read_arguments(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut P
     read
 }
 
-/// Adds the results that are not among `parameters` yet, so that a service only sets them.
+/// Adds the results that are not in `parameters` yet, so that a service only has to set them.
 ///
-/// [`Error::Full`] if the parameters are too small, [`Error::WrongType`] and [`Error::WrongSize`] for a variable that is
-/// another one than the result of its name.
+/// [`Error::Full`] if the parameters are too small, [`Error::WrongType`] and [`Error::WrongSize`] if a variable with the name of
+/// a result differs from it.
 pub fn prepare_results(specs: VariableSpecs<'_>, parameters: &mut ParametersView) -> Result<(), Error> {
     for (position, spec) in specs.raw().enumerate() {
         let index = position as u8;
@@ -190,7 +188,7 @@ pub fn prepare_results(specs: VariableSpecs<'_>, parameters: &mut ParametersView
     Ok(())
 }
 
-/// What is left of some parameters while results are fitted in.
+/// The capacity left in some parameters while results are counted.
 struct Room {
     variables: usize,
     bytes: usize,
@@ -202,7 +200,7 @@ impl Room {
         Self { variables: VARIABLES.saturating_sub(parameters.len()), bytes: parameters.remaining(), needed: 0 }
     }
 
-    /// Takes the room for one result of `size` elements; a variable of its name must be able to hold it.
+    /// Counts one result of `size` elements; an existing variable of its name must be able to hold it.
     fn take(&mut self, parameters: &ParametersView, index: u8, spec: RawSpec<'_>, size: u32) -> Result<(), Error> {
         let Some(value) = parameters.named(spec.name) else {
             self.variables = self.variables.checked_sub(1).ok_or(Error::Full(Limit::Variables))?;
@@ -223,7 +221,7 @@ impl Room {
         Ok(())
     }
 
-    /// Takes the room for a list or record. Its new value is put behind all others before the old one goes.
+    /// Counts a list or record. Its new value is written after all others before the old one is removed.
     fn take_nested(&mut self, to: &ParametersView, index: u8, spec: RawSpec<'_>, bytes: &[u8]) -> Result<(), Error> {
         let Some(own) = to.named(spec.name) else {
             self.take(to, index, spec, spec.size)?;
@@ -236,7 +234,7 @@ impl Room {
         Ok(())
     }
 
-    /// The same before the value is known.
+    /// The same while the value is not known.
     fn take_any_nested(&mut self, to: &ParametersView, index: u8, spec: RawSpec<'_>) -> Result<(), Error> {
         match to.named(spec.name) {
             Some(own) if spec::can_be(spec, own.raw_spec(), spec::Bounds::Free) => Ok(()),
@@ -245,7 +243,7 @@ impl Room {
         }
     }
 
-    /// Whether everything new fits together.
+    /// Whether all new values fit together.
     fn check(&self) -> Result<(), Error> {
         if self.needed > self.bytes {
             return Err(Error::ResultWouldNotFit { need: saturate(self.needed), have: saturate(self.bytes) });
@@ -254,7 +252,7 @@ impl Room {
     }
 }
 
-/// Validates a block and shows each value, its UTF-8 included, to `visit`.
+/// Validates a block, including UTF-8, and passes each value to `visit`.
 fn each<'s>(
     specs: VariableSpecs<'s>,
     block: &[u8],
@@ -271,7 +269,7 @@ fn each<'s>(
         rest = behind;
         refusal = refusal.and_then(|()| visit(index as u8, spec, value));
     }
-    // A malformed block is the peer's fault, whatever else would be wrong with its values.
+    // If the block is malformed, report that, and not an error of a value in it.
     if rest.is_empty() { refusal } else { Err(Error::Malformed) }
 }
 
@@ -310,8 +308,8 @@ fn encoded_length(value: Value<'_>) -> usize {
 }
 
 impl ParametersView {
-    /// Replaces all variables by the arguments of a function, then its other results, each 0, `false` or empty: in the order
-    /// in which a service gets them.
+    /// Replaces all variables by the arguments of a function, then its other results, each 0, `false` or empty, in the order in
+    /// which a service gets them.
     #[doc(hidden)]
     pub fn lay_out(&mut self, function: Signature<'_>) -> Result<(), Error> {
         self.clear();

@@ -1,12 +1,12 @@
-//! postcard's layout, written and read by hand: numbers of several bytes as varints, texts and lists behind their length,
-//! one byte for a choice. What serde derives of it takes far more of a board's flash; the tests compare the two.
+//! The [postcard](https://postcard.jamesmunns.com/wire-format) format, encoded by hand: numbers as varints, texts and lists after
+//! their length, one byte for a choice. What serde derives takes far more flash; tests compare the two.
 //!
-//! Neither side stops at the first error: it is recorded, and returned at the end.
+//! Neither direction stops at the first error: it is recorded, and returned at the end.
 
 use super::items::ALIGNMENT;
 use crate::config::NODE_NAME_BYTES;
 
-/// Writes values one behind the other.
+/// Writes values in sequence.
 pub(crate) struct Writer<'o> {
     out: &'o mut [u8],
     used: usize,
@@ -53,20 +53,20 @@ impl<'o> Writer<'o> {
         self.byte(flag.into());
     }
 
-    /// A text, or bytes behind their length.
+    /// A text or bytes, after their length.
     pub(crate) fn text(&mut self, text: &[u8]) {
         self.number(text.len() as u64);
         self.bytes(text);
     }
 
-    /// Begins an item of a list that can grow (see [`items`](super::items)); [`end`](Self::end) takes what is returned.
+    /// Begins an item of an extensible list (see [`items`](super::items)); pass the returned offset to [`end`](Self::end).
     pub(crate) fn begin(&mut self, kind: u16) -> usize {
         self.bytes(&kind.to_le_bytes());
         self.bytes(&[0, 0]);
         self.used
     }
 
-    /// Ends the item whose body begins at `start`: its length is put in front of it, and zeros behind it.
+    /// Ends the item whose body begins at `start`: fills in its length, and appends padding.
     #[cfg_attr(target_os = "none", inline(never))]
     pub(crate) fn end(&mut self, start: usize) {
         let length = self.used.saturating_sub(start);
@@ -80,13 +80,13 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// How many bytes were written; `None` where they did not fit.
+    /// How many bytes were written; `None` if they did not fit.
     pub(crate) const fn finish(self) -> Option<usize> {
         if self.fits { Some(self.used) } else { None }
     }
 }
 
-/// Reads values in sequence. After an error all are zero.
+/// Reads values in sequence. After an error all values are zero.
 pub(crate) struct Reader<'b> {
     rest: &'b [u8],
     sound: bool,
@@ -97,7 +97,7 @@ impl<'b> Reader<'b> {
         Self { rest: bytes, sound: true }
     }
 
-    /// What follows cannot be read.
+    /// Records an error.
     #[cold]
     pub(crate) fn fail(&mut self) {
         self.sound = false;
@@ -131,7 +131,7 @@ impl<'b> Reader<'b> {
         }
     }
 
-    /// A number of a type with so many bits.
+    /// A number that fits this many bits.
     #[cfg_attr(target_os = "none", inline(never))]
     fn number(&mut self, bits: u32) -> u64 {
         let (mut value, mut shift) = (0_u64, 0_u32);
@@ -175,7 +175,7 @@ impl<'b> Reader<'b> {
         byte == 1
     }
 
-    /// A text, or bytes behind their length.
+    /// A text or bytes, after their length.
     pub(crate) fn text(&mut self) -> &'b [u8] {
         let length = self.length();
         self.bytes(length)
@@ -190,7 +190,7 @@ impl<'b> Reader<'b> {
         })
     }
 
-    /// Whether all that was asked for could be read. More may be left: what a later version has put behind it.
+    /// Whether everything requested could be read. Bytes of a later version may be left.
     pub(crate) const fn is_sound(&self) -> bool {
         self.sound
     }

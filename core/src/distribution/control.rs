@@ -1,5 +1,5 @@
-//! Control messages: what two units tell each other beside requests and replies. One table has them all: it makes the enum
-//! and both directions of its encoding, an [item](super::items) each.
+//! Control messages: notifications between two units beside requests and replies (docs/wire.md). A table generates the enum, its
+//! encoder and its decoder; each message is an [item](super::items).
 
 use super::claim::Claim;
 use super::compact::{Reader, Writer};
@@ -8,14 +8,13 @@ use super::items::{Item, Malformed};
 use crate::ability::STREAMS;
 use crate::error::Error;
 
-/// The kind of a message that has control items.
+/// The message kind of control messages.
 pub(super) const CONTROL: u8 = 3;
 
-/// Makes [`Control`] of its table: each row is the item's kind, the variant and its fields in their order.
+/// Generates [`Control`]: each row has the item's kind, the variant, and the fields in wire order.
 macro_rules! controls {
     ($($(#[$about:meta])* $kind:literal $(if $is_on:ident)? => $name:ident { $($(#[$field_about:meta])* $field:ident: $type:ty,)* })*) => {
-        /// Messages between two units that are no requests: what they tell each other about their functions, limits and
-        /// leases.
+        /// A notification between two units: about functions, limits, leases, claims or streams.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub enum Control<'b> {
             $($(#[$about])* $name { $($(#[$field_about])* $field: $type,)* },)*
@@ -33,12 +32,12 @@ macro_rules! controls {
                         $($field.put(writer);)*
                         writer.end(item);
                     })*
-                    // None is made of an ability that is off.
+                    // Variants of abilities that this build lacks are never made.
                     _ => {}
                 }
             }
 
-            /// Reads an item of a control message; `None` for a kind that this version does not know.
+            /// Decodes an item; `None` for a kind that this version does not know.
             pub fn take(item: &Item<'b>) -> Result<Option<Self>, Malformed> {
                 item.read(|reader| match item.kind {
                     $($kind $(if $is_on)? => Some(Self::$name { $($field: Field::take(reader)),* }),)*
@@ -54,7 +53,7 @@ controls! {
     1 => Publish {
         /// Its slot.
         slot: u16,
-        /// Its life.
+        /// Its generation.
         generation: u16,
         /// [`Attributes`](super::function::Attributes) in their wire form.
         attributes: &'b [u8],
@@ -66,53 +65,53 @@ controls! {
         /// Its slot.
         slot: u16,
     }
-    /// All publishing and withdrawing up to here is to be acknowledged.
+    /// Asks for an acknowledgement of everything published and withdrawn so far.
     3 => ListEnd {
-        /// Rises with each acknowledgement asked for.
+        /// Increases with each such request.
         serial: u32,
     }
-    /// The list up to `serial` was read.
+    /// The list was processed up to `serial`.
     4 => ListAck {
         /// As in `ListEnd`.
         serial: u32,
-        /// Functions that the reader keeps no room for.
+        /// How many functions did not fit the reader's table.
         skipped: u16,
     }
     /// The sender's limits changed.
     5 => Limits {
-        /// Longest message that the sender takes.
+        /// Longest message that the sender accepts.
         message_size: u32,
         /// Least time between two requests to the sender, in microseconds.
         minimum_interval: u32,
-        /// Calls of one peer that the sender holds.
+        /// Most calls of one peer at a time.
         calls: u16,
     }
-    /// The callee ended what a leased call started; renewals have no effect.
+    /// The callee has ended a call's lease; renewals have no effect.
     6 => LeaseEnded {
         /// The caller's id of the call.
         call: u32,
         /// Why.
         why: LeaseEnd,
     }
-    /// The state of what a function of the sender moves.
+    /// The state of the actuator of one of the sender's functions.
     7 => Actuator {
         /// Its slot.
         slot: u16,
-        /// What keeps every order from beginning.
+        /// The latch, if the actuator is stopped.
         latch: Option<Latch>,
-        /// The order that it has, or had last.
+        /// The present or last order.
         last: Option<LastOrder>,
     }
     /// The sender has raised its claim.
     10 => Claimed {
-        /// What it is now.
+        /// The new claim.
         report: ClaimReport,
     }
-    /// The sender wants values of a stream of the reader, or no more of them.
+    /// The sender subscribes to a stream of the reader, or ends the subscription.
     8 if STREAMS => Subscribe {
         /// Its slot.
         slot: u16,
-        /// Its life.
+        /// Its generation.
         generation: u16,
         /// Least time between two values in milliseconds; [`NO_SUBSCRIPTION`](super::message::NO_SUBSCRIPTION) ends it.
         interval: u32,
@@ -121,11 +120,11 @@ controls! {
     9 if STREAMS => Subscribed {
         /// Its slot.
         slot: u16,
-        /// Its life.
+        /// Its generation.
         generation: u16,
-        /// Least time between two values in milliseconds, [`NO_SUBSCRIPTION`](super::message::NO_SUBSCRIPTION) where it was ended or refused.
+        /// Least time between two values in milliseconds; [`NO_SUBSCRIPTION`](super::message::NO_SUBSCRIPTION): ended or refused.
         interval: u32,
-        /// Bytes of values of all streams that the sender sends in a second.
+        /// Most bytes of stream values that the sender sends in a second.
         bytes: u32,
         /// Why it was refused.
         refusal: SubscriptionRefusal,
@@ -136,13 +135,13 @@ controls! {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum SubscriptionRefusal {
-    /// It was not.
+    /// It was not refused.
     None = 0,
-    /// There is no such stream, or it was replaced. Also any reason that this version does not know.
+    /// There is no such stream, or it was replaced. Also stands for reasons that this version does not know.
     Unknown = 1,
-    /// The access table does not let the subscriber have it.
+    /// The access table forbids it.
     NotAllowed = 2,
-    /// The subscriber has as many subscriptions as it may.
+    /// The subscriber has its limit of subscriptions.
     Full = 3,
 }
 
@@ -162,7 +161,7 @@ impl Field<'_> for SubscriptionRefusal {
 }
 
 impl Control<'_> {
-    /// Encodes into `out`, whole message; `None` where it does not fit.
+    /// Encodes the message into `out`; `None` if it does not fit.
     pub fn encode<'o>(&self, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let mut writer = Writer::new(out);
         writer.bytes(&[CONTROL, 0, 0, 0]);
@@ -172,47 +171,47 @@ impl Control<'_> {
     }
 }
 
-/// Why nothing begins on a lease that is inhibited.
+/// Why no order begins on an inhibited lease.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Latch {
-    /// The ID number of the unit that stopped it; 0 for this one.
+    /// The ID number of the unit that stopped it; 0 for the vehicle itself.
     pub by: u32,
-    /// Why, as this unit numbers its reasons; 0 for a function that stops.
+    /// The vehicle's own number of the reason; 0 for a function that stops.
     pub reason: u16,
 }
 
-/// The state of what a service moves, as callers are told without asking.
+/// The state of an actuator, which callers get without asking.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ActuatorState {
-    /// What keeps every order from beginning.
+    /// The latch, if the actuator is stopped.
     pub latch: Option<Latch>,
-    /// The order that has it, or had it last; `None` when there was none since the unit's start.
+    /// The present or last order; `None` if there was none since the unit started.
     pub last: Option<LastOrder>,
 }
 
-/// The order that a service has, or had last. An operator's is not told from one of the program of the same unit.
+/// The present or last order of an actuator. Does not tell an operator's order from one of the same unit's program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LastOrder {
-    /// The ID number of its caller.
+    /// The ID number of the calling unit.
     pub holder: u32,
-    /// The low half of the nonce in its caller's hello on the link that it came by; 0 for other units than its caller.
+    /// The lower half of the nonce in the caller's hello on the order's link; 0 if sent to another unit than the caller.
     pub link: u32,
-    /// Its caller's id of the call on that link; 0 for other units than its caller.
+    /// The caller's id of the call on that link; 0 if sent to another unit.
     pub call: u32,
-    /// The claim that its caller had; none for other units than its caller, and for a caller without one.
+    /// The caller's claim; none if it has none, or if sent to another unit.
     pub claim: Claim,
-    /// How it ended; `None` while it has not.
+    /// How it ended; `None` if it has not.
     pub end: Option<LeaseEnd>,
 }
 
 impl LastOrder {
-    /// For any other unit than its caller.
+    /// The order as it is sent to any unit but its caller.
     pub(crate) const fn of_another(self) -> Self {
         Self { link: 0, call: 0, claim: Claim::NONE, ..self }
     }
 
-    /// Its trace id: [`trace_id`] of link and call, 0 for other units than its caller. A program that wrote down the trace ids
-    /// of its calls knows them again after a start or on another host.
+    /// The [`trace_id`] of link and call; 0 at other units than the caller. A program that has stored the trace ids of its calls
+    /// recognises them after a restart or on another host.
     pub const fn trace(&self) -> u64 {
         trace_id(self.link, self.call)
     }
@@ -223,21 +222,22 @@ pub const fn trace_id(link: u32, call: u32) -> u64 {
     (link as u64) << 32 | call as u64
 }
 
-/// What a node tells of a call that moved something there, or was to: of one that was [interrupted](Error::Interrupted).
+/// What became of an [interrupted](Error::Interrupted) call with a lease, as its callee knows it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OrderOutcome {
     /// It has not ended.
     Runs,
-    /// It began, and ended so.
+    /// It began, and ended like this.
     Ended(LeaseEnd),
-    /// It has not begun, and does not any more, because its link has ended.
+    /// It has not begun, and will not, since its link has ended.
     NotStarted,
-    /// The node cannot tell, and it may have run: it was started since, or has done something for another caller, or by an earlier link.
+    /// The node does not know, so the call may have run: the node has restarted, or has had an order of another caller or link
+    /// since.
     Unknown,
 }
 
 impl ActuatorState {
-    /// What it tells of the newest call that a caller made by one of its links.
+    /// What became of the newest call that a caller made on one of its links.
     pub fn outcome_of(&self, link: u32, call: u32) -> OrderOutcome {
         match self.last {
             Some(last) if last.link != link || last.call == 0 => OrderOutcome::Unknown,
@@ -255,31 +255,31 @@ impl From<Latch> for Error {
     }
 }
 
-/// Why the callee ended what a leased call started.
+/// Why the callee ended an order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 #[non_exhaustive]
 pub enum LeaseEnd {
-    /// The service has done what was asked for.
+    /// The service has finished it.
     Finished,
-    /// It was not renewed in time, or the callee stopped it: the safe hook runs there. Also any reason that this version
+    /// It was not renewed in time, or the callee stopped it: the safe hook runs there. Also stands for reasons that this version
     /// does not know.
     Expired,
-    /// A newer call goes on in its place.
+    /// A newer call has replaced it.
     Replaced,
-    /// What it moved was stopped: the safe hook runs there, and nothing moves it before a reset.
+    /// Its actuator was stopped: the safe hook runs there, and no order begins before a reset.
     Stopped,
-    /// Its caller gave it up: the safe hook runs there. It is no news to that caller, whose events do not have it.
+    /// Its caller gave it up: the safe hook runs there. Not reported to that caller as an event.
     Released,
-    /// Never told by a callee, which did not answer renewals for the length of the lease: it is renewed no more, and ends
-    /// there within another one.
+    /// Decided by the caller: the callee did not answer renewals for the length of the lease. Renewals end, so the order ends
+    /// there within another length.
     Unanswered,
 }
 
 impl LeaseEnd {
     pub(crate) const ALL: [Self; 5] = [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped, Self::Released];
 
-    /// By its number on the wire; a reason of a later version is an end all the same.
+    /// By its number on the wire. Numbers of later versions become `Expired`.
     pub fn of(number: u32) -> Self {
         Self::ALL.get(number as usize).copied().unwrap_or(Self::Expired)
     }
@@ -297,7 +297,7 @@ impl LeaseEnd {
     }
 }
 
-/// What a field of a control message may be.
+/// A field of a control message.
 trait Field<'b> {
     fn put(self, writer: &mut Writer<'_>);
     fn take(reader: &mut Reader<'b>) -> Self;
@@ -353,7 +353,7 @@ impl Field<'_> for LeaseEnd {
     }
 }
 
-/// The reason and 1, or 0 for none; then by whom.
+/// 0 for none, otherwise the reason plus 1; then by whom.
 impl Field<'_> for Option<Latch> {
     fn put(self, writer: &mut Writer<'_>) {
         writer.number(self.map_or(0, |latch| u64::from(latch.reason).saturating_add(1)));
@@ -366,7 +366,7 @@ impl Field<'_> for Option<Latch> {
     }
 }
 
-/// 0 for none, 1 for one that has not ended, 2 and how it has; then holder, link, call and claim.
+/// 0 for none, 1 for an order that has not ended, otherwise 2 plus how it ended; then holder, link, call and claim.
 impl Field<'_> for Option<LastOrder> {
     fn put(self, writer: &mut Writer<'_>) {
         let LastOrder { holder, link, call, claim, end } =

@@ -1,4 +1,4 @@
-//! UDP datagrams: a fixed header, then a search, an answer, or the body of a session.
+//! UDP datagrams (docs/wire.md): a fixed header, then a search, an answer, or the body of a session.
 //!
 //! | bytes | meaning |
 //! |---|---|
@@ -6,14 +6,14 @@
 //! | 4 | first version that can read it |
 //! | 5 | kind: 1 [`WhoHas`], 2 [`Announce`], 3 session |
 //! | 6 | last version that the sender speaks |
-//! | 7 | how many codes are at the end |
+//! | 7 | number of authentication codes at the end |
 //! | 8–11 | fleet, little-endian |
 //! | 12– | [`WhoHas`], [`Announce`]: [items]; session: link u16, zero u16, nonce u64, body |
 //!
-//! In secured mode a search and an answer end with the fleet's code, over everything before it. An answer to one unit
-//! has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are filled up with
-//! room to the length of the longest answer, so that a datagram with a forged source address is not amplified: the
-//! answer or question that it causes is no longer than itself.
+//! In secured mode a search and an answer end with a code made with the fleet's key over everything before it. An answer to a
+//! single unit also has a code made with the pair's key, before the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are padded
+//! to the length of the longest answer: what they cause is no longer than they are, so a forged source address yields no
+//! amplification.
 
 use super::authenticator::{Authenticator, CODE_BYTES};
 use super::compact::{Reader, Writer};
@@ -31,11 +31,11 @@ const SESSION: u8 = 3;
 pub const HEADER_BYTES: usize = 12;
 /// Bytes before the body of a session datagram.
 pub const SESSION_HEADER_BYTES: usize = 24;
-/// Known nodes that one [`WhoHas`] can name.
+/// Most known nodes that one [`WhoHas`] can name.
 pub const KNOWN_NODES: usize = 64;
-/// Longest [`WhoHas`].
+/// Length of the longest [`WhoHas`].
 pub const SEARCH_BYTES: usize = 512;
-/// Longest [`Announce`] of secured mode, and the shortest [`WhoHas`].
+/// Length of the longest [`Announce`] in secured mode, and of the shortest [`WhoHas`].
 pub const ANSWER_BYTES: usize = 176;
 
 /// A search, broadcast (paper: "one node broadcasts a message containing its identifier").
@@ -43,24 +43,24 @@ pub const ANSWER_BYTES: usize = 176;
 pub struct WhoHas {
     /// The sender.
     pub identity: Identity,
-    /// The sender's boot.
+    /// The sender's boot epoch.
     pub epoch: Epoch,
-    /// Rises with each search of this boot.
+    /// Increases with each search of this boot.
     pub sequence: u32,
-    /// Comes back in the answer.
+    /// Returned in the answer.
     pub nonce: u64,
-    /// The manager that is looked for; `None` asks other m_units, and the sender's own s_units.
+    /// The manager that is wanted; `None` asks all other m_units, and the sender's own s_units.
     pub wanted: Option<Manager>,
     /// The sender's TCP port; 0 if it accepts no links.
     pub tcp_port: u16,
     /// How many answers the sender expects; 0 in a question to a single node, which answers at once.
     pub expected: u16,
-    /// [`short_hash`] of nodes that are connected already and stay silent.
+    /// The [`short_hash`] of each connected node, which does not answer.
     pub known: heapless::Vec<u32, KNOWN_NODES>,
-    /// The sender is a standby: it is answered, and otherwise not taken for a manager. A reader that does not know the mark answers
-    /// too. Were it to drop the question, a standby would find nobody beside a manager of an earlier version.
+    /// The sender is a standby, to be answered but not taken for a manager. Readers that do not know this flag answer, too: a
+    /// standby must find a manager of an earlier version.
     pub standby: bool,
-    /// Items that the reader did not know and passed over. Not sent.
+    /// How many unknown items the reader has skipped. Not encoded.
     pub skipped: u16,
 }
 
@@ -69,28 +69,28 @@ pub struct WhoHas {
 pub struct Announce {
     /// The sender.
     pub identity: Identity,
-    /// Its boot.
+    /// Its boot epoch.
     pub epoch: Epoch,
     /// The claim of an m_unit.
     pub claim: Option<ClaimReport>,
     /// The highest claim of the reader's identity that a vehicle has obeyed.
     pub obeyed: Option<ClaimReport>,
-    /// Rises with each announce of this boot.
+    /// Increases with each announce of this boot.
     pub sequence: u32,
     /// The nonce of the search that is answered; 0 in a broadcast.
     pub nonce: u64,
-    /// Where it can be dialled; 0 for nowhere.
+    /// The TCP port at which it can be dialled; 0 for none.
     pub tcp_port: u16,
-    /// How many more nodes it takes.
+    /// How many more nodes it can admit.
     pub room: u16,
-    /// How many nodes it expects to dial because of this announce.
+    /// How many nodes it expects to dial after this announce, for their random delays.
     pub expected: u16,
-    /// Items that the reader did not know and passed over. Not sent.
+    /// How many unknown items the reader has skipped. Not encoded.
     pub skipped: u16,
 }
 
-/// A datagram, borrowed from the bytes that it came in.
-// Searches are rare and handled where they are decoded, so this enum is not moved.
+/// A datagram, borrowed from the received bytes.
+// Searches are rare and processed where they are decoded, so this enum is not moved.
 #[allow(clippy::large_enum_variant)]
 #[derive(Debug, PartialEq, Eq)]
 pub enum Datagram<'b> {
@@ -112,17 +112,17 @@ pub enum Datagram<'b> {
 /// Why a datagram is not for this unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DatagramError {
-    /// Not of this mode, or of no unit at all.
+    /// It is of another mode, or no datagram of CARA.
     Magic,
-    /// It is of none of our versions, but of these.
+    /// It is of no version that this unit speaks, but of these.
     Version(Versions),
-    /// Another fleet, this one.
+    /// It is of this other fleet.
     Fleet(Fleet),
-    /// The code that shows that it comes from the fleet is wrong, or there is none.
+    /// The code made with the fleet's key is wrong or missing.
     Forged,
-    /// An answer to one unit whose pair code is wrong for this unit.
+    /// An answer to a single unit, whose pair code is wrong for this unit.
     NotForUs,
-    /// The rest cannot be read.
+    /// The rest cannot be decoded.
     Malformed,
 }
 
@@ -132,13 +132,12 @@ impl From<Malformed> for DatagramError {
     }
 }
 
-/// The fixed part of a datagram of any mode, version and fleet, for tools that inspect a network without being one of
-/// its units. Units decode with [`Datagram::decode`].
+/// The fixed header of any mode, version and fleet, for tools that inspect a network. Units use [`Datagram::decode`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// The sender's mode.
     pub mode: Mode,
-    /// The first version that can read the datagram, to the last one that the sender speaks.
+    /// From the first version that can read the datagram to the last one that the sender speaks.
     pub versions: Versions,
     /// The sender's fleet.
     pub fleet: Fleet,
@@ -147,7 +146,7 @@ pub struct Header {
 }
 
 impl Header {
-    /// The header and the bytes behind it; [`DatagramError::Magic`] or [`DatagramError::Malformed`] where there is none.
+    /// Decodes the header, and returns the bytes behind it; [`DatagramError::Magic`] or [`DatagramError::Malformed`].
     pub fn decode(bytes: &[u8]) -> Result<(Self, &[u8]), DatagramError> {
         let (header, body) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(DatagramError::Malformed)?;
         let [m0, m1, m2, m3, first, kind, last, codes, f0, f1, f2, f3] = *header;
@@ -156,7 +155,7 @@ impl Header {
         Ok((Self { mode, versions, fleet, kind, codes }, body))
     }
 
-    /// The body as the versions of this unit have it. Codes are not checked.
+    /// Decodes the body, by the versions of this unit. Does not check the codes.
     pub fn read<'b>(&self, body: &'b [u8]) -> Result<Datagram<'b>, DatagramError> {
         Ok(match self.kind {
             WHO_HAS if self.codes == self.codes_of(0) => Datagram::WhoHas(WhoHas::take(self.items(body)?)?),
@@ -175,13 +174,13 @@ impl Header {
         })
     }
 
-    /// All but the codes.
+    /// The body without the codes.
     fn items<'b>(&self, body: &'b [u8]) -> Result<&'b [u8], DatagramError> {
         let codes = usize::from(self.codes).saturating_mul(CODE_BYTES);
         body.len().checked_sub(codes).and_then(|length| body.get(..length)).ok_or(DatagramError::Malformed)
     }
 
-    /// How many codes a search has, or an answer to this nonce.
+    /// How many codes a search has, or an answer with this nonce.
     const fn codes_of(&self, nonce: u64) -> u8 {
         codes(self.mode, nonce != 0)
     }
@@ -200,7 +199,7 @@ impl Header {
     }
 }
 
-/// The fleet's code, and that of the pair where the datagram is for one unit; none in plain mode.
+/// How many codes there are: the fleet's and, if the datagram is for one unit, the pair's; none in plain mode.
 const fn codes(mode: Mode, for_one: bool) -> u8 {
     match mode {
         Mode::Plain => 0,
@@ -209,7 +208,7 @@ const fn codes(mode: Mode, for_one: bool) -> u8 {
     }
 }
 
-/// What a search says.
+/// The fixed fields of a search.
 struct Search {
     sequence: u32,
     nonce: u64,
@@ -223,7 +222,7 @@ impl Search {
     }
 }
 
-/// What an answer says.
+/// The fixed fields of an answer.
 struct Answer {
     sequence: u32,
     nonce: u64,
@@ -244,7 +243,7 @@ impl Answer {
     }
 }
 
-/// The hashes of an item [`kind::KNOWN`], four bytes each.
+/// Decodes an item [`kind::KNOWN`]: hashes of four bytes each.
 fn hashes(body: &[u8]) -> Result<heapless::Vec<u32, KNOWN_NODES>, Malformed> {
     let (hashes, []) = body.as_chunks() else { return Err(Malformed) };
     let mut known = heapless::Vec::new();
@@ -253,9 +252,8 @@ fn hashes(body: &[u8]) -> Result<heapless::Vec<u32, KNOWN_NODES>, Malformed> {
 }
 
 impl<'b> Datagram<'b> {
-    /// Decodes a datagram of this fleet. In secured mode the fleet's code is checked before anything else of a
-    /// [`WhoHas`] or [`Announce`] is parsed, and an answer counts only with the code of the pair. Session datagrams are
-    /// opened by their session.
+    /// Decodes a datagram of this fleet. In secured mode the fleet's code of a [`WhoHas`] or [`Announce`] is checked before
+    /// anything else is decoded, and an answer needs the pair's code. Session datagrams are decrypted by their session.
     pub fn decode(bytes: &'b [u8], fleet: Fleet, authenticator: &dyn Authenticator) -> Result<Self, DatagramError> {
         let (header, body) = Header::decode(bytes)?;
         header.check(authenticator.mode(), fleet)?;
@@ -273,8 +271,8 @@ impl<'b> Datagram<'b> {
     }
 }
 
-/// Link, nonce and body of a session datagram of this mode, version and fleet, by its header alone: for
-/// [`Session::datagram`](crate::services::session::Session::datagram). All others are the node's.
+/// Link, nonce and body of a session datagram of this mode and fleet, judged by its header alone: pass them to
+/// [`Session::datagram`](crate::services::session::Session::datagram), and all other datagrams to the node.
 pub fn for_session(bytes: &mut [u8], mode: Mode, fleet: Fleet) -> Option<(LinkId, u64, &mut [u8])> {
     let (header, body) = Header::decode(bytes).ok()?;
     header.check(mode, fleet).ok()?;
@@ -285,7 +283,7 @@ pub fn for_session(bytes: &mut [u8], mode: Mode, fleet: Fleet) -> Option<(LinkId
     Some((LinkId(link), nonce, bytes.get_mut(SESSION_HEADER_BYTES..)?))
 }
 
-/// All but the fleet's code, if that is right.
+/// The datagram without the fleet's code, if that is right.
 fn of_fleet<'b>(bytes: &'b [u8], authenticator: &dyn Authenticator) -> Option<&'b [u8]> {
     let (signed, code) = bytes.split_last_chunk()?;
     authenticator.is_of_fleet(signed, code).then_some(signed)
@@ -310,7 +308,7 @@ fn header(kind: u8, mode: Mode, versions: Versions, codes: u8, fleet: Fleet) -> 
     [m0, m1, m2, m3, versions.first, kind, versions.last, codes, f0, f1, f2, f3]
 }
 
-/// Puts a code behind the first `length` bytes of `out`; the length with it.
+/// Appends a code after the first `length` bytes of `out`; returns the new length.
 fn append(code: [u8; CODE_BYTES], length: usize, out: &mut [u8]) -> Option<usize> {
     *out.get_mut(length..)?.first_chunk_mut()? = code;
     length.checked_add(CODE_BYTES)
@@ -343,7 +341,7 @@ impl WhoHas {
         Ok(Self { identity, epoch, sequence, nonce, wanted, tcp_port, expected, known, standby, skipped })
     }
 
-    /// The datagram, in `out`; `None` where it does not fit.
+    /// Encodes the datagram into `out`; `None` if it does not fit.
     pub fn encode<'o>(&self, fleet: Fleet, authenticator: &dyn Authenticator, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let mode = authenticator.mode();
         let mut writer = Writer::new(out);
@@ -395,8 +393,7 @@ impl Announce {
         Ok(Self { identity, epoch, claim, obeyed, sequence, nonce, tcp_port, room, expected, skipped })
     }
 
-    /// The datagram, in `out`; `None` where it does not fit, or in secured mode where it answers `to` and there is no key
-    /// for the pair.
+    /// Encodes the datagram into `out`; `None` if it does not fit, or in secured mode if there is no key for the pair with `to`.
     pub fn encode<'o>(
         &self,
         fleet: Fleet,
@@ -428,13 +425,12 @@ impl Announce {
     }
 }
 
-/// Room behind the first `length` bytes of `out`, so that the whole with the fleet's code is as long as the longest
-/// answer; the length with it.
+/// Pads the first `length` bytes of `out` to the longest answer without the fleet's code; returns the new length.
 fn fill(length: usize, out: &mut [u8]) -> Option<usize> {
     items::fill(length, ANSWER_BYTES.saturating_sub(CODE_BYTES), out)
 }
 
-/// The header of a session datagram of a link with this version, to `link` of the receiver, named by the receiver's `nonce`.
+/// The header of a session datagram: `link` and `nonce` are those of the receiver.
 pub fn session_header(mode: Mode, version: u8, fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
     let versions = Versions { first: version, last: version };
     let [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11] = header(SESSION, mode, versions, 0, fleet);
@@ -443,8 +439,8 @@ pub fn session_header(mode: Mode, version: u8, fleet: Fleet, link: u16, nonce: u
     [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11, l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7]
 }
 
-/// 32 bits that name an identity in a list of known nodes: FNV-1a over role (0 m_unit, 1 s_unit), id (little-endian)
-/// and name. A collision costs one search more.
+/// Names an identity in a list of known nodes by 32 bits: FNV-1a over role (0 m_unit, 1 s_unit), id (little-endian) and name. A
+/// collision costs one more search.
 pub fn short_hash(identity: &Identity) -> u32 {
     let role = match identity.role() {
         Role::MUnit => 0,

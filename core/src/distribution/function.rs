@@ -1,9 +1,9 @@
-//! The paper's `Function`: a name with the arguments that it needs and the results that it gives.
+//! The paper's `Function`: a name with its arguments and results.
 //!
-//! A signature exists in one encoding, which is stored and travels as it is: name length u8, name, number of
-//! arguments u8, arguments, number of results u8, results; where declared, a section u8, its number of variables u8 and
-//! those, for the progress of calls (1) and for the values of failures (2), behind which help may stand; each variable: type u8, name length u8, size u32
-//! little-endian, name, and what a list or record is made of. [`Definition`] owns one, [`Signature`] borrows one.
+//! A signature has one encoding, in memory and on the wire (docs/wire.md): name length u8, name, number of arguments u8,
+//! arguments, number of results u8, results; then, if declared, a section u8, number of variables u8 and variables for the
+//! progress of calls (1) and for the values of failures (2), and last the help. Each variable: type u8, name length u8, size u32
+//! little-endian, name, and the inner types of a list or record. [`Definition`] owns a signature, [`Signature`] borrows one.
 
 use core::fmt;
 
@@ -38,7 +38,7 @@ pub struct Definition {
 /// A signature in borrowed bytes; `Display` is its text form.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Signature<'a> {
-    /// Validated on construction, so that a look-up need not parse all of it.
+    /// Validated on construction, so that look-ups need not parse all of it.
     bytes: &'a [u8],
 }
 
@@ -81,7 +81,7 @@ impl Definition {
         &self.bytes
     }
 
-    /// The same function whose calls tell the variables of `parameters` while they run; their values don't matter.
+    /// The same function with the variables of `parameters` as the progress of its calls; their values don't matter.
     ///
     /// ```
     /// # use cara_core::{Definition, distribution::parameters::Parameters};
@@ -95,7 +95,7 @@ impl Definition {
         self.declaring(specs_of(parameters), self.signature().failure())
     }
 
-    /// The same function whose failures have the variables of `parameters`; their values don't matter.
+    /// The same function with the variables of `parameters` as the values of its failures; their values don't matter.
     pub fn failure(self, parameters: &ParametersView) -> Result<Self, Error> {
         self.declaring(self.signature().progress(), specs_of(parameters))
     }
@@ -113,7 +113,7 @@ impl Definition {
     }
 }
 
-/// The variables of `parameters` as a signature names them.
+/// The variables of `parameters`, as specs.
 fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_>> {
     parameters.iter().map(|variable| VariableSpec {
         name: variable.name,
@@ -123,10 +123,10 @@ fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_
     })
 }
 
-/// The number of the section that is for people; whatever has a greater one is behind it.
+/// The section with help. Sections with greater numbers follow it.
 pub(super) const HELP_SECTION: u8 = 3;
 
-/// What a signature may declare behind its results.
+/// Sections of a signature behind its results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Section {
     Progress = 1,
@@ -138,13 +138,13 @@ impl Section {
 }
 
 impl<'a> Signature<'a> {
-    /// Checks an encoded signature; [`Error::Malformed`] for anything that [`Definition`] could not have made.
+    /// Checks an encoded signature; [`Error::Malformed`] if [`Definition`] could not have made it.
     ///
-    /// Help is not in what is returned where the feature `help` is off, or where it makes the signature too long.
+    /// Drops the help if the feature `help` is off, or if the signature would be too long with it.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
         let (name, arguments, results) = Self::split(bytes).ok_or(Error::Malformed)?;
         let whole = Self { bytes };
-        // What a later version may have behind it is of no use.
+        // Drop sections of later versions.
         let with_help = whole.in_front_of(HELP_SECTION.saturating_add(1));
         let has_room = HELP && with_help.bytes.len() <= SIGNATURE_BYTES;
         let this = if has_room { with_help } else { whole.without_help() };
@@ -161,34 +161,34 @@ impl<'a> Signature<'a> {
         name.and_then(|name| core::str::from_utf8(name).ok()).unwrap_or_default()
     }
 
-    /// What a caller must pass.
+    /// The arguments that a caller must pass.
     #[cfg_attr(not(target_os = "none"), inline)]
     pub fn arguments(&self) -> VariableSpecs<'a> {
         VariableSpecs::of_checked(self.behind_length().and_then(|(length, rest)| rest.get(length..)))
     }
 
-    /// What a caller gets back.
+    /// The results that a caller gets.
     #[cfg_attr(not(target_os = "none"), inline)]
     pub fn results(&self) -> VariableSpecs<'a> {
         VariableSpecs::of_checked(self.arguments().behind())
     }
 
-    /// What its calls tell while they run.
+    /// The variables of progress reports.
     pub fn progress(&self) -> VariableSpecs<'a> {
         self.section(Section::Progress as u8)
     }
 
-    /// The values of its failures.
+    /// The values of failures.
     pub fn failure(&self) -> VariableSpecs<'a> {
         self.section(Section::Failure as u8)
     }
 
-    /// What people read is not in it.
+    /// The signature without help.
     pub(crate) fn without_help(self) -> Self {
         self.in_front_of(HELP_SECTION)
     }
 
-    /// All in front of this section and those with greater numbers.
+    /// The signature up to the section `end`, and without those that follow it.
     fn in_front_of(self, end: u8) -> Self {
         let mut rest = self.results().behind();
         while let Some((&section, behind)) = rest.and_then(<[u8]>::split_first) {
@@ -213,7 +213,7 @@ impl<'a> Signature<'a> {
         VariableSpecs::of_checked(None)
     }
 
-    /// The length of the name, and what follows it.
+    /// The length of the name, and the bytes that follow the length.
     #[inline]
     fn behind_length(&self) -> Option<(usize, &'a [u8])> {
         self.bytes.split_first().map(|(length, rest)| (usize::from(*length), rest))
@@ -224,13 +224,13 @@ impl<'a> Signature<'a> {
         self.bytes
     }
 
-    /// A copy that owns its bytes.
+    /// An owned copy.
     pub fn to_definition(&self) -> Definition {
-        // What was checked is no longer than a definition.
+        // Cannot fail: a checked signature is no longer than a definition.
         Definition { bytes: heapless::Vec::from_slice(self.bytes).unwrap_or_default() }
     }
 
-    /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does; of lists as long as they are empty.
+    /// Capacity in bytes of a `Parameters` with all arguments and results, as the callee's has; lists count as empty.
     pub fn parameters_bytes(&self) -> u32 {
         let arguments = self.arguments();
         let only_results = self.results().raw().filter(|result| arguments.raw().all(|known| known.name != result.name));
@@ -241,12 +241,12 @@ impl<'a> Signature<'a> {
         bytes.map_or(u32::MAX, saturate)
     }
 
-    /// The signature in bytes that were checked when they were stored.
+    /// A signature from bytes that were checked when they were stored.
     pub(crate) const fn of_checked(bytes: &'a [u8]) -> Self {
         Self { bytes }
     }
 
-    /// Name, arguments and results, all of which can be read.
+    /// Name, arguments and results, all of which are well-formed.
     fn split(bytes: &'a [u8]) -> Option<(&'a str, VariableSpecs<'a>, VariableSpecs<'a>)> {
         let (&length, rest) = bytes.split_first()?;
         let (name, rest) = rest.split_at_checked(usize::from(length))?;
@@ -265,17 +265,17 @@ impl<'a> Signature<'a> {
     }
 }
 
-/// Writes a signature variable by variable, and knows every rule about signatures.
+/// Builds a signature variable by variable, and checks all rules about signatures.
 pub(super) struct Builder {
     bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
     arguments_at: usize,
     results_at: Option<usize>,
-    /// The section that was begun last, and where its count is.
+    /// The present section, and the offset of its count.
     section: Option<(Section, usize)>,
 }
 
 impl Builder {
-    /// The arguments and results of a function.
+    /// Starts with the arguments and results of a function.
     fn of<'a>(
         name: &str,
         mut arguments: impl Iterator<Item = VariableSpec<'a>>,
@@ -287,7 +287,7 @@ impl Builder {
         Ok(builder)
     }
 
-    /// Adds what a signature declares behind its results. A unit that has no use for it passes it over.
+    /// Adds the sections of a signature. Units without the feature `details` skip them.
     fn sections_of(&mut self, signature: Signature<'_>) -> Result<(), Error> {
         if !DETAILS {
             return Ok(());
@@ -298,7 +298,7 @@ impl Builder {
         })
     }
 
-    /// Adds a variable to a section; the sections come behind the results, in their order.
+    /// Adds a variable to a section; sections follow the results, in ascending order.
     pub(super) fn declare(&mut self, section: Section, spec: VariableSpec<'_>) -> Result<(), Error> {
         self.begin_results()?;
         let at = match self.section {
@@ -322,7 +322,7 @@ impl Builder {
         builder.push(&[name.len() as u8])?;
         builder.push(name.as_bytes())?;
         builder.arguments_at = builder.bytes.len();
-        // Room for the number of results as well, so that `finish` can't fail.
+        // Reserve a byte for the number of results, so that `finish` cannot fail.
         builder.push(&[0])?;
         Ok(builder)
     }
@@ -336,7 +336,7 @@ impl Builder {
         self.variable(self.arguments_at, spec)
     }
 
-    /// Adds a result. Results that are arguments as well are the same variables; all others are counted, since a
+    /// Adds a result. A result with the name of an argument is the same variable; all others count towards the limit, since one
     /// `Parameters` must hold both.
     pub(super) fn result(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
         let results_at = self.begin_results()?;
@@ -356,7 +356,7 @@ impl Builder {
     }
 
     pub(super) fn finish(mut self) -> Definition {
-        // `variable` keeps a byte free for this one.
+        // `variable` has kept a byte free for this.
         let _ = self.begin_results();
         Definition { bytes: self.bytes }
     }

@@ -1,7 +1,7 @@
-//! The paper's `Function_list`: one's own functions with their handlers, and the functions of a peer.
+//! The paper's `Function_list`: a unit's own functions with their handlers, and the functions of a peer.
 //!
-//! A function is named by slot and generation. Adding a function invalidates no other; removing or replacing one
-//! changes the generation of its slot only, so that a request with a stale list is a typed error.
+//! A request names a function by slot and generation. Adding a function does not affect others; removing or replacing one changes
+//! the generation of its slot only, so a request with an outdated list gets a definite error.
 
 use core::fmt;
 
@@ -16,7 +16,7 @@ use crate::storage::Storage;
 
 use super::attributes::Attributes;
 
-/// One's own functions (paper: `my_function_list`).
+/// A unit's own functions (paper: `my_function_list`).
 ///
 /// Adding a function does not make it visible to peers; publishing does.
 ///
@@ -38,12 +38,12 @@ use super::attributes::Attributes;
 #[doc(alias = "Function_list")]
 pub struct FunctionList<S: Storage, H: 'static> {
     table: Table<S, H>,
-    /// Closed by a stop of all, and by the removal of what was latched: what is added later begins with it.
+    /// Set by a stop of all, and by removing a latched function: functions that are added later inherit it.
     stopped: LatchWord,
 }
 
 impl<S: Storage, H: 'static> FunctionList<S, H> {
-    /// An empty list with room for as many functions as there are entries, and for `bytes` of signatures.
+    /// An empty list with capacity for one function per entry, and for `bytes` of signatures.
     pub fn new(entries: S::Slice<Entry<H>>, bytes: S::Slice<u8>) -> Self {
         Self { table: Table::new(entries, bytes), stopped: LatchWord::new() }
     }
@@ -87,17 +87,17 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         Ok(old.slot)
     }
 
-    /// The place of the function of this name.
+    /// The slot of the function with this name.
     pub fn find(&self, name: &str) -> Option<Slot> {
         self.table.find(name).map(|index| Slot(index as u16))
     }
 
-    /// The function in a place.
+    /// The function in a slot.
     pub fn function(&self, slot: Slot) -> Option<Function<'_, H>> {
         self.table.function(usize::from(slot.0))
     }
 
-    /// The function that a request names: [`Error::StaleFunction`] if it was removed or replaced since,
+    /// The function that a request names; [`Error::StaleFunction`] if it was removed or replaced since,
     /// [`Error::UnknownFunction`] if there never was one.
     pub(crate) fn lookup(&self, slot: Slot, generation: Generation) -> Result<Function<'_, H>, Error> {
         let entry = self.table.entries.get(usize::from(slot.0)).ok_or(Error::UnknownFunction)?;
@@ -107,17 +107,17 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         self.table.of(entry).ok_or(Error::UnknownFunction)
     }
 
-    /// The generation of a place, of an empty one as well.
+    /// The generation of a slot, even an empty one.
     pub fn generation(&self, slot: Slot) -> Option<Generation> {
         self.table.entries.get(usize::from(slot.0)).map(|entry| entry.generation)
     }
 
-    /// The functions by slot.
+    /// The functions, ordered by slot.
     pub fn iter(&self) -> impl Iterator<Item = Function<'_, H>> + Clone {
         self.table.iter()
     }
 
-    /// How many places there are, empty ones included.
+    /// How many slots there are, including empty ones.
     pub(crate) fn places(&self) -> u16 {
         u16::try_from(self.table.entries.len()).unwrap_or(u16::MAX)
     }
@@ -127,12 +127,12 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         self.iter().count()
     }
 
-    /// Whether there is no function.
+    /// Whether there are no functions.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The text form of each function on a line.
+    /// The text form of each function, one per line.
     pub fn show_functions(&self) -> impl fmt::Display + '_ {
         Lines(self.iter())
     }
@@ -142,27 +142,26 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
 pub struct TheirFunctionList<S: Storage> {
     table: Table<S, ()>,
     skipped: u32,
-    /// Functions and bytes of signatures that it may grow to.
+    /// Limits of its growth: functions, and bytes of signatures.
     most: (usize, usize),
 }
 
 impl<S: Storage> TheirFunctionList<S> {
-    /// An empty list with room for as many functions as there are entries, and for `bytes` of signatures.
+    /// An empty list with capacity for one function per entry, and for `bytes` of signatures.
     pub fn new(entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> Self {
         Self { table: Table::new(entries, bytes), skipped: 0, most: (0, 0) }
     }
 
-    /// Lets it grow to so many functions, and so many bytes of signatures, where the storage has an allocator. It keeps help on
-    /// functions then, as long as there is room for all functions.
+    /// Sets how many functions, and bytes of signatures, the list may grow to if the storage has an allocator. It then stores
+    /// help, too, as long as there is capacity for all functions.
     pub(crate) const fn let_grow(&mut self, functions: usize, bytes: usize) {
         self.most = (functions, bytes);
     }
 
-    /// Applies what the peer published about one of its slots; it replaces the function in the slot and any of the same
-    /// name.
+    /// Stores a function that the peer has published in a slot. It replaces the function in the slot and any other of its name.
     ///
-    /// On an error what was in the slot is gone, and the function counts as skipped: [`Error::Full`], or [`Error::Malformed`]
-    /// for a signature that this version cannot read.
+    /// On an error the slot is empty, and the function counts as skipped: [`Error::Full`], or [`Error::Malformed`] for a
+    /// signature that this version cannot decode.
     pub(crate) fn insert(
         &mut self,
         slot: Slot,
@@ -182,7 +181,7 @@ impl<S: Storage> TheirFunctionList<S> {
         if let Some(index) = self.table.find(name) {
             self.table.take(index);
         }
-        // A list that does not grow, as on a board, has no use for help. Rather all without it than one function skipped.
+        // A list of fixed size, as on a board, never stores help. A growing one drops all help rather than skip a function.
         let keeps_help = HELP && self.most.1 > 0;
         let kept = if keeps_help { signature } else { signature.without_help() };
         let mut put = self.put(slot, generation, attributes, kept.as_bytes());
@@ -196,17 +195,17 @@ impl<S: Storage> TheirFunctionList<S> {
         put
     }
 
-    /// The peer has published a function that is not kept.
+    /// Counts a function that the peer has published and that is not stored.
     pub(crate) const fn skip(&mut self) {
         self.skipped = self.skipped.saturating_add(1);
     }
 
-    /// Removes what is in a slot; `false` if nothing was.
+    /// Removes the function in a slot; `false` if there was none.
     pub fn remove(&mut self, slot: Slot) -> bool {
         self.index_of(slot).and_then(|index| self.table.take(index)).is_some()
     }
 
-    /// Shows the functions whose names are wanted and hides the others, which stay stored: they can be shown again.
+    /// Shows the functions that `wanted` accepts and hides the others, which stay stored and can be shown again.
     pub(crate) fn show_only(&mut self, mut wanted: impl FnMut(&str) -> bool) {
         for index in 0..self.table.entries.len() {
             let Some(hidden) = self.table.function(index).map(|function| !wanted(function.name())) else { continue };
@@ -216,13 +215,13 @@ impl<S: Storage> TheirFunctionList<S> {
         }
     }
 
-    /// What this unit wants of a stream.
+    /// This unit's subscription to a stream.
     pub(crate) fn wish_mut(&mut self, slot: Slot) -> Option<&mut Wish> {
         let index = self.index_of(slot)?;
         self.table.entries.get_mut(index)?.wish.get_mut()
     }
 
-    /// A stream of which the peer has not been told what this unit wants: its place, its generation and the interval.
+    /// A subscription that was not sent to the peer yet: its slot, generation and interval.
     pub(crate) fn untold_wish(&self) -> Option<(Slot, Generation, u32)> {
         let untold = |entry: &&Entry| entry.function.is_some() && entry.wish.interval != entry.wish.advertised;
         let entry = self.table.entries.iter().find(untold)?;
@@ -237,19 +236,19 @@ impl<S: Storage> TheirFunctionList<S> {
         }
     }
 
-    /// Removes everything and forgets what was skipped.
+    /// Removes everything and resets the count of skipped functions.
     pub fn clear(&mut self) {
         self.table.clear();
         self.skipped = 0;
     }
 
-    /// The slices, with nothing in them.
+    /// The slices, cleared for the next session.
     pub(crate) fn into_slices(mut self) -> (S::Slice<Entry>, S::Slice<u8>) {
         self.table.clear();
         (self.table.entries, self.table.bytes)
     }
 
-    /// The place of the function of this name in the peer's list.
+    /// The slot of the function with this name in the peer's list.
     pub fn find(&self, name: &str) -> Option<Slot> {
         self.named(name).map(|function| function.slot)
     }
@@ -259,32 +258,32 @@ impl<S: Storage> TheirFunctionList<S> {
         self.table.find(name).and_then(|index| self.shown(index))
     }
 
-    /// The function in a place of the peer's list.
+    /// The function in a slot of the peer's list.
     pub fn function(&self, slot: Slot) -> Option<Function<'_>> {
         self.index_of(slot).and_then(|index| self.shown(index))
     }
 
-    /// The functions in no particular order.
+    /// The functions, in no particular order.
     pub fn iter(&self) -> impl Iterator<Item = Function<'_>> + Clone {
         (0..self.table.entries.len()).filter_map(|index| self.shown(index))
     }
 
-    /// Number of functions that are kept and shown.
+    /// Number of functions that are stored and shown.
     pub fn len(&self) -> usize {
         self.iter().count()
     }
 
-    /// Whether no function is kept.
+    /// Whether no function is shown.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Functions that the peer published and that were not kept, since the last [`clear`](Self::clear).
+    /// How many published functions were not stored, since the last [`clear`](Self::clear).
     pub const fn skipped(&self) -> u32 {
         self.skipped
     }
 
-    /// The text form of each function on a line.
+    /// The text form of each function, one per line.
     pub fn show_functions(&self) -> impl fmt::Display + '_ {
         Lines(self.iter())
     }
@@ -313,7 +312,7 @@ impl<S: Storage> TheirFunctionList<S> {
         Ok(())
     }
 
-    /// Where a slot of the peer is kept: at its own index wherever possible, so that most lookups take one step.
+    /// The index of a slot of the peer: the same number wherever possible, so that most look-ups take one step.
     fn index_of(&self, slot: Slot) -> Option<usize> {
         let keeps = |entry: &Entry| entry.function.as_ref().is_some_and(|stored| stored.slot == slot);
         let preferred = usize::from(slot.0);

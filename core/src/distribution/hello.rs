@@ -4,9 +4,9 @@
 //! |---|---|
 //! | 0–3 | magic of the mode |
 //! | 4, 5 | first and last version that the sender speaks |
-//! | 6–7 | cipher suites that it has, a bit each |
+//! | 6–7 | supported cipher suites, a bit each |
 //! | 8–11 | fleet, little-endian |
-//! | 12–19 | capabilities, a bit each: one counts when both ends have it |
+//! | 12–19 | capabilities, a bit each; in effect if both ends have it |
 //! | 20– | [items](super::items) |
 
 use serde::{Deserialize, Serialize};
@@ -21,7 +21,7 @@ use crate::distribution::claim::{Claim, TaggedClaim};
 /// Bytes before the items.
 const PREFIX_BYTES: usize = 20;
 
-/// Which manager an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
+/// The manager that an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Manager {
     /// The manager's name.
@@ -30,14 +30,14 @@ pub struct Manager {
     pub id: u32,
 }
 
-/// What a unit takes, told so that nothing longer is sent.
+/// What a unit accepts, so that the peer sends nothing longer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// Longest block of parameters, in bytes.
     pub message_size: u32,
     /// Longest frame body, in bytes.
     pub chunk_size: u16,
-    /// Calls of one peer that it holds.
+    /// Most calls of one peer at a time.
     pub calls: u16,
     /// Least time between two requests to it, in microseconds.
     pub minimum_interval: u32,
@@ -54,53 +54,53 @@ impl From<&Constraints> for Limits {
     }
 }
 
-/// How a unit introduces itself on a link.
+/// A unit's introduction of itself on a link.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Hello {
     /// The versions that the unit speaks.
     pub versions: Versions,
-    /// Abilities that no version implies, a bit each; 0 now.
+    /// Abilities that no version implies, a bit each; none are defined yet.
     pub capabilities: u64,
-    /// Units of different fleets refuse each other.
+    /// The fleet; units of different fleets refuse each other.
     pub fleet: Fleet,
     /// Name, id and role.
     pub identity: Identity,
     /// The manager that an s_unit belongs to.
     pub wanted: Option<Manager>,
-    /// This life of the unit.
+    /// This boot of the unit.
     pub epoch: Epoch,
     /// The claim of an m_unit.
     pub claim: Option<ClaimReport>,
     /// The highest claim of the reader's identity that the sender has obeyed.
     pub obeyed: Option<ClaimReport>,
-    /// Fresh for each link; the peer's session datagrams carry it.
+    /// Fresh for each link; the peer's session datagrams contain it.
     pub nonce: u64,
-    /// What the unit takes.
+    /// What the unit accepts.
     pub limits: Limits,
-    /// The index by which the unit wants this link's session datagrams addressed.
+    /// The unit's index of this link, to which its session datagrams are addressed.
     pub link: u16,
-    /// The UDP port to which session datagrams go; 0 for none.
+    /// The UDP port for its session datagrams; 0 for none.
     pub udp_port: u16,
     /// The unit's clock when the hello was made, in microseconds.
     pub stamp: u64,
-    /// Pause between the unit's keep-alives, in milliseconds.
+    /// Interval of the unit's keep-alives, in milliseconds.
     pub keep_alive: u32,
-    /// Items that the reader did not know and passed over. Not sent.
+    /// How many unknown items the reader has skipped. Not encoded.
     pub skipped: u16,
 }
 
 /// Why a hello cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HelloError {
-    /// No unit at all.
+    /// Not a hello of CARA.
     Magic,
-    /// A unit of the other mode.
+    /// A hello of the other mode.
     Mode,
-    /// The unit speaks none of our versions, but these.
+    /// None of this unit's versions, but these.
     Version(Versions),
-    /// No cipher suite that both have.
+    /// No common cipher suite.
     Suite,
-    /// The rest cannot be read, or says what must be understood and is not.
+    /// The rest cannot be decoded, or has an unknown item that must not be skipped.
     Malformed,
 }
 
@@ -127,15 +127,15 @@ impl Manager {
 /// A claim, as a manager makes it or as a vehicle has obeyed it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClaimReport {
-    /// The claim, with the tag that shows that a manager of its identity made it.
+    /// The claim and its tag, which only a manager of its identity can make.
     pub tagged: TaggedClaim,
-    /// In milliseconds: of a manager's own claim, since it took over from a live one, [`NEVER`](Self::NEVER) if it did not; of one
-    /// that was obeyed, since its manager was last heard.
+    /// In milliseconds. For a manager's own claim: since it took over from a live manager, [`NEVER`](Self::NEVER) if it did not.
+    /// For an obeyed claim: since its manager was last heard.
     pub since: u32,
 }
 
 impl ClaimReport {
-    /// As [`since`](Self::since): it did not take over, or was not heard for 49 days.
+    /// The value of [`since`](Self::since) for a manager that did not take over, or was not heard for 49 days.
     pub const NEVER: u32 = u32::MAX;
 
     /// The claim.
@@ -143,7 +143,7 @@ impl ClaimReport {
         self.tagged.claim
     }
 
-    /// The item that says it, if there is one.
+    /// Encodes the item, if there is a claim.
     pub(super) fn put(report: Option<&Self>, kind: u16, writer: &mut Writer<'_>) {
         let Some(report) = report else { return };
         let item = writer.begin(kind);
@@ -165,7 +165,7 @@ impl ClaimReport {
     }
 }
 
-/// What an item [`kind::LINK`] says.
+/// The content of an item [`kind::LINK`].
 struct Link {
     nonce: u64,
     link: u16,
@@ -198,7 +198,7 @@ impl Limits {
 }
 
 impl Hello {
-    /// Encodes into `out`; the length, or `None` where it does not fit.
+    /// Encodes into `out`; returns the length, or `None` if it does not fit.
     pub fn encode(&self, mode: Mode, out: &mut [u8]) -> Option<usize> {
         let mut writer = Writer::new(out);
         writer.bytes(&mode.magic());
@@ -223,7 +223,7 @@ impl Hello {
         writer.finish()
     }
 
-    /// Reads a hello of this mode. Items that this version does not know are passed over, and counted.
+    /// Decodes a hello of this mode. Items that this version does not know are skipped and counted.
     pub fn decode(bytes: &[u8], mode: Mode) -> Result<Self, HelloError> {
         let (prefix, items) = bytes.split_first_chunk::<PREFIX_BYTES>().ok_or(HelloError::Malformed)?;
         let [m0, m1, m2, m3, first, last, s0, s1, f0, f1, f2, f3, capabilities @ ..] = *prefix;

@@ -1,7 +1,7 @@
-//! Messages of a session: requests and replies with headers in front of a block of parameters, control messages of
-//! [items](super::items). Headers tell their length, so that a later version can put more into them. With
-//! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
-//! that knows the encoding; `docs/wire.md` says it in words.
+//! Messages of a session: requests and replies, whose headers precede a block of parameters, and control messages of
+//! [items](super::items). Headers contain their length, so that later versions can extend them. This module,
+//! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) are the only code with knowledge of the
+//! encoding, which `docs/wire.md` specifies.
 
 pub use super::control::SubscriptionRefusal;
 pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome, trace_id};
@@ -24,50 +24,50 @@ const PROGRESS: u8 = 5;
 const SAMPLE: u8 = 6;
 
 const WANTS_REPLY: u8 = 1;
-/// The caller wants to be told progress; a callee may pass it over.
+/// The caller asks for progress; a callee may ignore this.
 const WANTS_PROGRESS: u8 = 0x02;
-/// An operator made it, and not the unit's program.
+/// An operator made the request, not the unit's program.
 const OPERATOR: u8 = 0x04;
-/// What another caller moves is taken over.
+/// The call takes over an actuator that another caller holds.
 const TAKES_OVER: u8 = 0x10;
-/// Flags without which a callee must not run the request, and which this version does not know.
+/// Flags that this version does not know, and without which a callee must not run the request.
 const UNKNOWN: u8 = 0xE0;
-/// Bytes before a request's block.
+/// Length of a request's header.
 pub const REQUEST_BYTES: usize = 32;
-/// Bytes before a reply's block.
+/// Length of a reply's header.
 pub const REPLY_BYTES: usize = 16;
-/// Longest header that a receiver has room for in front of its longest block: those of later versions may be longer.
+/// Capacity of a receiver for a header before the longest block: those of later versions may be longer.
 pub const LONGEST_HEADER_BYTES: usize = 64;
-/// Bytes before the items of a control message.
+/// Length of a control message's header.
 const CONTROL_HEADER_BYTES: usize = 4;
-/// Headers tell their length in these.
+/// The unit of a header's length.
 const WORD: usize = 4;
 const REQUEST_WORDS: u8 = (REQUEST_BYTES / WORD) as u8;
 const REPLY_WORDS: u8 = (REPLY_BYTES / WORD) as u8;
-/// Longest control message that is not a `Publish`.
+/// Length of the longest control message other than `Publish`.
 pub const CONTROL_BYTES: usize = 48;
-/// Bytes that a `Publish` needs beside the signature.
+/// Length of a `Publish` without its signature.
 pub const PUBLISH_BYTES: usize = 32;
 
-/// A message, borrowed from the bytes that it came in.
+/// A message, borrowed from the received bytes.
 #[derive(Debug)]
 pub enum Message<'b> {
     /// Run a function.
     Request(RequestHeader, &'b [u8]),
-    /// What a request led to: results, or why there are none.
+    /// The outcome of a request: results or an error.
     Reply(u32, Result<&'b [u8], Error>),
-    /// An asynchronous request was not run, or its service failed.
+    /// A request without a reply was not run, or its service failed.
     Failure(u32, Error),
-    /// What a running call tells.
+    /// Progress of a running call.
     Progress(u32, &'b [u8]),
-    /// Lists, limits, leases: [items](super::items), of which [`Control`] is one each.
+    /// [Items](super::items), each a [`Control`]: lists, limits, leases.
     Control(&'b [u8]),
     /// The newest value of a stream.
     Sample(SampleHeader, &'b [u8]),
 }
 
 impl<'b> Message<'b> {
-    /// Reads a message; `None` for anything that the format does not know.
+    /// Decodes a message; `None` if it is not of this format.
     #[inline]
     pub fn decode(bytes: &'b [u8]) -> Option<Self> {
         match *bytes.first()? {
@@ -99,7 +99,7 @@ impl<'b> Message<'b> {
     }
 }
 
-/// What follows a header that says so many words of itself; it may be longer than this version's, and not shorter.
+/// The bytes after a header that gives its own length in words: at least `least` bytes, more in later versions.
 #[inline]
 fn behind_header<'b>(bytes: &'b [u8], words: &u8, least: usize) -> Option<&'b [u8]> {
     let length = usize::from(*words).saturating_mul(WORD);
@@ -113,37 +113,37 @@ impl Put for ChunkWriter<'_> {
     }
 }
 
-/// What stands in front of a request's arguments.
+/// The header of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RequestHeader {
-    /// Rises within a session; names the request in the reply.
+    /// Increases within a session; the reply repeats it.
     pub id: u32,
     /// The callee's function.
     pub slot: Slot,
-    /// The life of the slot that the caller knows.
+    /// The generation of the slot that the caller knows.
     pub generation: Generation,
     /// The caller waits for a reply.
     pub wants_reply: bool,
-    /// The caller wants to be told progress.
+    /// The caller asks for progress.
     pub wants_progress: bool,
-    /// What another caller moves is taken over.
+    /// The call takes over an actuator that another caller holds.
     pub takes_over: bool,
-    /// An operator made it, and not the unit's program.
+    /// An operator made the request, not the unit's program.
     pub operator: bool,
-    /// Flags that this version does not know, without which the request must not be run.
+    /// Unknown flags, without which the request must not be run.
     pub unknown: u8,
-    /// Time until the caller's deadline when the request was made, saturating.
+    /// Time from the request to the caller's deadline, saturating.
     pub remaining: Duration,
-    /// The callee's clock as the caller last heard it, in microseconds.
+    /// The callee's clock in microseconds, as the caller last received it.
     pub stamp: u64,
-    /// Time since the caller heard it, saturating.
+    /// Time since it was received, saturating.
     pub since: Duration,
-    /// The call's place among those that its caller has made on this link: a later one has a higher number.
+    /// The call's number among those that its caller has made on this link: later calls have higher ones.
     pub number: u32,
 }
 
 impl RequestHeader {
-    /// The header's bytes.
+    /// The encoded header.
     #[inline]
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
         let flags = if self.wants_reply { WANTS_REPLY } else { 0 }
@@ -215,22 +215,22 @@ impl RequestHeader {
     }
 }
 
-/// What stands in front of a value of a stream.
+/// The header of a stream's value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleHeader {
     /// The sender's stream.
     pub slot: Slot,
-    /// The life of the slot.
+    /// The generation of the slot.
     pub generation: Generation,
-    /// When the value was made, at the earliest, on the subscriber's clock in microseconds: before its start if negative.
+    /// The earliest time at which the value can have been made, in microseconds of the subscriber's clock; may be negative.
     pub made: i64,
 }
 
-/// Bytes before the block of a sample.
+/// Length of a sample's header.
 pub const SAMPLE_BYTES: usize = 16;
 
 impl SampleHeader {
-    /// The header's bytes.
+    /// The encoded header.
     pub fn encode(&self) -> [u8; SAMPLE_BYTES] {
         let ([s0, s1], [g0, g1]) = (self.slot.0.to_le_bytes(), self.generation.0.to_le_bytes());
         let [a, b, c, d, e, f, g, h] = self.made.to_le_bytes();
@@ -247,26 +247,26 @@ impl SampleHeader {
     }
 }
 
-/// Bytes before the block of progress.
+/// Length of a progress header.
 pub const PROGRESS_BYTES: usize = 8;
 
-/// The header of what call `id` tells.
+/// The header of progress of call `id`.
 pub fn encode_progress(id: u32) -> [u8; PROGRESS_BYTES] {
     let [a, b, c, d] = id.to_le_bytes();
     [PROGRESS, 0, 0, (PROGRESS_BYTES / WORD) as u8, a, b, c, d]
 }
 
-/// What stands behind the header of a reply or failure whose service failed: its text, and the block of its values.
+/// What follows the header of a reply or failure message after a service failed: a text, and a block of values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FailureDetails<'b> {
     /// The reason in words.
     pub text: &'b str,
-    /// The block of the values that the signature declares, or nothing.
+    /// The block of values, if the signature declares them.
     pub values: &'b [u8],
 }
 
 impl<'b> FailureDetails<'b> {
-    /// `None` for any other message, and where there are none.
+    /// Decodes the details; `None` if the message has none.
     pub fn of(message: &'b [u8]) -> Option<Self> {
         let &[REPLY | FAILURE, SERVICE_FAILED, _, words, ..] = message.first_chunk::<REPLY_BYTES>()? else {
             return None;
@@ -278,12 +278,12 @@ impl<'b> FailureDetails<'b> {
         Some(Self { text: core::str::from_utf8(text).ok()?, values })
     }
 
-    /// Bytes of a text with its length and padding.
+    /// Length of a text with its length field and padding.
     pub(crate) const fn text_bytes(text: &str) -> usize {
         text.len().next_multiple_of(8).saturating_add(8)
     }
 
-    /// Writes a text, which takes [`text_bytes`](Self::text_bytes).
+    /// Encodes a text, in [`text_bytes`](Self::text_bytes).
     pub(crate) fn put_text(text: &str, to: &mut impl Put) {
         to.put(&(text.len() as u64).to_le_bytes());
         to.put(text.as_bytes());
@@ -300,7 +300,7 @@ pub fn encode_reply(id: u32, status: Result<(), Error>) -> [u8; REPLY_BYTES] {
     answer(REPLY, id, status)
 }
 
-/// The message that tells why asynchronous request `id` failed.
+/// The message with the error of request `id`, which expects no reply.
 pub fn encode_failure(id: u32, error: Error) -> [u8; REPLY_BYTES] {
     answer(FAILURE, id, Err(error))
 }
@@ -327,10 +327,10 @@ fn decode_reply(bytes: &[u8; REPLY_BYTES]) -> (u32, Result<(), Error>) {
     (id, Err(error_of(code, index, first, second)))
 }
 
-/// The code of a service that failed with one of its own.
+/// The wire code of [`ServiceError::Failed`](crate::error::ServiceError::Failed).
 const SERVICE_FAILED: u8 = 20;
 
-/// (code, index, first number, second number) of an error that a callee answers.
+/// The wire form of a callee's error: code, index, first number, second number.
 fn error_code(error: Error) -> (u8, u8, u32, u32) {
     match error {
         Error::UnknownFunction => (1, 0, 0, 0),
@@ -359,7 +359,7 @@ fn error_code(error: Error) -> (u8, u8, u32, u32) {
     }
 }
 
-/// The inverse of [`error_code`]; a code of a later version reads as `Malformed`.
+/// The inverse of [`error_code`]. Codes of later versions become `Malformed`.
 fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
     match code {
         1 => Error::UnknownFunction,
@@ -388,48 +388,48 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
     }
 }
 
-/// What travels in a session's datagrams, or in the stream as a session frame.
+/// The content of a session's datagram, or of a session frame in the stream.
 #[derive(Debug, PartialEq, Eq)]
 pub enum SessionBody<'b> {
     /// The sender is alive.
     KeepAlive {
         /// The sender's clock in microseconds.
         stamp: u64,
-        /// What comes of the peer.
+        /// What has arrived from the peer.
         report: Report,
     },
-    /// The caller still wants what a leased call started. To be answered at once, on the way that it came.
+    /// Renews the lease of a call. Answered at once, by the same of stream and datagram.
     Renew(Renewal),
-    /// The answer: the caller's id of the call.
+    /// Answers `Renew`, with the caller's id of the call.
     Renewed(u32),
-    /// The caller no longer wants a leased call, wherever it is.
+    /// The caller releases a call of a function with a lease, whether in flight, queued or running.
     Release(Release),
-    /// The caller has given a call up, and waits for it no longer.
+    /// The caller has given a call up and no longer waits for it.
     Cancel(Release),
-    /// The caller gives up all its calls of a leased function up to this id, whether in flight, queued or running.
+    /// The caller releases all its calls of a function with ids up to this one, whether in flight, queued or running.
     ReleaseAll(Slot, u32),
-    /// One whole message: a best-effort request, or an emergency's second copy. The priority's byte, the message.
+    /// The priority and a whole message: a best-effort request, or the second copy of an emergency.
     Message(u8, &'b [u8]),
-    /// To be answered at once, in a datagram.
+    /// Answered at once, by datagram.
     Ping,
-    /// The answer, with what comes of the peer.
+    /// Answers `Ping`, and reports what has arrived from the peer.
     Pong(Report),
-    /// The sender ends the link, whose stream is dead: a close code. In a datagram only.
+    /// The sender ends the link because its stream is dead, with a close code. Only by datagram.
     Close(u8),
 }
 
-/// A renewal of a leased call; its age is bounded like a request's.
+/// A renewal of a call's lease. Its age is bounded like a request's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Renewal {
     /// The caller's id of the call.
     pub call: u32,
-    /// The class that the call was made in.
+    /// The class of the call.
     pub class: Priority,
-    /// The callee's clock as the caller last heard it.
+    /// The callee's clock, as the caller last received it.
     pub stamp: u64,
-    /// Time since then.
+    /// Time since it was received.
     pub since: Duration,
-    /// How long before that the caller has last been seen to want it.
+    /// Age of the evidence that the caller wants the call: the time since its heart's last beat.
     pub age: Duration,
 }
 
@@ -438,7 +438,7 @@ pub struct Renewal {
 pub struct Release {
     /// The caller's id of the call.
     pub call: u32,
-    /// The class that the call was made in.
+    /// The class of the call.
     pub class: Priority,
 }
 
@@ -449,7 +449,7 @@ impl Release {
     }
 }
 
-/// Longest session body that is not a message.
+/// Length of the longest session body that is not a message.
 pub const SESSION_BODY_BYTES: usize = 22;
 
 const KEEP_ALIVE: u8 = 1;
@@ -468,7 +468,7 @@ const HEARS: u8 = 1;
 const HOLDS: u8 = 2;
 
 impl<'b> SessionBody<'b> {
-    /// Reads a session body. All but a message may be longer than this version knows; `None` for what it does not know.
+    /// Decodes a session body; `None` if unknown. All but a message may be longer than this version's.
     pub fn decode(bytes: &'b [u8]) -> Option<Self> {
         let (&kind, rest) = bytes.split_first()?;
         match kind {
@@ -507,14 +507,14 @@ impl<'b> SessionBody<'b> {
         }
     }
 
-    /// A keep-alive's bytes.
+    /// The encoded keep-alive.
     pub fn keep_alive(stamp: u64, report: Report) -> [u8; 14] {
         let [a, b, c, d, e, f, g, h] = stamp.to_le_bytes();
         let [_, r0, r1, r2, r3, flags] = Self::pong(report);
         [KEEP_ALIVE, a, b, c, d, e, f, g, h, r0, r1, r2, r3, flags]
     }
 
-    /// A renewal's bytes.
+    /// The encoded renewal.
     pub fn renewal(renewal: &Renewal) -> [u8; 22] {
         let [c0, c1, c2, c3] = renewal.call.to_le_bytes();
         let [a, b, c, d, e, f, g, h] = renewal.stamp.to_le_bytes();
@@ -523,42 +523,42 @@ impl<'b> SessionBody<'b> {
         [RENEW, renewal.class.to_wire(), c0, c1, c2, c3, a, b, c, d, e, f, g, h, w, x, y, z, a0, a1, a2, a3]
     }
 
-    /// The answer's bytes.
+    /// The encoded answer to a renewal.
     pub fn renewed(call: u32) -> [u8; 5] {
         let [c0, c1, c2, c3] = call.to_le_bytes();
         [RENEWED, c0, c1, c2, c3]
     }
 
-    /// The bytes that release one call.
+    /// Encodes the release of one call.
     pub fn release(release: &Release) -> [u8; 6] {
         let [c0, c1, c2, c3] = release.call.to_le_bytes();
         [RELEASE, release.class.to_wire(), c0, c1, c2, c3]
     }
 
-    /// The bytes that cancel one call.
+    /// Encodes the cancellation of one call.
     pub fn cancel(release: &Release) -> [u8; 6] {
         let [_, rest @ ..] = Self::release(release);
         let [a, b, c, d, e] = rest;
         [CANCEL, a, b, c, d, e]
     }
 
-    /// The bytes that release all calls of a function up to `id`.
+    /// Encodes the release of all calls of a function up to `id`.
     pub fn release_all(slot: Slot, id: u32) -> [u8; 7] {
         let ([s0, s1], [i0, i1, i2, i3]) = (slot.0.to_le_bytes(), id.to_le_bytes());
         [RELEASE_ALL, s0, s1, i0, i1, i2, i3]
     }
 
-    /// A ping's byte.
+    /// The encoded ping.
     pub const PING: [u8; 1] = [PING];
 
-    /// A pong's bytes.
+    /// The encoded pong.
     pub fn pong(report: Report) -> [u8; 6] {
         let [r0, r1, r2, r3] = report.received.to_le_bytes();
         let flags = if report.hears { HEARS } else { 0 } | if report.holds { HOLDS } else { 0 };
         [PONG, r0, r1, r2, r3, flags]
     }
 
-    /// The bytes that end a link with this close code.
+    /// Encodes the end of a link with this close code.
     pub const fn close(code: u8) -> [u8; 2] {
         [CLOSE, code]
     }

@@ -1,10 +1,10 @@
-//! Values in a block: where each ends, and what lists and records hold.
+//! Values in a block: where each ends, and the contents of lists and records.
 //!
-//! In a block a list is `[count u32][body u32]` and its elements, each padded to 8 bytes; a record is
-//! its fields in order. Values lie in a `Parameters` as in a block, so that sending one copies it, and reading one needs no
-//! memory: [`Elements`] and [`Fields`] walk over the bytes.
+//! In a block a list is `[count u32][body u32]` and its elements, each padded to 8 bytes; a record is its fields in order. A
+//! `Parameters` stores them in the same layout, so sending copies bytes and reading needs no memory: [`Elements`] and [`Fields`]
+//! iterate over the bytes.
 //!
-//! What is recursive here is at most [`DEPTH`] deep, since signatures are checked before they are stored.
+//! Recursion here is at most [`DEPTH`] deep, since signatures are checked before they are stored.
 
 use super::spec::{Bounds, LIST_HEAD, RawSpec, VariableSpecs, can_be, least, padding_after};
 use super::value::{Type, Value, Variable, saturate};
@@ -12,13 +12,13 @@ use crate::bytes::is_text;
 use crate::config::DEPTH;
 use crate::error::Error;
 
-/// The value at the start of `block`, and what follows it; `None` if it is cut off, too long or not padded with zeros.
+/// The value at the start of `block`, and what follows; `None` if it is cut off, too long or not padded with zeros.
 pub(super) fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
     let (length, rest) = if spec.kind.is_fixed() {
         (spec.kind.bytes_of(spec.size)?, block)
     } else {
         let (&head, rest) = block.split_first_chunk::<8>()?;
-        // The upper half is the four bytes of zero, so that a longer value fails here.
+        // The upper half has to be zero, so that a longer value fails here.
         let length = u32::try_from(u64::from_le_bytes(head)).ok().filter(|&length| length <= spec.size)?;
         (length as usize, rest)
     };
@@ -35,7 +35,7 @@ pub(super) fn is_canonical(kind: Type, value: &[u8]) -> bool {
     }
 }
 
-/// Whether a value of a list or record can be sent or stored as `spec`, and the bytes that it takes.
+/// Whether a value of a list or record can be sent or stored as `spec`; returns its size in bytes.
 pub(super) fn measure(spec: RawSpec<'_>, value: Value<'_>, index: u8) -> Result<usize, Error> {
     if value.size != spec.size || value.inner != spec.inner {
         let own = RawSpec { name: &[], kind: value.kind, size: value.size, inner: value.inner };
@@ -43,7 +43,7 @@ pub(super) fn measure(spec: RawSpec<'_>, value: Value<'_>, index: u8) -> Result<
             return Err(Error::WrongType { index });
         }
         if check(spec, value.bytes).is_none_or(|(_, rest)| !rest.is_empty()) {
-            // Of a list that has too many elements their count, and not how many it may have.
+            // If the list is too long, report its count of elements, not its declared size.
             let found = match split_list(value.bytes) {
                 Some((count, ..)) if spec.kind == Type::List && count > spec.size => count,
                 _ => value.size,
@@ -54,9 +54,9 @@ pub(super) fn measure(spec: RawSpec<'_>, value: Value<'_>, index: u8) -> Result<
     Ok(value.bytes.len())
 }
 
-/// A list or record that has begun and not ended.
+/// A list or record that is being walked.
 enum Open<'s> {
-    /// A list: elements that are still to come, and how many bytes are left behind its body.
+    /// A list: the elements left, and the bytes that follow its body.
     List {
         left: u32,
         element: RawSpec<'s>,
@@ -65,12 +65,12 @@ enum Open<'s> {
     Record(VariableSpecs<'s>),
 }
 
-/// The list or record at the start of a block, all of it checked, and what follows it. `None` if it is malformed.
+/// Checks the list or record at the start of a block; returns it and what follows, or `None` if it is malformed.
 pub(super) fn check<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
     walk(spec, block, true)
 }
 
-/// The same in bytes that were checked: bodies of lists are passed over.
+/// The same for checked bytes: skips the bodies of lists.
 pub(super) fn extent<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
     walk(spec, block, false)
 }
@@ -88,7 +88,7 @@ fn walk<'b>(spec: RawSpec<'_>, block: &'b [u8], checks: bool) -> Option<(&'b [u8
                 if !checks {
                     rest = rest.get(body..)?;
                 } else {
-                    // A count that lies is found here, before anything is done as often as it says.
+                    // Detect a false count here, before it causes as many steps.
                     let fits =
                         count == 0 || least(element).checked_mul(count as usize).is_some_and(|least| least <= body);
                     if count > next.size || !body.is_multiple_of(8) || !fits {
@@ -128,14 +128,14 @@ fn walk<'b>(spec: RawSpec<'_>, block: &'b [u8], checks: bool) -> Option<(&'b [u8
     }
 }
 
-/// Count and length of the body at the start of a list, and what follows them.
+/// Count, length of the body, and the bytes that follow, at the start of a list.
 fn split_list(bytes: &[u8]) -> Option<(u32, usize, &[u8])> {
     let (count, rest) = bytes.split_first_chunk::<4>()?;
     let (body, rest) = rest.split_first_chunk::<4>()?;
     Some((u32::from_le_bytes(*count), u32::from_le_bytes(*body) as usize, rest))
 }
 
-/// The value at the start of checked bytes, without its padding, and what follows it.
+/// The value at the start of checked bytes, without its padding, and what follows.
 fn take<'a>(spec: RawSpec<'a>, bytes: &'a [u8], index: u8) -> Option<(Value<'a>, &'a [u8])> {
     let (value, rest) = if spec.kind.is_nested() { extent(spec, bytes)? } else { split(spec, bytes)? };
     Some((Value { index, kind: spec.kind, size: spec.size, inner: spec.inner, bytes: value }, rest))
@@ -151,12 +151,12 @@ pub struct Elements<'a> {
 }
 
 impl Elements<'_> {
-    /// How many are left.
+    /// How many elements are left.
     pub const fn len(&self) -> u32 {
         self.left
     }
 
-    /// Whether none is left.
+    /// Whether no elements are left.
     pub const fn is_empty(&self) -> bool {
         self.left == 0
     }
@@ -198,7 +198,7 @@ impl<'a> Iterator for Fields<'a> {
 }
 
 impl<'a> Value<'a> {
-    /// The elements of a list; none for another type.
+    /// The elements of a list; none for other types.
     pub fn elements(&self) -> Elements<'a> {
         let element = self.raw_spec().element();
         let list = element.and_then(|element| Some((element, split_list(self.bytes)?)));
@@ -208,12 +208,12 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// The fields of a record; none for another type.
+    /// The fields of a record; none for other types.
     pub fn fields(&self) -> Fields<'a> {
         Fields { specs: self.raw_spec().fields(), rest: self.bytes, index: self.index }
     }
 
-    /// The field of this name; [`Error::UnknownVariable`] where there is none.
+    /// The field with this name; [`Error::UnknownVariable`] if there is none.
     pub fn field(&self, name: &str) -> Result<Value<'a>, Error> {
         self.fields().find(|field| field.name == name).map(|field| field.value).ok_or(Error::UnknownVariable)
     }
@@ -223,7 +223,7 @@ impl<'a> Value<'a> {
     }
 }
 
-/// `length` elements or bytes as a list's head has them.
+/// The encoded head of a list.
 pub(super) fn list_head(count: u32, body: usize) -> [u8; LIST_HEAD] {
     (u64::from(count) | u64::from(saturate(body)).wrapping_shl(32)).to_le_bytes()
 }

@@ -1,8 +1,8 @@
 //! The paper's `Parameters`: named variables with a type and a size, passed to a service and updated by its results.
 //!
-//! [`Parameters`] owns its bytes and has no heap; functions take a [`ParametersView`], to which a `Parameters` of any
-//! size coerces. Names and values lie in one arena; each value reserves its declared size, so that setting one
-//! never moves another. A list or record takes what its value takes, and moves what follows it.
+//! [`Parameters`] contains its bytes, without a heap; functions take a [`ParametersView`], to which `Parameters` of any size
+//! coerce. Names and values lie in one arena. A value reserves its declared size, so setting it never moves another; a list or
+//! record takes the size of its present value, and moves what follows.
 
 use core::fmt;
 use core::ops::{Deref, DerefMut};
@@ -46,22 +46,22 @@ pub type Parameters<const BYTES: usize = PARAMETERS_BYTES> = ParametersInner<[u8
 /// ```
 pub type ParametersView = ParametersInner<[u8]>;
 
-/// Both [`Parameters`] and [`ParametersView`]; not named directly.
+/// The type behind [`Parameters`] and [`ParametersView`]; not named directly.
 #[derive(Clone)]
 pub struct ParametersInner<B: ?Sized> {
     table: [Entry; VARIABLES],
-    /// As wide as `used`, so that the bytes behind are aligned and copied word by word.
+    /// 32 bits like `used`, so that `bytes` is aligned and copied word by word.
     count: u32,
     used: u32,
     bytes: B,
 }
 
-/// One variable. In the arena lie what a list or record is made of, the name, and the value.
+/// One variable. The arena has its inner types if it is a list or record, then its name and its value.
 #[derive(Clone, Copy)]
 struct Entry {
     value_at: u32,
     size: u32,
-    /// Bytes of the value now.
+    /// The present length of the value in bytes.
     length: u32,
     name_length: u8,
     kind: Type,
@@ -73,14 +73,14 @@ impl Entry {
 }
 
 impl Parameters {
-    /// Empty parameters of the usual size.
+    /// Empty parameters with the default capacity.
     pub const fn new() -> Self {
         Self::sized()
     }
 }
 
 impl<const BYTES: usize> ParametersInner<[u8; BYTES]> {
-    /// Empty parameters of any size: `Parameters::<2048>::sized()`.
+    /// Empty parameters with this capacity in bytes: `Parameters::<2048>::sized()`.
     pub const fn sized() -> Self {
         Self { table: [Entry::EMPTY; VARIABLES], count: 0, used: 0, bytes: [0; BYTES] }
     }
@@ -89,7 +89,7 @@ impl<const BYTES: usize> ParametersInner<[u8; BYTES]> {
 impl<B: Arena + ?Sized> ParametersInner<B> {
     /// Adds `size` integers, all 0.
     ///
-    /// [`Error::NameTaken`], [`Error::BadName`] or [`Error::Full`] leave the parameters unchanged; so for all types.
+    /// [`Error::NameTaken`], [`Error::BadName`] or [`Error::Full`] leave the parameters unchanged, as in all methods that add.
     pub fn add_int(&mut self, name: &str, size: u32) -> Result<(), Error> {
         self.add(name, Type::Int, size)
     }
@@ -124,13 +124,12 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         self.add(name, Type::Bytes, maximum)
     }
 
-    /// Adds a variable of any type but a list or record, with the value 0, `false` or empty.
+    /// Adds a variable of any type except list and record, with the value 0, `false` or empty.
     pub fn add(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
         self.as_mut_view().add_variable(VariableSpec::flat(name, kind, size))
     }
 
-    /// Adds a variable as a signature has it, with the value 0, `false` or empty; a list is empty, and a record has such
-    /// fields.
+    /// Adds a variable as a signature declares it, with the value 0, `false` or empty; the fields of a record likewise.
     #[cfg_attr(feature = "nested", doc = "```")]
     #[cfg_attr(not(feature = "nested"), doc = "```ignore")]
     /// use cara_core::distribution::{function::Definition, parameters::Parameters};
@@ -155,19 +154,19 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         self.as_mut_view().add_variable(spec)
     }
 
-    /// The elements of a list; [`Error::UnknownVariable`] or [`Error::WrongType`].
+    /// The elements of a list. Errors: [`Error::UnknownVariable`], [`Error::WrongType`].
     pub fn list(&self, name: &str) -> Result<Elements<'_>, Error> {
         let value = self.value(name)?;
         if value.kind() == Type::List { Ok(value.elements()) } else { Err(Error::WrongType { index: value.index }) }
     }
 
-    /// The fields of a record; [`Error::UnknownVariable`] or [`Error::WrongType`].
+    /// The fields of a record. Errors: [`Error::UnknownVariable`], [`Error::WrongType`].
     pub fn record(&self, name: &str) -> Result<Fields<'_>, Error> {
         let value = self.value(name)?;
         if value.kind() == Type::Record { Ok(value.fields()) } else { Err(Error::WrongType { index: value.index }) }
     }
 
-    /// Sets a list to the elements that `write` adds. On an error, which may be one of `write`, the old value stays.
+    /// Sets a list to the elements that `write` adds. On an error, including one of `write`, the old value stays.
     pub fn set_list(
         &mut self,
         name: &str,
@@ -178,7 +177,7 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         view.write_list(index, write)
     }
 
-    /// Sets a record, all of whose fields `write` sets in their order. On an error the old value stays.
+    /// Sets a record; `write` must set all fields in order. On an error the old value stays.
     pub fn set_record(
         &mut self,
         name: &str,
@@ -191,7 +190,7 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
 
     /// Sets a variable from a number, a truth value, an array or slice of them, a `&str` or a `&[u8]`.
     ///
-    /// Fixed sizes must be exact; text and bytes at most as long as declared. On an error the old value stays.
+    /// Numbers and truth values must be as many as declared; text and bytes may be shorter. On an error the old value stays.
     ///
     /// ```
     /// use cara_core::distribution::parameters::Parameters;
@@ -231,7 +230,7 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         T::from_value(self.value(name)?)
     }
 
-    /// Reads all elements of a variable into `elements`, which must be as many. On an error they are unchanged.
+    /// Reads all elements of a variable into a slice of exactly that length. On an error the slice is unchanged.
     ///
     /// ```
     /// use cara_core::distribution::parameters::Parameters;
@@ -254,12 +253,12 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         self.used = 0;
     }
 
-    /// Replaces all variables by those of `other`; [`Error::Full`] leaves the parameters unchanged.
+    /// Replaces all variables by those of `other`. [`Error::Full`] leaves the parameters unchanged.
     pub fn copy_from(&mut self, other: &ParametersView) -> Result<(), Error> {
         self.as_mut_view().replace_by(other)
     }
 
-    /// Bytes that are free for further names and values.
+    /// Bytes that are free for more names and values.
     pub fn remaining(&self) -> usize {
         self.as_view().bytes.len().saturating_sub(self.used as usize)
     }
@@ -269,7 +268,7 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         self.count as usize
     }
 
-    /// Whether there is no variable.
+    /// Whether there are no variables.
     pub const fn is_empty(&self) -> bool {
         self.count == 0
     }
@@ -290,12 +289,12 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
         view.named(name.as_bytes()).ok_or(Error::UnknownVariable)
     }
 
-    /// The parameters without their size as a type.
+    /// The parameters as a type without their capacity.
     pub fn as_view(&self) -> &ParametersView {
         B::view(self)
     }
 
-    /// The parameters without their size as a type.
+    /// The parameters as a type without their capacity.
     pub fn as_mut_view(&mut self) -> &mut ParametersView {
         B::view_mut(self)
     }
@@ -311,18 +310,18 @@ impl ParametersView {
         self.add_checked(spec.raw())
     }
 
-    /// The value of the variable in a place; [`Error::UnknownVariable`] where there is none.
+    /// The value of the variable at an index; [`Error::UnknownVariable`] if there is none.
     #[doc(hidden)]
     pub fn value_of(&self, place: usize) -> Result<Value<'_>, Error> {
         self.value_at(place).filter(|_| place < self.len()).ok_or(Error::UnknownVariable)
     }
 
-    /// The variable in a place, to be set.
+    /// The variable at an index, to be set.
     pub(crate) fn target_of(&mut self, place: usize) -> Result<Target<'_>, Error> {
         if place < self.len() { self.target(place).ok_or(Error::UnknownVariable) } else { Err(Error::UnknownVariable) }
     }
 
-    /// Adds a variable whose name may be one, and is not there.
+    /// Adds a variable whose name is valid and not taken.
     pub(super) fn add_checked(&mut self, spec: RawSpec<'_>) -> Result<(), Error> {
         let nested = if spec.kind.is_nested() { spec::least(spec) } else { 0 };
         let target = self.reserve(spec, nested)?;
@@ -333,18 +332,18 @@ impl ParametersView {
         Ok(())
     }
 
-    /// The same with a value that was checked against its type and size.
+    /// As [`add_checked`](Self::add_checked), with a value that was checked against type and size.
     pub(super) fn add_with(&mut self, spec: RawSpec<'_>, value: &[u8]) -> Result<(), Error> {
         self.reserve(spec, value.len())?.set_checked(value);
         Ok(())
     }
 
-    /// The place of a new variable, whose value is not set; that of a list or record takes `nested` bytes.
+    /// Reserves a new variable without setting its value; that of a list or record takes `nested` bytes.
     fn reserve(&mut self, spec: RawSpec<'_>, nested: usize) -> Result<Target<'_>, Error> {
         let RawSpec { name, kind, size, inner } = spec;
         let index = self.count;
         let full = Error::Full(Limit::ParametersBytes);
-        // With `ok_or` each slice would be copied into a `Result` and out of it.
+        // `ok_or` would copy each slice into a `Result` and out again.
         let Some(place) = self.table.get_mut(index as usize) else { return Err(Error::Full(Limit::Variables)) };
         let Some(length) = (if kind.is_nested() { Some(nested) } else { kind.bytes_of(size) }) else {
             return Err(full);
@@ -357,7 +356,7 @@ impl ParametersView {
             (inner_place, free) = free.split_at_mut_checked(inner.len()).ok_or(full)?;
             copy(inner, inner_place);
             value_at = value_at.saturating_add(saturate(inner.len()));
-            // What a variable is made of is part of a signature, or was checked like one.
+            // The inner types come from a signature, or were checked like one, so this cannot fail.
             inner_length = u16::try_from(inner.len()).map_err(|_| Error::Full(Limit::SignatureBytes))?;
         }
         let Some((name_place, free)) = free.split_at_mut_checked(name.len()) else { return Err(full) };
@@ -399,7 +398,7 @@ impl ParametersView {
         Some(Value { index: index as u8, kind: entry.kind, size: entry.size, inner, bytes })
     }
 
-    /// All bytes of names and values, also those that are not used.
+    /// The whole arena, including unused bytes.
     pub(super) const fn arena(&self) -> &[u8] {
         &self.bytes
     }
@@ -408,14 +407,14 @@ impl ParametersView {
         self.used as usize
     }
 
-    /// The bytes from a place on that nothing uses: `most` of them, or all that there are.
+    /// Up to `most` unused bytes from an offset on.
     pub(super) fn room_at(&mut self, at: usize, most: usize) -> Option<&mut [u8]> {
         let (_, free) = self.bytes.split_at_mut_checked(at)?;
         let end = free.len().min(most);
         free.get_mut(..end)
     }
 
-    /// Sets a list or record from bytes that were checked against what it is made of.
+    /// Sets a list or record from bytes that were checked against its type.
     pub(super) fn set_nested(&mut self, index: usize, bytes: &[u8]) -> Result<(), Error> {
         let start = self.used as usize;
         let place = self.bytes.get_mut(start..start.saturating_add(bytes.len()));
@@ -424,7 +423,7 @@ impl ParametersView {
         Ok(())
     }
 
-    /// Puts `length` bytes, which lie behind all that is used, in the place of the value of a list or record.
+    /// Moves `length` bytes, which lie behind all used bytes, into the value of a list or record.
     pub(super) fn replace_nested(&mut self, index: usize, length: usize) {
         let Some(entry) = self.table.get_mut(index) else { return };
         let (at, old) = (entry.value_at, entry.length as usize);
@@ -443,7 +442,7 @@ impl ParametersView {
         self.used = moved(self.used);
     }
 
-    /// Where in the arena stands what the variable at `index` is made of.
+    /// The offset in the arena of the inner types of the variable at `index`.
     pub(super) fn inner_at(&self, index: usize) -> Option<usize> {
         let entry = self.table.get(index)?;
         let behind = usize::from(entry.name_length).checked_add(usize::from(entry.inner_length))?;
@@ -455,7 +454,7 @@ impl ParametersView {
         self.bytes.get(end.saturating_sub(usize::from(entry.inner_length))..end).unwrap_or_default()
     }
 
-    /// Sets the value of the variable at `index` from bytes that were checked against its type and size.
+    /// Sets the variable at `index` from bytes that were checked against its type and size.
     #[inline]
     pub(crate) fn set_checked(&mut self, index: usize, bytes: &[u8]) {
         if let Some(target) = self.target(index) {
@@ -479,10 +478,10 @@ impl ParametersView {
     }
 }
 
-/// The bytes of a `Parameters`: an array or a slice.
+/// The bytes of `Parameters`: an array or a slice.
 ///
-/// The methods are those of the generic type rather than of the view alone, so that
-/// `pos.set_value("x", pos.variable::<i64>("x")? + 1)` compiles.
+/// The methods are on the generic type, not on the view alone, so that `pos.set_value("x", pos.variable::<i64>("x")? + 1)`
+/// compiles.
 pub trait Arena: sealed::Sealed {
     #[doc(hidden)]
     fn view(parameters: &ParametersInner<Self>) -> &ParametersView;

@@ -1,7 +1,7 @@
-//! The variables of a signature: name, type and size of each, and what a list or record is made of.
+//! The variables of a signature: name, type, size and, for lists and records, the inner types.
 //!
-//! A list is followed by its element's type u8 and size u32, and by what that is made of; a record by its fields, each a variable.
-//! What is recursive here is at most [`DEPTH`] deep, since signatures are checked before they are stored.
+//! The inner types of a list are its element's type u8 and size u32, then the element's inner types; those of a record are its
+//! fields, each a variable. Recursion here is at most [`DEPTH`] deep, since signatures are checked before they are stored.
 
 use core::fmt;
 
@@ -20,7 +20,7 @@ pub struct VariableSpec<'a> {
     /// Its size: exactly this many numbers or truth values, at most this many bytes of a string or bytes, at most this many
     /// elements of a list, or the number of a record's fields.
     pub size: u32,
-    /// What a list or record is made of, as it stands in a signature; empty for other types.
+    /// The inner types of a list or record, as encoded in a signature; empty for other types.
     pub inner: &'a [u8],
 }
 
@@ -41,7 +41,7 @@ pub struct VariableSpecs<'a> {
     pub(super) rest: &'a [u8],
 }
 impl<'a> VariableSpecs<'a> {
-    /// Bytes of a `Parameters` that holds all of them.
+    /// Capacity in bytes of a `Parameters` with all of them.
     pub fn parameters_bytes(self) -> u32 {
         let bytes = self.raw().try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec)?));
         bytes.map_or(u32::MAX, saturate)
@@ -52,7 +52,7 @@ impl<'a> VariableSpecs<'a> {
         self.find(|spec| spec.name == name)
     }
 
-    /// The same, without a look at the names.
+    /// The variables, without validation of their names.
     pub(super) fn raw(mut self) -> impl Iterator<Item = RawSpec<'a>> + Clone {
         core::iter::from_fn(move || self.next_raw())
     }
@@ -73,7 +73,7 @@ impl<'a> VariableSpecs<'a> {
         }
     }
 
-    /// What follows the variables, none of which is read.
+    /// The bytes that follow the variables, none of which has been read yet.
     #[inline]
     pub(super) fn behind(&self) -> Option<&'a [u8]> {
         (0..self.left).try_fold(self.rest, |rest, _| {
@@ -123,12 +123,12 @@ impl<'a> RawSpec<'a> {
 }
 
 impl<'a> VariableSpec<'a> {
-    /// A variable that is no list or record.
+    /// A variable other than a list or record.
     pub const fn flat(name: &'a str, kind: Type, size: u32) -> Self {
         Self { name, kind, size, inner: &[] }
     }
 
-    /// What a list's elements are, without a name; `None` for another type.
+    /// The element of a list, without a name; `None` for other types.
     pub fn element(&self) -> Option<Self> {
         self.raw().element().map(|element| Self {
             name: "",
@@ -138,7 +138,7 @@ impl<'a> VariableSpec<'a> {
         })
     }
 
-    /// A record's fields; none for another type.
+    /// The fields of a record; none for other types.
     pub fn fields(&self) -> VariableSpecs<'a> {
         self.raw().fields()
     }
@@ -156,11 +156,11 @@ impl<'a> VariableSpec<'a> {
 
 /// Bytes of an element's type and size.
 const ELEMENT_HEAD: usize = 5;
-/// Bytes of a list's count and of the length of its body.
+/// Bytes of the head of a list's value: the count of elements and the length of its body.
 pub(super) const LIST_HEAD: usize = 8;
 
 impl<'a> RawSpec<'a> {
-    /// What the elements of a list are.
+    /// The element of a list.
     pub(super) fn element(&self) -> Option<Self> {
         if self.kind != Type::List {
             return None;
@@ -178,14 +178,14 @@ impl<'a> RawSpec<'a> {
     }
 }
 
-/// The type and size of an element, and what follows them.
+/// An element's type and size, and the bytes that follow them.
 pub(super) const fn split_element(bytes: &[u8]) -> Option<(Type, u32, &[u8])> {
     let Some((&[kind, size @ ..], rest)) = bytes.split_first_chunk::<ELEMENT_HEAD>() else { return None };
     let Some(kind) = Type::from_wire(kind) else { return None };
     Some((kind, u32::from_le_bytes(size), rest))
 }
 
-/// What follows the insides of a list or record, which begin at `rest`. Each turn takes bytes, so it ends.
+/// The bytes that follow the inner types of a list or record at `rest`. Terminates, since each round consumes bytes.
 fn behind(mut kind: Type, mut size: u32, mut rest: &[u8]) -> Option<&[u8]> {
     let mut fields = 0_u32;
     loop {
@@ -205,14 +205,14 @@ fn behind(mut kind: Type, mut size: u32, mut rest: &[u8]) -> Option<&[u8]> {
     }
 }
 
-/// The insides of a list or record, and what follows them.
+/// The inner types of a list or record, and the bytes that follow them.
 fn split_inner(kind: Type, size: u32, bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let rest = behind(kind, size, bytes)?;
     bytes.split_at_checked(bytes.len().checked_sub(rest.len())?)
 }
 
-/// Checks what a variable of a signature is made of: depth, names, and that an element takes bytes, since a count of
-/// elements that take none would cost its sender nothing.
+/// Checks the inner types of a variable: depth, names, and that no element is empty, since a large count of empty elements would
+/// cost its sender nothing.
 pub(super) fn check_inner(spec: RawSpec<'_>) -> Result<(), Error> {
     if spec.kind.is_nested() {
         return check_at(spec, 0);
@@ -250,7 +250,7 @@ fn check_at(spec: RawSpec<'_>, depth: usize) -> Result<(), Error> {
     Ok(())
 }
 
-/// Bytes of the shortest value in a block: numbers as they are, texts and lists empty. All of them are zero.
+/// Bytes of the shortest value in a block, with empty texts and lists. All these bytes are zero.
 pub(super) fn least(spec: RawSpec<'_>) -> usize {
     match spec.kind {
         Type::List | Type::String | Type::Bytes => LIST_HEAD,
@@ -262,7 +262,7 @@ pub(super) fn least(spec: RawSpec<'_>) -> usize {
     }
 }
 
-/// Bytes of the longest value in a block; `None` where that exceeds the address space.
+/// Bytes of the longest value in a block; `None` if that exceeds the address space.
 pub(super) fn longest(spec: RawSpec<'_>) -> Option<usize> {
     match spec.kind {
         Type::List => (spec.size as usize).checked_mul(longest(spec.element()?)?)?.checked_add(LIST_HEAD),
@@ -277,13 +277,13 @@ pub(super) fn longest(spec: RawSpec<'_>) -> Option<usize> {
 /// How the sizes of two variables are compared.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Bounds {
-    /// Those of texts, bytes and lists may differ: the value tells whether it fits.
+    /// Those of texts, bytes and lists may differ: whether a value fits is checked when it is there.
     Free,
-    /// Those of the first are at most those of the second, so that every value fits.
+    /// Those of the first type are at most those of the second, so that every value fits.
     Fit,
 }
 
-/// Whether a value of the one type can be one of the other.
+/// Whether a value of one type is accepted by the other.
 pub(super) fn can_be(one: RawSpec<'_>, other: RawSpec<'_>, bounds: Bounds) -> bool {
     let size = || bounds == Bounds::Free || one.size <= other.size;
     one.kind == other.kind
@@ -302,11 +302,11 @@ pub(super) fn can_be(one: RawSpec<'_>, other: RawSpec<'_>, bounds: Bounds) -> bo
         }
 }
 
-/// A type and its size; `None` where there is none.
+/// A type and its size, if there is one.
 type Shape = Option<(Type, u32)>;
 
-/// Where in a variable two units differ: adds the way to it, and returns what each has there. A way without room ends at a
-/// name.
+/// Finds where the type of a variable differs between two units: appends the path to `path`, and returns both types there. A path
+/// that is too long is cut after a name.
 pub(super) fn difference<const N: usize>(
     ours: Option<VariableSpec<'_>>,
     theirs: Option<VariableSpec<'_>>,
@@ -335,7 +335,7 @@ pub(super) fn difference<const N: usize>(
         };
         (here, there) = next;
         let name = here.or(there).map_or(&[][..], |spec| spec.name);
-        // What is behind a name without room is left out as well: it would seem to be in what stands before.
+        // Once a name does not fit, leave out all that follow: they would seem to be fields of the name before it.
         let name = core::str::from_utf8(name).unwrap_or_default();
         has_room &= path.len().saturating_add(way.len()).saturating_add(name.len()) <= N;
         if has_room {
@@ -349,15 +349,15 @@ pub(super) fn difference<const N: usize>(
     (here.map(shape), there.map(shape))
 }
 
-/// Whether the peer's field can be ours, where both are.
+/// Whether the peer's field is compatible with ours, if both exist.
 fn is_same_field((ours, theirs): (Option<RawSpec<'_>>, Option<RawSpec<'_>>), bounds: Bounds) -> bool {
     let (Some(ours), Some(theirs)) = (ours, theirs) else { return false };
-    // An argument goes there, a result comes from there.
+    // Arguments go to the peer, results come from it.
     let (from, to) = if bounds == Bounds::Free { (ours, theirs) } else { (theirs, ours) };
     from.name == to.name && can_be(from, to, bounds)
 }
 
-/// Bytes of a [`Parameters`] that one variable takes; `None` where that exceeds the address space.
+/// Bytes that a variable takes in a [`Parameters`]; `None` if that exceeds the address space.
 pub(super) fn bytes_of_variable(spec: RawSpec<'_>) -> Option<usize> {
     if spec.kind.is_nested() {
         return least(spec).checked_add(spec.inner.len())?.checked_add(spec.name.len());
@@ -365,7 +365,7 @@ pub(super) fn bytes_of_variable(spec: RawSpec<'_>) -> Option<usize> {
     spec.kind.bytes_of(spec.size)?.checked_add(spec.name.len())
 }
 
-/// Bytes of zero after `length` bytes, so that the next value starts at a multiple of 8.
+/// Number of zero bytes after `length` bytes that align the next value to 8.
 pub(super) const fn padding_after(length: usize) -> usize {
     length.wrapping_neg() & 7
 }

@@ -1,4 +1,4 @@
-//! Storage of both function lists: entries by index, and one arena without gaps for all signatures.
+//! Storage of both function lists: entries by index, and one contiguous arena for all signatures.
 
 use core::fmt;
 
@@ -12,25 +12,25 @@ use crate::bytes::{copy, move_down};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
 
-/// A function's place in its owner's list.
+/// Index of a function in its owner's list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Slot(pub u16);
 
-/// Tells apart the functions that have been in one slot.
+/// Distinguishes the functions that have been in one slot.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Generation(pub u16);
 
-/// A function in a list. `H` is its handler; `()` in a peer's list.
+/// A function in a list. `H` is the type of its handler; `()` in a peer's list.
 pub struct Function<'a, H: ?Sized = ()> {
-    /// Its place.
+    /// Its slot.
     pub slot: Slot,
-    /// The generation of its place.
+    /// The generation of its slot.
     pub generation: Generation,
     /// Its name, arguments and results.
     pub signature: Signature<'a>,
-    /// How it wants to be called.
+    /// Its priority, lease and other attributes.
     pub attributes: &'a Attributes,
-    /// What runs it.
+    /// Its handler.
     pub handler: &'a H,
 }
 
@@ -55,24 +55,24 @@ impl<H: ?Sized> fmt::Debug for Function<'_, H> {
     }
 }
 
-/// Room for one function; ports allocate a slice of empty ones.
+/// Memory for one function; ports allocate a slice of empty entries.
 pub struct Entry<H = ()> {
     pub(super) generation: Generation,
-    /// It is kept and not shown.
+    /// Stored, but hidden by the access table.
     pub(super) hidden: bool,
-    /// What this unit wants of a stream.
+    /// This unit's subscription, if it is a stream.
     pub(super) wish: State<Wish, { STREAMS as usize }>,
     pub(super) function: Option<Stored<H>>,
 }
 
-/// As the interval of a subscription: there is none.
+/// The interval of a subscription that does not exist.
 pub const NO_SUBSCRIPTION: u32 = u32::MAX;
 
-/// What a unit wants of a stream of its peer: the interval of a subscription in milliseconds, or [`NO_SUBSCRIPTION`].
+/// A unit's subscription to a stream of its peer: the interval in milliseconds, or [`NO_SUBSCRIPTION`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Wish {
     pub(crate) interval: u32,
-    /// As the peer was told.
+    /// As last sent to the peer.
     pub(crate) advertised: u32,
 }
 
@@ -89,7 +89,7 @@ pub(super) struct Stored<H> {
 }
 
 impl<H> Entry<H> {
-    /// Room without a function.
+    /// An entry without a function.
     pub const fn empty() -> Self {
         Self { generation: Generation(0), hidden: false, wish: State::NEW, function: None }
     }
@@ -101,12 +101,12 @@ impl<H> Default for Entry<H> {
     }
 }
 
-/// Half as much again, at least what is `needed` and at most `most`; as it is where that much is there.
+/// The length to grow to: half as much again, at least `needed`, and at most `most`; unchanged if it suffices.
 fn longer(length: usize, needed: usize, most: usize) -> usize {
     if length >= needed { length } else { length.saturating_add(length / 2).max(needed).min(most) }
 }
 
-/// Entries, and one arena for all their signatures without gaps.
+/// The entries, and one contiguous arena for all signatures.
 pub(super) struct Table<S: Storage, H: 'static> {
     pub(super) entries: S::Slice<Entry<H>>,
     pub(super) bytes: S::Slice<u8>,
@@ -123,7 +123,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         self.entries.iter().position(|entry| entry.function.is_none())
     }
 
-    /// Makes room for one more function, whose signature has so many bytes, in at most `most` entries and bytes.
+    /// Grows, if needed, for one more function with a signature of this length, up to `most` entries and bytes.
     pub(super) fn make_room(&mut self, signature: usize, most: (usize, usize))
     where
         Entry<H>: Default,
@@ -165,7 +165,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         Ok(())
     }
 
-    /// Empties an entry and closes the gap in the arena.
+    /// Clears an entry and closes the gap in the arena.
     pub(super) fn take(&mut self, index: usize) -> Option<Stored<H>> {
         let removed = self.entries.get_mut(index)?.function.take()?;
         self.len = self.len.saturating_sub(1);
@@ -187,7 +187,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         }
     }
 
-    /// Keeps all functions without their help.
+    /// Removes the help of all functions.
     pub(super) fn forget_help(&mut self) {
         for index in 0..self.entries.len() {
             let bare = self.function(index).map(|function| function.signature.without_help().as_bytes().len());
@@ -228,7 +228,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         self.of(self.entries.get(index)?)
     }
 
-    /// The function in one of the entries.
+    /// The function in an entry.
     pub(super) fn of<'a>(&'a self, entry: &'a Entry<H>) -> Option<Function<'a, H>> {
         let stored = entry.function.as_ref()?;
         Some(Function {

@@ -1,8 +1,8 @@
 //! The text form of a signature, used by `show_functions`, the command line and the documentation, and its parser.
 //!
-//! `pos_info(position: int[2]) -> (position: int[2])`; `int`, `float` and `bool` alone have the size 1; a function
-//! without results has no arrow. Behind them `progress (left: float)` and `fails (at: int[2])` may follow. A list of at most 8
-//! `int` is `int[..8]`, a record `{id: string[32], x: float}`. Spaces are free between words.
+//! `pos_info(position: int[2]) -> (position: int[2])`; `int`, `float` and `bool` alone have the size 1; a function without
+//! results has no arrow. `progress (left: float)` and `fails (at: int[2])` may follow. A list of at most 8 `int` is `int[..8]`, a
+//! record `{id: string[32], x: float}`. Spaces between words are ignored.
 
 use core::fmt;
 
@@ -21,11 +21,11 @@ use crate::config::{DEPTH, SIGNATURE_BYTES};
 pub struct ParseError {
     /// Bytes before the error.
     pub position: usize,
-    /// What should stand there.
+    /// What was expected there.
     pub expected: Expected,
 }
 
-/// What should stand where a [`ParseError`] points.
+/// What a [`ParseError`] expected at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Expected {
@@ -145,10 +145,10 @@ fn parse_stream(text: &str) -> Result<Definition, ParseError> {
 
 const IS_NESTED: bool = Type::List.is_nested();
 
-/// What a list or record is made of, in the form of a signature.
+/// Inner types of a list or record, as encoded in a signature.
 type Inner = heapless::Vec<u8, { if IS_NESTED { SIGNATURE_BYTES } else { 0 } }>;
 
-/// Puts `bytes` in front of what lies at `at`.
+/// Inserts `bytes` at offset `at`.
 fn insert(inner: &mut Inner, at: usize, bytes: &[u8]) -> Result<(), ()> {
     inner.extend_from_slice(bytes).map_err(|_| ())?;
     if let Some(tail) = inner.get_mut(at..) {
@@ -189,7 +189,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// A type with all that is inside it, which is put behind `inner`.
+    /// A type with its inner types, which are appended to `inner`.
     fn whole_type(&mut self, inner: &mut Inner, depth: usize) -> Result<(Type, u32), ParseError> {
         if !IS_NESTED {
             return self.type_and_size();
@@ -212,7 +212,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// The fields of a record and its closing brace. Returns how many they are.
+    /// The fields of a record and its closing brace. Returns their number.
     fn fields(&mut self, inner: &mut Inner, depth: usize) -> Result<u32, ParseError> {
         if depth >= DEPTH {
             return Err(self.error(Expected::ShallowerType));
@@ -289,7 +289,7 @@ impl<'a> Parser<'a> {
         self.take_while(|byte| byte.is_ascii_whitespace());
     }
 
-    /// The longest run of bytes of ASCII that `belongs` accepts.
+    /// The longest prefix of ASCII bytes that `belongs` accepts.
     fn take_while(&mut self, belongs: impl Fn(u8) -> bool) -> &'a str {
         let rest = self.rest();
         let length = rest.iter().position(|&byte| !belongs(byte)).unwrap_or(rest.len());
@@ -314,7 +314,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// What a rule about signatures asks for at a variable that breaks it.
+/// The syntax error for a variable that breaks a rule about signatures.
 const fn explain(position: usize, error: Error) -> ParseError {
     let expected = match error {
         Error::NameTaken => Expected::NewName,

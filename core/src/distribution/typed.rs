@@ -1,8 +1,8 @@
-//! Rust types as variables, and signatures that are made when compiling: what `#[derive(Variables)]` and `#[interface]`
-//! write down.
+//! Rust types as variables, and signatures made at compile time, for code that `#[derive(Variables)]` and `#[interface]`
+//! generate.
 //!
-//! A view that was made from a signature holds its arguments first, then the results that are no arguments, in the
-//! signature's order. So the place of each variable is known when compiling, and no name is compared when a call is served.
+//! Parameters made from a signature have its arguments first, then the results that are not arguments, in the signature's order.
+//! So the index of each variable is a constant, and serving a call compares no names.
 
 use core::fmt;
 
@@ -22,27 +22,27 @@ mod signatures;
 use signatures::position;
 pub use signatures::{Declared, Encoded, element, element_bytes, fields, fields_bytes, parameters_bytes};
 
-/// The code of [`ServiceError::Failed`] with which a typed service refuses an argument that its Rust type cannot hold, as
-/// 300 for a `u8`, before any code of its own runs.
+/// The code of [`ServiceError::Failed`] for an argument that its Rust type cannot hold, as 300 for a `u8`; the service has not
+/// run.
 pub const BAD_ARGUMENT: u16 = u16::MAX;
 
-/// A Rust type that is one variable: integers, floats and `bool`, arrays of them, strings and bytes of `heapless`, enums
-/// without fields that derive it, and, with the feature `nested`, structs that derive [`Variables`], as records.
+/// A Rust type that is one variable: integers, floats and `bool`, arrays of them, strings and bytes of `heapless`, enums without
+/// fields that derive it, and, with the feature `nested`, structs that derive [`Variables`], as records.
 #[diagnostic::on_unimplemented(
     message = "`{Self}` cannot be a variable",
     label = "no type of a variable",
     note = "variables are integers, `f32`, `f64`, `bool`, arrays of them, `heapless::String<N>`, `heapless::Vec<u8, N>`, enums without fields that `#[derive(Variables)]`, and, with `#[size(N)]`, `String`, `&str`, `Vec<u8>` and `&[u8]`; where the core has the feature `nested`, also structs that `#[derive(Variables)]`, and `Vec`, `heapless::Vec` and `Option` of all of these"
 )]
 pub trait Field: Sized {
-    /// The type of the IDL that holds it.
+    /// The type of the variable.
     const KIND: Type;
-    /// The declared size: so many elements, or at most so many bytes of text or bytes.
+    /// Its declared size: the number of elements, or the longest text or bytes.
     const SIZE: u32;
-    /// What a record or list is made of, as it stands in a signature.
+    /// The inner types of a record or list, as encoded in a signature.
     const INNER: &'static [u8] = &[];
-    /// Reads it; [`Error::WrongType`], [`Error::WrongSize`] or [`Error::OutOfRange`].
+    /// Reads the variable. Errors: [`Error::WrongType`], [`Error::WrongSize`], [`Error::OutOfRange`].
     fn from_field(value: Value<'_>) -> Result<Self, Error>;
-    /// Sets the variable; the same errors, and then it is unchanged.
+    /// Sets the variable. The same errors leave it unchanged.
     fn to_field(&self, slot: Slot<'_>) -> Result<(), Error>;
 }
 
@@ -98,33 +98,33 @@ impl<const N: usize> Field for heapless::Vec<u8, N> {
     }
 }
 
-/// The names of variables, and their units.
+/// Names of variables, each with its unit.
 pub type Units = &'static [(&'static str, &'static str)];
 
-/// A struct whose fields are variables; `#[derive(Variables)]` writes it.
+/// A struct whose fields are variables. Derive it with `#[derive(Variables)]`.
 #[diagnostic::on_unimplemented(
     message = "`{Self}` does not say what its variables are called",
     label = "no struct with `#[derive(Variables)]`",
     note = "a result that is no such struct has its name in `#[returns(name)]` above the function"
 )]
 pub trait Variables: Sized {
-    /// The variables in the order of the fields.
+    /// The variables, in the order of the fields.
     const SPECS: &'static [VariableSpec<'static>];
     /// The units of variables, by name.
     const UNITS: Units = &[];
-    /// A line of help for people: what a stream of these values is.
+    /// One line of help, for a stream of these values.
     const HELP: &'static str = "";
 
-    /// Reads the fields from the variables in these places.
+    /// Reads the fields from the variables at these indexes.
     #[doc(hidden)]
     fn read_places(parameters: &ParametersView, places: &[u8]) -> Result<Self, Error>;
 
-    /// Sets the variables in these places from the fields.
+    /// Sets the variables at these indexes from the fields.
     #[doc(hidden)]
     fn write_places(&self, parameters: &mut ParametersView, places: &[u8]) -> Result<(), Error>;
 
-    /// Reads the fields from the variables of their names; [`Error::UnknownVariable`] where one is missing,
-    /// [`Error::WrongType`], [`Error::WrongSize`] and [`Error::OutOfRange`].
+    /// Reads the fields from the variables with their names. Errors: [`Error::UnknownVariable`] if one is missing,
+    /// [`Error::WrongType`], [`Error::WrongSize`], [`Error::OutOfRange`].
     fn from_parameters(parameters: &ParametersView) -> Result<Self, Error> {
         let mut places = IN_ORDER;
         for (place, spec) in places.iter_mut().zip(Self::SPECS) {
@@ -133,11 +133,11 @@ pub trait Variables: Sized {
         Self::read_places(parameters, &places)
     }
 
-    /// Lends the variables, with room for them and for nothing else.
+    /// Lends parameters with these variables and no further capacity.
     #[doc(hidden)]
     fn with_parameters<R>(&self, look: impl FnOnce(&ParametersView) -> R) -> Result<R, Error>;
 
-    /// Sets the variables of the fields' names, and adds those that are missing. On an error some of them may be set.
+    /// Sets the variables with the fields' names, and adds those that are missing. On an error some of them may be set.
     fn to_parameters(&self, parameters: &mut ParametersView) -> Result<(), Error> {
         let mut places = IN_ORDER;
         for (place, spec) in places.iter_mut().zip(Self::SPECS) {
@@ -171,7 +171,7 @@ impl Variables for () {
     }
 }
 
-/// The stream whose values are those of a struct. [`Error::BadName`], and [`Error::Full`] for too many variables.
+/// Declares a stream of the values of a struct. Errors: [`Error::BadName`], [`Error::Full`] for too many variables.
 pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     let mut stream = Builder::new(name)?;
     V::SPECS.iter().try_for_each(|spec| stream.result(*spec))?;
@@ -179,7 +179,7 @@ pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     if !HELP {
         return Ok(stream);
     }
-    // What there is no room for is the help.
+    // If the signature would become too long, leave out the help.
     let reported = if V::HELP.is_empty() { Ok(stream.clone()) } else { stream.clone().help(V::HELP) };
     let mut units = V::UNITS.iter();
     let reported = reported
@@ -187,10 +187,10 @@ pub fn stream_of<V: Variables>(name: &str) -> Result<Definition, Error> {
     Ok(reported.unwrap_or(stream))
 }
 
-/// Each argument where it stands in the signature.
+/// Each argument at its index in the signature.
 pub const IN_ORDER: [u8; VARIABLES] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
 
-/// Where the results are in a view that was made from a signature.
+/// The indexes of the results in parameters that were made from a signature.
 pub const fn places_of_results(arguments: &[VariableSpec<'_>], results: &[VariableSpec<'_>]) -> [u8; VARIABLES] {
     let mut places = [0; VARIABLES];
     let (mut unset, mut rest, mut next): (&mut [u8], _, _) = (&mut places, results, arguments.len() as u8);
@@ -207,44 +207,44 @@ pub const fn places_of_results(arguments: &[VariableSpec<'_>], results: &[Variab
     places
 }
 
-/// The place that stands at `index`; one where nothing is for an index beyond them.
+/// The index at position `index`; `usize::MAX`, where there is no variable, beyond the end.
 #[inline]
 pub fn place(places: &[u8], index: usize) -> usize {
     places.get(index).map_or(usize::MAX, |place| usize::from(*place))
 }
 
-/// What an argument is, for the service that is to get it.
+/// Reads an argument for a service.
 pub fn argument<T: Field>(parameters: &ParametersView, place: usize) -> Result<T, ServiceError> {
     parameters.value_of(place).and_then(T::from_field).map_err(refused)
 }
 
-/// The same of text and bytes, borrowed.
+/// Reads an argument that is text or bytes, borrowed.
 pub fn borrowed<'p, T: FromValue<'p>>(parameters: &'p ParametersView, place: usize) -> Result<T, ServiceError> {
     parameters.value_of(place).and_then(T::from_value).map_err(refused)
 }
 
-/// What a service answers where an argument does not fit its Rust type.
+/// The error for an argument that does not fit its Rust type.
 pub fn refused(_: Error) -> ServiceError {
     ServiceError::Failed(BAD_ARGUMENT)
 }
 
-/// The elements of a list; [`Error::WrongType`] for another type.
+/// The elements of a list; [`Error::WrongType`] for other types.
 pub fn elements(value: Value<'_>) -> Result<Elements<'_>, Error> {
     if value.kind() == Type::List { Ok(value.elements()) } else { Err(Error::WrongType { index: value.index }) }
 }
 
-/// The element of a list that has one at most; [`Error::OutOfRange`] if it has more.
+/// The element of a list of at most one; [`Error::OutOfRange`] if there are more.
 pub fn optional(value: Value<'_>) -> Result<Option<Value<'_>>, Error> {
     let mut elements = elements(value)?;
     if elements.len() > 1 { Err(Error::OutOfRange) } else { Ok(elements.next()) }
 }
 
-/// The fields of a record, which are taken in their order.
+/// The fields of a record, to be taken in order.
 #[derive(Clone, Debug)]
 pub struct Record<'a>(Fields<'a>);
 
 impl<'a> Record<'a> {
-    /// [`Error::WrongType`] for another type.
+    /// [`Error::WrongType`] for other types.
     pub fn of(value: Value<'a>) -> Result<Self, Error> {
         if value.kind() == Type::Record {
             Ok(Self(value.fields()))
@@ -253,13 +253,13 @@ impl<'a> Record<'a> {
         }
     }
 
-    /// The next field; [`Error::UnknownVariable`] where that has another name.
+    /// The next field; [`Error::UnknownVariable`] if it has another name.
     pub fn take(&mut self, name: &str) -> Result<Value<'a>, Error> {
         self.0.next().filter(|field| field.name == name).map(|field| field.value).ok_or(Error::UnknownVariable)
     }
 }
 
-/// Passes on what needs lists and records; nothing of it where the core does not have them.
+/// Expands to code for lists and records, or to nothing if the core is built without them.
 #[cfg(feature = "nested")]
 #[doc(hidden)]
 #[macro_export]
@@ -267,7 +267,7 @@ macro_rules! __nested {
     ($($item:item)*) => { $($item)* };
 }
 
-/// Passes on what needs lists and records; nothing of it where the core does not have them.
+/// Expands to code for lists and records, or to nothing if the core is built without them.
 #[cfg(not(feature = "nested"))]
 #[doc(hidden)]
 #[macro_export]
@@ -275,7 +275,7 @@ macro_rules! __nested {
     ($($item:item)*) => {};
 }
 
-/// Passes a list on, which cannot be where the core does not have them.
+/// Expands to code for a list, or to an error if the core is built without lists.
 #[cfg(feature = "nested")]
 #[doc(hidden)]
 #[macro_export]
@@ -285,7 +285,7 @@ macro_rules! __list {
     };
 }
 
-/// Passes a list on, which cannot be where the core does not have them.
+/// Expands to code for a list, or to an error if the core is built without lists.
 #[cfg(not(feature = "nested"))]
 #[doc(hidden)]
 #[macro_export]
@@ -297,22 +297,21 @@ macro_rules! __list {
 
 pub use crate::{__list, __nested};
 
-/// Longest way to a variable; of a longer one the innermost names are left out, so that the error can be returned by value.
+/// Longest path to a variable. A longer one loses its innermost names: the error is returned by value, so must be small.
 const PATH_BYTES: usize = 40;
 
-/// The peer's function of a name is another one than that of the interface here: nothing was sent.
+/// The peer's version of a function differs from this unit's interface, so the call was not sent.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub struct Mismatch {
     /// The function.
     pub function: heapless::String<NAME_BYTES>,
-    /// The argument or result in which they differ, as `position`; in lists and records the way to it, as `nodes[].x`, as far as
-    /// there is room.
+    /// The argument or result that differs, as `position`; inside lists and records its path, as `nodes[].x`, cut to fit.
     pub variable: heapless::String<PATH_BYTES>,
-    /// What it is.
+    /// Whether it is an argument or a result.
     pub part: Part,
-    /// Its type and size here; `None` where the interface does not have it.
+    /// Its type and size here; `None` if this unit's interface lacks it.
     pub ours: Option<(Type, u32)>,
-    /// Its type and size at the peer; `None` where the peer does not have it.
+    /// Its type and size at the peer; `None` if the peer's version lacks it.
     pub theirs: Option<(Type, u32)>,
 }
 
@@ -338,9 +337,10 @@ fn show(f: &mut fmt::Formatter<'_>, shape: Option<(Type, u32)>) -> fmt::Result {
 }
 
 impl Mismatch {
-    /// Compares a function of an interface with what the peer has published under its name. What the peer wants must be there,
-    /// with its type and size, and what is wanted of it must be given. Of text and bytes an argument's length is looked at when
-    /// it is sent, and a result must not become longer than is declared here. Progress and values of failures the peer need not have.
+    /// Compares a function of an interface with the peer's version. All arguments that the peer needs must exist here, all
+    /// results of the interface must exist there, with equal types and sizes. The length of text and bytes in an argument is
+    /// checked when it is sent; in a result it must not be declared longer than here. The peer need not have the progress and
+    /// failure values.
     pub fn check(ours: Signature<'_>, theirs: Signature<'_>) -> Result<(), Self> {
         if are_same(ours.as_bytes(), theirs.as_bytes()) || ours.without_help() == theirs.without_help() {
             return Ok(());

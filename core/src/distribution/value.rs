@@ -1,7 +1,7 @@
 //! The types of the IDL (paper, section 2), their values, and the Rust types that convert to and from them.
 //!
-//! Integers travel as `i64` and floats as `f64` bits; narrower Rust types convert with a check. Floats are
-//! formatted by `Display` alone, so that no float formatting enters an image that does not show values.
+//! Integers are encoded as `i64` and floats as `f64` bits; narrower Rust types are converted with a check. Only `Display` formats
+//! floats, so that no float formatting is linked into firmware that shows no values.
 
 use core::fmt;
 
@@ -27,15 +27,15 @@ pub enum Type {
     Bytes = 4,
     /// At most `size` elements of one other type.
     List = 5,
-    /// Named fields, `size` of them, each of a type of its own.
+    /// Named fields, `size` of them, each with its own type.
     Record = 6,
 }
 
 impl Type {
-    /// The types that are not made of others.
+    /// The types without inner types.
     pub const FLAT: [Self; 5] = [Self::Int, Self::Float, Self::String, Self::Bool, Self::Bytes];
 
-    /// The type that travels as `byte`.
+    /// The type with this number on the wire.
     pub(crate) const fn from_wire(byte: u8) -> Option<Self> {
         match byte {
             0 => Some(Self::Int),
@@ -49,7 +49,7 @@ impl Type {
         }
     }
 
-    /// Its name: the word of the text form, where lists and records have none.
+    /// Its name in a signature's text; lists and records are written otherwise there.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Int => "int",
@@ -67,7 +67,7 @@ impl Type {
         matches!(self, Self::Int | Self::Float | Self::Bool)
     }
 
-    /// Whether it is made of other types. Without the feature `nested` none is, and what asks costs nothing.
+    /// Whether it has inner types. Constant without the feature `nested`, so that code for such types is left out.
     #[inline]
     pub const fn is_nested(self) -> bool {
         NESTED && matches!(self, Self::List | Self::Record)
@@ -82,7 +82,7 @@ impl Type {
         }
     }
 
-    /// Bytes that `size` elements take; `None` where that exceeds the address space.
+    /// Bytes that `size` elements take; `None` if that exceeds the address space.
     pub const fn bytes_of(self, size: u32) -> Option<usize> {
         (size as usize).checked_mul(self.width())
     }
@@ -100,7 +100,7 @@ pub struct Value<'a> {
     pub(crate) index: u8,
     pub(crate) kind: Type,
     pub(crate) size: u32,
-    /// What a list or record is made of, as in a signature.
+    /// The inner types of a list or record, as in a signature.
     pub(crate) inner: &'a [u8],
     pub(crate) bytes: &'a [u8],
 }
@@ -116,8 +116,7 @@ impl<'a> Value<'a> {
         self.size
     }
 
-    /// The value as it lies in memory: little-endian words, one byte per truth value, the bytes of text, or a list or
-    /// record as in a block.
+    /// The value as it is in memory: little-endian words, one byte per truth value, text; lists and records as in a block.
     pub const fn raw(&self) -> &'a [u8] {
         self.bytes
     }
@@ -172,7 +171,7 @@ impl fmt::Debug for Value<'_> {
     }
 }
 
-/// The place of one variable's value, borrowed for setting it.
+/// One variable's value, borrowed for setting it.
 pub struct Target<'a> {
     pub(crate) index: u8,
     pub(crate) kind: Type,
@@ -310,7 +309,7 @@ impl IntoValue for &str {
     }
 }
 
-/// Reads a whole value into `elements`, or leaves them as they are.
+/// Reads a whole value into `elements`; on an error they are unchanged.
 pub(crate) fn read_elements<T: Element>(value: Value<'_>, elements: &mut [T]) -> Result<(), Error> {
     let found = elements.len();
     if value.kind == Type::Bytes
@@ -338,7 +337,7 @@ pub(crate) fn read_elements<T: Element>(value: Value<'_>, elements: &mut [T]) ->
     Ok(())
 }
 
-/// `length` as 32 bits.
+/// The length as u32, saturating.
 pub(crate) fn saturate(length: usize) -> u32 {
     u32::try_from(length).unwrap_or(u32::MAX)
 }

@@ -1,8 +1,7 @@
-//! Writing lists and records into a `Parameters`: element by element, behind all that is used there, in the form of a block.
-//! The old value goes when the new one is complete, so that an error leaves it as it was.
+//! Writes lists and records into a `Parameters`: element by element, after all used bytes, in the layout of a block. The old
+//! value is replaced only when the new one is complete, so that an error leaves it unchanged.
 //!
-//! What a list or record is made of stands in the same arena. It is read by its place there, step by step, since a slice of
-//! it would forbid writing.
+//! The inner types are in the same arena, so they are read step by step by offset: a borrowed slice would prevent writing.
 
 use super::nested;
 use super::parameters::ParametersView;
@@ -12,43 +11,43 @@ use crate::ability::{Ability, NESTED, Nested};
 use crate::bytes::copy;
 use crate::error::{Error, Limit};
 
-/// Adds elements to a list, of which the oldest comes first.
+/// Adds elements to a list, in order.
 ///
-/// An element that was refused leaves the list as it was before it.
+/// An element that fails to be added leaves the list as it was.
 pub struct ListWriter<'p> {
     view: &'p mut ParametersView,
     index: u8,
-    /// Where the next element goes.
+    /// Offset of the next element.
     at: usize,
     element: Made,
     count: u32,
     most: u32,
 }
 
-/// Sets the fields of a record, each once and in their order.
+/// Sets the fields of a record, each once and in order.
 pub struct RecordWriter<'p> {
     view: &'p mut ParametersView,
     index: u8,
-    /// Where the next field goes.
+    /// Offset of the next field's value.
     at: usize,
-    /// Where the next field's type stands.
+    /// Offset of the next field's type.
     field_at: usize,
     left: u32,
 }
 
-/// Where one value goes: a variable, an element of a list, or a field of a record.
+/// The target of one value: a variable, an element of a list, or a field of a record.
 pub struct Slot<'a>(To<'a>);
 
 enum To<'a> {
-    /// A variable that is no list or record.
+    /// A variable other than a list or record.
     Variable(Target<'a>),
-    /// The list or record in a place.
+    /// The list or record at an index.
     Nested(<Nested as Ability>::Of<(&'a mut ParametersView, usize)>),
-    /// What a list or record that is being written has next, and where it ends once it is there.
+    /// The next part of a list or record that is being written.
     Part(<Nested as Ability>::Of<Part<'a>>),
 }
 
-/// What a list or record that is being written has next.
+/// The next part of a list or record that is being written; after writing, its end.
 struct Part<'a> {
     view: &'a mut ParametersView,
     index: u8,
@@ -57,7 +56,7 @@ struct Part<'a> {
     end: &'a mut Option<usize>,
 }
 
-/// A type, and where in the arena stands what it is made of.
+/// A type, and the offset of its inner types in the arena.
 #[derive(Clone, Copy)]
 struct Made {
     kind: Type,
@@ -126,7 +125,7 @@ impl Part<'_> {
     }
 }
 
-/// Lets `write` set a part, and returns where it ends.
+/// Lets `write` set a part; returns its end.
 fn part(
     view: &mut ParametersView,
     index: u8,
@@ -144,17 +143,17 @@ fn part(
 impl ListWriter<'_> {
     /// Adds a number, a truth value, an array of them, a `&str` or a `&[u8]`.
     ///
-    /// [`Error::WrongType`], [`Error::WrongSize`], also for one element too many, [`Error::OutOfRange`] and [`Error::Full`].
+    /// Errors: [`Error::WrongType`], [`Error::WrongSize`], also for an element too many, [`Error::OutOfRange`], [`Error::Full`].
     pub fn push(&mut self, value: impl IntoValue) -> Result<(), Error> {
         self.add(|view, index, at, element| leaf(view, index, at, element, value))
     }
 
-    /// Adds a list; the errors of [`push`](Self::push), and those of `write`.
+    /// Adds a list; errors as for [`push`](Self::push), and those of `write`.
     pub fn push_list(&mut self, write: impl FnOnce(&mut ListWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
         self.add(|view, index, at, element| list(view, index, at, element, write))
     }
 
-    /// Adds a record; the errors of [`push`](Self::push), and those of `write`.
+    /// Adds a record; errors as for [`push`](Self::push), and those of `write`.
     pub fn push_record(&mut self, write: impl FnOnce(&mut RecordWriter<'_>) -> Result<(), Error>) -> Result<(), Error> {
         self.add(|view, index, at, element| record(view, index, at, element, write))
     }
@@ -181,13 +180,13 @@ impl ListWriter<'_> {
 impl RecordWriter<'_> {
     /// Sets the next field to a number, a truth value, an array of them, a `&str` or a `&[u8]`.
     ///
-    /// [`Error::UnknownVariable`] if the next field has another name, [`Error::WrongType`], [`Error::WrongSize`],
-    /// [`Error::OutOfRange`] and [`Error::Full`].
+    /// Errors: [`Error::UnknownVariable`] if the next field has another name, [`Error::WrongType`], [`Error::WrongSize`],
+    /// [`Error::OutOfRange`], [`Error::Full`].
     pub fn set(&mut self, name: &str, value: impl IntoValue) -> Result<(), Error> {
         self.field(name, |view, index, at, field| leaf(view, index, at, field, value))
     }
 
-    /// Sets the next field, which is a list; the errors of [`set`](Self::set), and those of `write`.
+    /// Sets the next field, a list; errors as for [`set`](Self::set), and those of `write`.
     pub fn set_list(
         &mut self,
         name: &str,
@@ -196,7 +195,7 @@ impl RecordWriter<'_> {
         self.field(name, |view, index, at, field| list(view, index, at, field, write))
     }
 
-    /// Sets the next field, which is a record; the errors of [`set`](Self::set), and those of `write`.
+    /// Sets the next field, a record; errors as for [`set`](Self::set), and those of `write`.
     pub fn set_record(
         &mut self,
         name: &str,
@@ -205,7 +204,7 @@ impl RecordWriter<'_> {
         self.field(name, |view, index, at, field| record(view, index, at, field, write))
     }
 
-    /// Has `write` set the next field.
+    /// Lets `write` set the next field.
     pub fn set_with(&mut self, name: &str, write: impl FnOnce(Slot<'_>) -> Result<(), Error>) -> Result<(), Error> {
         self.field(name, |view, index, at, field| part(view, index, at, field, write))
     }
@@ -229,7 +228,7 @@ impl RecordWriter<'_> {
 }
 
 impl ParametersView {
-    /// The variable in a place, to be set whatever its type is.
+    /// The variable at an index, to be set, of any type.
     #[doc(hidden)]
     #[inline]
     pub fn slot_of(&mut self, place: usize) -> Result<Slot<'_>, Error> {
@@ -270,7 +269,7 @@ impl ParametersView {
     }
 }
 
-/// Writes a value that is no list or record, and returns where it ends.
+/// Writes a value other than a list or record; returns its end.
 fn leaf(view: &mut ParametersView, index: u8, at: usize, made: Made, value: impl IntoValue) -> Result<usize, Error> {
     let Made { kind, size, .. } = made;
     if kind.is_nested() {
@@ -281,7 +280,7 @@ fn leaf(view: &mut ParametersView, index: u8, at: usize, made: Made, value: impl
     let head = if kind.is_fixed() { 0 } else { LIST_HEAD };
     let start = at.saturating_add(head);
     let most = declared.checked_next_multiple_of(8).ok_or(full)?;
-    // A text may take less than is declared, and so fit where that would not.
+    // A text may be shorter than declared, and fit even if the declared length would not.
     let free = view.room_at(start, most).ok_or(full)?;
     let is_short = free.len() < declared;
     if is_short && kind.is_fixed() {
@@ -300,7 +299,7 @@ fn leaf(view: &mut ParametersView, index: u8, at: usize, made: Made, value: impl
     Ok(end)
 }
 
-/// Writes a list, and returns where it ends.
+/// Writes a list; returns its end.
 fn list(
     view: &mut ParametersView,
     index: u8,
@@ -324,7 +323,7 @@ fn list(
     Ok(end)
 }
 
-/// Writes a record, and returns where it ends.
+/// Writes a record; returns its end.
 fn record(
     view: &mut ParametersView,
     index: u8,

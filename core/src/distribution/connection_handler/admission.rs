@@ -1,5 +1,5 @@
-//! Which links are taken: one per node, of the right fleet, role and manager, as many as the constraint allows; and how a
-//! node that restarted is told from another one with the same identity.
+//! Which links are admitted: one per node, of the right fleet, role and manager, up to the constraint; and how to tell a
+//! restarted node from another one with the same identity. Claims decide between two managers (docs/concepts.md).
 
 use super::claims::claim_of;
 use super::known::{Known, Newcomer, NodeState};
@@ -13,19 +13,19 @@ use crate::host::mailman::LinkId;
 use crate::host::port::Port;
 use crate::time::Instant;
 
-/// What the node says to a hello.
+/// The node's decision about a hello.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Admission {
-    /// The link is taken.
+    /// The link is admitted.
     Accept,
     /// It is refused.
     Refuse(Refusal),
-    /// It waits for a [`Directive`], until it is clear whether another link of its identity is alive.
+    /// The link waits for a [`Directive`], until it is clear whether another link with its identity is alive.
     Wait,
 }
 
 impl<P: Port> Node<P> {
-    /// Decides about a link whose hello has come. `from` is the other end of the stream.
+    /// Decides about a link after its hello. `from` is the other end of the stream.
     pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: P::Endpoint, hello: &Hello) -> Admission {
         if self.is_standby() {
             return self.refuse(now, from, &hello.identity, Refusal::Standby);
@@ -36,7 +36,7 @@ impl<P: Port> Node<P> {
             }
             return self.refuse(now, from, &hello.identity, refusal);
         }
-        // The identity decides before the number of nodes does: a node that restarts takes its own place, also in a full table.
+        // Check the identity before the maximum of nodes: a node that restarts gets its old slot, even in a full table.
         let Hello { epoch, claim, limits, .. } = *hello;
         let is_higher = claim_of(claim.as_ref()) > self.obeyed(&hello.identity);
         let newcomer = Newcomer { link, epoch, claim, is_higher, limits, address: from, decided: false };
@@ -49,7 +49,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// There is no key for this unit and the peer of a link, which is refused. The identity may be anybody's.
+    /// Refuses a link because there is no key for the pair. The identity is not authenticated.
     pub(crate) fn refuse_without_key(&mut self, now: Instant, from: P::Endpoint, identity: &Identity) {
         self.refuse(now, from, identity, Refusal::NoKey);
     }
@@ -74,7 +74,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// As many nodes are connected as may be.
+    /// Whether the maximum of nodes is connected.
     pub(super) fn is_full(&self) -> bool {
         self.table.joined() >= self.config.constraints.maximum_nodes
     }
@@ -97,7 +97,7 @@ impl<P: Port> Node<P> {
         (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
         known.under = None;
         let offered = known.offered.take().filter(|(offered, _)| *offered > claim_of(claim.as_ref()));
-        // A dial that is planned or under way has its aim; a second link of the same node would only be refused.
+        // Cancel a dial that is planned or under way: a second link of the same node would only be refused.
         self.table.cancel(place);
         self.table.set_state(place, NodeState::Joined(link));
         self.table.set_link(link, Some(place));
@@ -106,7 +106,7 @@ impl<P: Port> Node<P> {
         self.counters.count(NodeCounter::Joined);
         self.hints.forget(identity);
         if let Some((_, from)) = offered {
-            // Another manager of the same identity has answered with a higher claim, and was slower.
+            // Another manager of the same identity answered with a higher claim, but its link was slower: ask it.
             self.hints.plan(now, from, identity, now);
         }
         if identity.role() == Role::MUnit {
@@ -117,7 +117,7 @@ impl<P: Port> Node<P> {
         Admission::Accept
     }
 
-    /// Another link has the identity of a node that is connected.
+    /// Decides about a link with the identity of a connected node.
     fn meet(
         &mut self,
         now: Instant,
@@ -125,16 +125,16 @@ impl<P: Port> Node<P> {
         identity: &Identity,
         mut newcomer: Newcomer<P::Endpoint>,
     ) -> Admission {
-        // Both ends compare the same two identities, so they keep the same one of two links without asking each other.
+        // Both ends compare the same two identities, so they agree which of two links to keep without further messages.
         let smaller = self.config.identity < *identity;
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
         let same_life = known.epoch == newcomer.epoch;
         let dialed = known.dialing == Some(newcomer.link);
         if known.newcomer.is_some() || known.task == Some(Task::Admit) {
-            // One waits already: a second one is one too many.
+            // Another link waits already: admit no second one.
             return self.refuse(now, newcomer.address, identity, Refusal::DuplicateIdentity);
         }
-        // Both ends have dialled each other at once: both keep the link that the smaller one opened.
+        // Both ends have dialled each other at the same time: both keep the link that the smaller identity opened.
         let crossing = same_life && dialed != known.dialed;
         if crossing && dialed != smaller {
             return self.refuse(now, newcomer.address, identity, Refusal::AlreadyConnected);
@@ -147,7 +147,7 @@ impl<P: Port> Node<P> {
         Admission::Wait
     }
 
-    /// The link that a newcomer would replace is to show whether it is alive.
+    /// Challenges the link that a newcomer would replace.
     pub(super) fn challenge(&mut self, now: Instant, place: usize) -> Option<Command<P::Endpoint>> {
         let known = self.table.node(place)?;
         let (old, newcomer) = (known.link()?, known.newcomer.as_ref()?);
@@ -157,7 +157,7 @@ impl<P: Port> Node<P> {
         Some(Command::Notify(old, directive))
     }
 
-    /// The challenged link has answered: the newcomer is not taken.
+    /// The challenged link is alive: the newcomer is refused.
     pub(crate) fn challenge_answered(&mut self, now: Instant, old: LinkId) {
         let Some(place) = self.table.of_link(old) else { return };
         let waits = |known: &Known<P::Endpoint>| known.newcomer.as_ref().is_some_and(|newcomer| !newcomer.decided);
@@ -181,8 +181,7 @@ impl<P: Port> Node<P> {
         Some(Command::Notify(newcomer.link, Directive::Refuse(refusal)))
     }
 
-    /// The challenge has not been answered in time: the link makes room. The newcomer takes the place when it has
-    /// [left](Node::left).
+    /// The challenged link was silent: ends it. The newcomer replaces it once it has [left](Node::left).
     pub(super) fn supersede(&mut self, place: usize) -> Option<Command<P::Endpoint>> {
         let known = self.table.node_mut(place)?;
         let (old, epoch) = (known.link()?, known.epoch);
@@ -192,12 +191,12 @@ impl<P: Port> Node<P> {
             (true, false) => CloseReason::Reset,
             (false, _) => CloseReason::PeerRestarted,
         };
-        // From here on an answer of the old link comes too late, and must not refuse a newcomer whose rival is being closed.
+        // The old link is being closed, so a late sign of life must not refuse the newcomer any more.
         newcomer.decided = true;
         Some(Command::Notify(old, Directive::Close(reason)))
     }
 
-    /// A newcomer joins in the place of a link that is gone.
+    /// A newcomer replaces a link that has ended.
     pub(super) fn take_place(&mut self, now: Instant, place: usize, newcomer: Newcomer<P::Endpoint>) {
         if let Some(identity) = self.table.node(place).map(|known| known.identity.clone())
             && self.join(now, &identity, newcomer) == Admission::Accept

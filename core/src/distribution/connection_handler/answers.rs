@@ -1,4 +1,5 @@
-//! Answers to searches, and dials to the nodes that were found.
+//! Answers to searches, and dials to nodes that were found. Random delays and broadcasts keep thousands of units that start
+//! together from answering and dialling all at once (docs/performance.md, "Many vehicles").
 
 use super::claims::claim_of;
 use super::known::NodeState;
@@ -16,26 +17,26 @@ use crate::host::mailman::Mailman;
 use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
-/// A second unit that asks within this time is answered by a broadcast as well: where two ask, more are holding back,
-/// at most for this long.
+/// A second unit that asks within this time is answered by broadcast: others, which hold back for at most this long, probably
+/// wait for the same answer.
 const SAME_QUESTION: Duration = LONGEST_SEARCH.times(2);
-/// Two broadcast answers are at least this far apart.
+/// Minimum interval between broadcast answers.
 const ANSWER_PAUSE: Duration = FIRST_SEARCH.times(2);
 /// An answer waits up to this long, so that one broadcast serves all units that ask meanwhile.
 const ANSWER_GATHER: Duration = Duration::from_millis(20);
-/// Answers to single nodes that may wait for their random delay.
+/// How many answers to single nodes may wait for their random delay.
 const WAITING_ANSWERS: usize = 8;
-/// Of them to one host: further units of that host get the broadcast.
+/// How many of them may be for one host; its other units get the broadcast.
 const ANSWERS_TO_A_HOST: usize = 4;
-/// Dials are spread over at least this many nodes: more hold back than are expected.
+/// Dials are spread over the delays of at least this many nodes, since more may hold back than are expected.
 const LEAST_SPREAD: u16 = 50;
-/// Dials are spread over at most this many nodes, so that the last one dials two seconds later.
+/// Dials are spread over the delays of at most this many nodes: two seconds.
 const MOST_SPREAD: u16 = 2_000;
-/// An m_unit that has dialled a peer in vain this often searches for it.
+/// An m_unit searches for a peer again after this many failed dials.
 const MOVED_AFTER: u8 = 2;
-/// A dial without an answer for this long no longer blocks another address of the same node.
+/// After this time without an answer, a dial no longer blocks a dial to another address of the same node.
 const DIAL_ALONE: Duration = Duration::from_millis(300);
-/// A dial is given up after this time, even if the network below has not given it up.
+/// A dial is given up after this time, even if the transport still tries.
 pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// An answer to a single node.
@@ -48,13 +49,13 @@ struct Answer<E> {
     nonce: u64,
 }
 
-/// Answers that are due.
+/// Answers that wait to be sent.
 #[derive(Clone, Debug)]
 pub(super) struct Answers<E> {
     single: heapless::Vec<Answer<E>, WAITING_ANSWERS>,
     broadcast: Option<Instant>,
     last_broadcast: Option<Instant>,
-    /// The [`short_hash`] of the node that asked last, and when.
+    /// When a node last asked, and its [`short_hash`].
     asked: Option<(Instant, u32)>,
 }
 
@@ -69,7 +70,7 @@ impl<E> Answers<E> {
     }
 }
 
-/// What an answer says of a node that can be dialled.
+/// The data of an answer by a node that can be dialled.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Found {
     epoch: Epoch,
@@ -86,10 +87,10 @@ impl Found {
 }
 
 impl<P: Port> Node<P> {
-    /// A unit looks for this manager: the first is answered alone, and with the second all the others as well.
+    /// A unit searches for this manager. The first to ask gets an answer of its own; a second one soon after causes a broadcast.
     pub(super) fn answer_seeker(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas) {
         if who_has.expected == 0 {
-            // It asks this unit alone, and has waited already.
+            // The question is to this unit alone, and its sender has already waited.
             self.answer_later(now, from, &who_has.identity, who_has.nonce);
             return;
         }
@@ -104,7 +105,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// Who has asked this unit last, and from where, as long as its answer waits.
+    /// The node that asked last and its address, while its answer waits.
     pub fn asked_by(&self) -> Option<(&Identity, P::Endpoint)> {
         self.answers.single.last().map(|answer| (&answer.who, answer.to))
     }
@@ -122,8 +123,7 @@ impl<P: Port> Node<P> {
         self.answer_later(at, to, &who_has.identity, nonce);
     }
 
-    /// Schedules an answer to one node. If the list is full, the broadcast or the next question serves it; one host
-    /// cannot fill the list.
+    /// Schedules an answer to one node. If the list is full, the broadcast or the next question serves it. No host can fill it.
     pub(super) fn answer_later(&mut self, at: Instant, to: P::Endpoint, who: &Identity, nonce: u64) {
         let single = &mut self.answers.single;
         if single.iter().any(|answer| answer.to == to && answer.nonce == nonce) {
@@ -158,7 +158,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// `false` where there is no key to sign the answer with.
+    /// Sends an answer; `false` if there is no key to authenticate it.
     fn send_announce(
         &mut self,
         now: Instant,
@@ -187,12 +187,12 @@ impl<P: Port> Node<P> {
         true
     }
 
-    /// How many nodes this unit still takes.
+    /// How many more nodes this unit can admit.
     fn room(&self) -> u16 {
         self.config.constraints.maximum_nodes.saturating_sub(self.table.joined())
     }
 
-    /// How many nodes may answer or dial at once: those that still fit, of those that there are.
+    /// How many nodes may answer or dial at once: all that there are, up to the capacity left.
     pub(super) fn expected(&self) -> u16 {
         match self.role() {
             Role::MUnit => self.room().min(self.known_nodes),
@@ -200,18 +200,18 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// A random span within the spread for `expected` nodes.
+    /// A random delay for `expected` nodes.
     pub(super) fn spread(&mut self, expected: u16) -> Duration {
         self.random.jitter(ANSWER_SPREAD.times(u64::from(expected.clamp(LEAST_SPREAD, MOST_SPREAD))))
     }
 
-    /// Of two m_units the smaller identity dials; an s_unit always does.
+    /// Whether this unit dials a peer: an s_unit always does; of two m_units, the smaller identity.
     pub(super) fn dials(&self, peer: &Identity) -> bool {
         peer.role() == Role::MUnit && (self.role() == Role::SUnit || self.config.identity < *peer)
     }
 
-    /// A node that this unit dials has answered it: it is dialled at once, unless it is connected. While a dial to another
-    /// address of it is silent, this one is tried beside it.
+    /// A node that this unit dials has answered it. Dials it at once, unless it is connected. If a dial to another address of it
+    /// has brought no answer yet, dials both.
     pub(super) fn found(&mut self, now: Instant, identity: &Identity, from: P::Endpoint, found: Found) {
         let Found { epoch, sequence, tcp_port, claim } = found;
         if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
@@ -225,13 +225,13 @@ impl<P: Port> Node<P> {
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return };
-        // An answer that was held up names an address that the node may have left. Only the newest one counts.
+        // A delayed answer may name an address that the node has left: only the newest counts.
         if !known.is_news(epoch, sequence) {
             self.counters.count(NodeCounter::Outdated);
             return;
         }
         known.newest = Some((epoch, sequence));
-        // Kept also while the node is connected: it is where it is dialled when this link ends.
+        // Kept while the node is connected, too: it is dialled there when this link ends.
         let moved = known.listens.replace(address) != Some(address);
         if known.offered.is_none_or(|(offered, _)| claim > offered) {
             known.offered = Some((claim, from));
@@ -242,14 +242,14 @@ impl<P: Port> Node<P> {
             }
             return;
         }
-        // A node that has restarted is not made to wait for what its earlier boot has failed at.
+        // A restarted node need not wait for back-off that failures of its earlier boot caused.
         if known.epoch != epoch {
             known.not_before = Instant::START;
             known.attempts = 0;
         }
         (known.address, known.epoch) = (address, epoch);
         let at = match known.state {
-            // A dial that is silent is not given up for another address, which may be forged: both are tried.
+            // Do not give up a dial that has brought no answer yet: the other address may be forged, so try both.
             NodeState::Dialing if moved => now.max(known.since + DIAL_ALONE),
             NodeState::Dialing => return,
             _ if known.task.is_some() => known.due.min(now.max(known.not_before)),
@@ -258,7 +258,7 @@ impl<P: Port> Node<P> {
         self.table.schedule(place, at, Task::Dial);
     }
 
-    /// The time to dial a node has come.
+    /// Dials a node whose dial is due.
     pub(super) fn dial(&mut self, now: Instant, place: usize) -> Option<Command<P::Endpoint>> {
         if self.is_full() {
             self.retry(now, place);
@@ -274,7 +274,7 @@ impl<P: Port> Node<P> {
         Some(Command::Dial { to, identity })
     }
 
-    /// A node that was being dialled has not joined.
+    /// A node that was dialled has not joined.
     pub(super) fn dial_ended(&mut self, now: Instant, place: usize) {
         if let Some(known) = self.table.node_mut(place) {
             known.dialing = None;
@@ -295,7 +295,7 @@ impl<P: Port> Node<P> {
         match self.config.target {
             Target::Manager(_) if P::DISCOVERS => {
                 if failed == 0 {
-                    // It has just been heard, so it may have moved: search soon, however long it was away.
+                    // Its answer has just been heard, so it may have moved: search soon, however long it was away.
                     self.search.attempt = 0;
                 }
                 self.plan_next(now);

@@ -1,7 +1,7 @@
-//! What a unit counts about discovery and membership.
+//! A unit's counters of discovery and membership. The doc comments of the variants are shown by `cara counters`.
 
 crate::counters::counters! {
-    /// What a unit counts about discovery and membership.
+    /// A unit's counters of discovery and membership.
     pub enum NodeCounter[<NodeCounter as crate::counters::Counter>::ALL.len()] {
         /// Datagrams of another mode, or of no unit at all.
         DatagramMagic,

@@ -9,12 +9,12 @@ use crate::error::Refusal;
 use crate::host::port::Port;
 use crate::time::Instant;
 
-/// What has been heard of others with this unit's identity.
+/// Other nodes with this unit's identity.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Duplicates<E> {
-    /// To be reported.
+    /// The address that has yet to be reported.
     pending: Option<E>,
-    /// The boot that was reported last, and when: reports of a node that claims many boots are rate-limited.
+    /// The boot that was reported last, and when: reports are rate-limited, in case a node claims many boots.
     reported: Option<(Epoch, Instant)>,
 }
 
@@ -32,14 +32,14 @@ impl<E> Duplicates<E> {
 }
 
 impl<P: Port> Node<P> {
-    /// The address of another live node with this unit's own name and id, reported once for each of its boots. It waits
-    /// until this unit stops, or this one waits for it: give each node its own name or id.
+    /// The address of another live node with this unit's own name and id, reported once for each of its boots. One of the two
+    /// waits until the other stops: give each node its own name or id.
     pub fn take_duplicate(&mut self) -> Option<P::Endpoint> {
         self.duplicates.pending.take()
     }
 
-    /// Ignores this unit's own datagrams, and records another's in its name. A manager answers the `question` of the
-    /// other one, which would not detect it otherwise, and asks it in turn, for its claim.
+    /// Ignores this unit's own datagrams, and records those of another unit in its name. A manager answers the other's
+    /// `question`, so that the other detects the conflict, too, and asks for its claim in turn.
     pub(super) fn is_own(
         &mut self,
         now: Instant,
@@ -52,7 +52,7 @@ impl<P: Port> Node<P> {
             return false;
         }
         if let Some(who_has) = question.filter(|who_has| who_has.standby) {
-            // It commands nothing, and is to know that this manager lives.
+            // A standby does not command, but has to know that this manager is alive.
             if epoch != self.config.epoch && self.role() == Role::MUnit {
                 self.answer_later(now, from, identity, who_has.nonce);
             }
@@ -64,7 +64,7 @@ impl<P: Port> Node<P> {
             self.duplicates.hear(now, from, epoch);
             if let Some(who_has) = question.filter(|_| self.role() == Role::MUnit) {
                 self.answer_later(now, from, identity, who_has.nonce);
-                // With a growing pause, so that two do not ask each other without end.
+                // With growing back-off, so that the two do not ask each other without end.
                 if who_has.tcp_port != 0 {
                     self.hints.plan(now, from, identity, now);
                 }

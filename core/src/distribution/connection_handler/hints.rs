@@ -1,9 +1,8 @@
-//! Hints: addresses at which broadcasts place a node. A recorded broadcast can be replayed, so a hint proves nothing.
+//! Hints: addresses from which broadcasts of wanted nodes came. A recorded broadcast can be replayed, so a hint proves nothing.
 //!
-//! A hint leads to one question with a fresh nonce, to the address that it came from, and to nothing else; only an
-//! address that answers it is dialled. An address that does not answer is asked with growing back-off, however often it
-//! is heard, and is displaced by another one a second after it was asked. The unit's own search continues: a hint
-//! delays it once, by a second at most.
+//! A hint causes one question with a fresh nonce to that address, and only an address that answers is dialled. An address that
+//! does not answer is asked again with growing back-off, however often hints at it arrive, and another hint may displace it one
+//! second after it was asked. Meanwhile the unit's own search continues: hints delay it once, by a second at most.
 
 use super::known::NodeState;
 use super::search::{back_off, fresh, mostly_late};
@@ -17,17 +16,17 @@ use crate::host::mailman::Mailman;
 use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
-/// Addresses that are asked side by side.
+/// How many addresses are asked side by side.
 const HINTS: usize = 4;
-/// An address that was asked keeps its slot for this long: at most four a second are asked, however many hints arrive.
+/// How long an address that was asked keeps its slot. So at most four a second are asked, however many hints arrive.
 const STAY: Duration = Duration::from_secs(1);
-/// Longest time that the unit's own search waits for such a question.
+/// How long the unit's own search waits for a question at most.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
-/// Without an answer, the unit broadcasts after this time and a random part of it, unless its search is due earlier.
+/// If there is no answer, the unit broadcasts after this time plus a random part of it, unless its search is due earlier.
 const UNANSWERED: Duration = Duration::from_millis(500);
-/// A host's question counts once in this time, the longest for which units hold back.
+/// A host's question defers this unit's search only once in this time, the longest for which units hold back.
 const HOST_PAUSE: Duration = LONGEST_SEARCH.times(2);
-/// Hosts that are remembered for that.
+/// For how many hosts that is remembered.
 const HOSTS: usize = 16;
 
 /// One address that a broadcast came from.
@@ -40,13 +39,13 @@ struct Hint<E> {
     due: Option<Instant>,
     /// How often it was asked.
     asked: u8,
-    /// It is not asked again earlier.
+    /// Earliest time of the next question.
     not_before: Instant,
     /// When it was asked last.
     since: Instant,
 }
 
-/// The addresses that are asked, or were a short while ago.
+/// The addresses to ask, or asked a short while ago.
 #[derive(Clone, Debug)]
 pub(super) struct Hints<E> {
     list: heapless::Vec<Hint<E>, HINTS>,
@@ -87,23 +86,23 @@ impl<E: Endpoint> Hints<E> {
         Some((hint.from, hint.who.clone()))
     }
 
-    /// The node is there: later hints at it begin from the start.
+    /// The node has joined: later hints at it start without back-off.
     pub(super) fn forget(&mut self, who: &Identity) {
         self.list.retain(|hint| hint.who != *who);
     }
 }
 
-/// Units of one host have ports of their own. On loopback all are of this host, and told apart by them.
+/// Units of one host have different ports. On loopback all units are on this host, so there the port tells them apart.
 fn is_same_host<E: Endpoint>(one: E, other: E) -> bool {
     one.is_of_host(&other) && (!one.is_loopback() || one.port() == other.port())
 }
 
-/// The hosts whose questions counted recently: a replayed question defers this unit's own once, and not for as long as
-/// the attacker likes.
+/// The hosts whose questions counted recently. A replayed question defers this unit's search once, and not for as long as an
+/// attacker likes.
 #[derive(Clone, Debug)]
 pub(super) struct Hosts {
     seed: u32,
-    /// Marks of hosts, the one that counted first in front.
+    /// Hashes of hosts, in the order in which they counted.
     list: heapless::Deque<(u32, Instant), HOSTS>,
 }
 
@@ -112,7 +111,7 @@ impl Hosts {
         Self { seed, list: heapless::Deque::new() }
     }
 
-    /// Whether a question from this address counts now; after that it does not for a while.
+    /// Whether a question from this address counts; if so, the next ones do not for a while.
     pub(super) fn counts(&mut self, now: Instant, from: impl Endpoint) -> bool {
         while self.list.front().is_some_and(|(_, at)| *at + HOST_PAUSE <= now) {
             self.list.pop_front();
@@ -127,7 +126,7 @@ impl Hosts {
         self.list.push_back((host, now)).is_ok()
     }
 
-    /// A hash of a host. A collision costs one search more.
+    /// A hash of a host's address. A collision costs one more search.
     fn mark(&self, from: impl Endpoint) -> u32 {
         let port = if from.is_loopback() { from.port() } else { 0 };
         mix(mix(self.seed ^ from.host_bits()) ^ u32::from(port))
@@ -135,8 +134,8 @@ impl Hosts {
 }
 
 impl<P: Port> Node<P> {
-    /// A broadcast hints at a node that this unit dials: it is asked after `delay`, unless it is connected.
-    /// A vehicle that is connected to another boot of its manager asks this one, which may have a higher claim.
+    /// A broadcast hints at a node that this unit dials: asks it after `delay`, unless it is connected. A vehicle that is
+    /// connected to another boot of its manager asks as well, since this boot may have a higher claim.
     pub(super) fn hinted(&mut self, now: Instant, from: P::Endpoint, who: &Identity, epoch: Epoch, delay: Duration) {
         let away = self.node(who).is_none_or(|known| match known.state {
             NodeState::Away => known.not_before <= now,
@@ -159,7 +158,7 @@ impl<P: Port> Node<P> {
     ) {
         while let Some((to, who)) = self.hints.take(now) {
             if self.node(&who).is_some_and(|known| known.is_joined()) {
-                // What answered an earlier question proves nothing now.
+                // The answer to an earlier question proves nothing now, so use a fresh nonce.
                 self.search.nonce = fresh(&mut self.random);
             }
             self.ask(to, &who, mailman, authenticator);
@@ -170,7 +169,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// Whether the search waits for the answer to a question to one node that is about to go out and makes a broadcast
+    /// Whether to delay a broadcast search because a question to a single node is about to be sent, whose answer would make it
     /// needless: once, and not for long.
     pub(super) fn waits_for_hints(&mut self, now: Instant) -> bool {
         let due = self.hints.next();

@@ -1,4 +1,4 @@
-//! What is known of one node.
+//! The state of one node.
 
 use super::table::NONE;
 use super::timetable::Task;
@@ -8,37 +8,37 @@ use crate::distribution::identity::{Epoch, Identity};
 use crate::host::mailman::LinkId;
 use crate::time::Instant;
 
-/// What is known of a node. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
+/// The state of one node. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Known<E> {
     /// Its name, id and role.
     pub identity: Identity,
-    /// The other end of its link; while it is away, where it was last heard.
+    /// The other end of its link; while away, the address from which it was last heard.
     pub address: E,
-    /// The boot that is connected; while it is away, the newest that was heard.
+    /// The connected boot; while away, the newest boot that was heard.
     pub epoch: Epoch,
-    /// What it takes, once it has joined.
+    /// What it accepts, once it has joined.
     pub limits: Option<Limits>,
-    /// Where it can be dialled, if that is known.
+    /// The address at which it can be dialled, if known.
     pub(super) listens: Option<E>,
-    /// The newest answer of it.
+    /// Epoch and sequence number of its newest answer.
     pub(super) newest: Option<(Epoch, u32)>,
-    /// It has obeyed this higher claim of another manager of this unit's identity.
+    /// The higher claim of another manager of this unit's identity, if the node obeys one.
     pub(super) under: Option<Claim>,
-    /// The highest claim with which it has answered while it was away, and from where.
+    /// The highest claim with which it has answered while it was away, and the address.
     pub(super) offered: Option<(Claim, E)>,
     pub(super) state: NodeState,
-    /// Its link was opened from here.
+    /// This unit opened its link.
     pub(super) dialed: bool,
-    /// The link that is being opened to it.
+    /// The link to it that is being opened.
     pub(super) dialing: Option<LinkId>,
-    /// A link with its identity that waits for the outcome of the present one's challenge.
+    /// A second link with its identity, which waits until the present one has been challenged.
     pub(super) newcomer: Option<Newcomer<E>>,
-    /// When it joined, or was dialled last.
+    /// When it joined, or was last dialled.
     pub(super) since: Instant,
     /// Dials that have failed in a row.
     pub(super) attempts: u8,
-    /// It has refused for a lasting reason: this boot of it is not dialled earlier.
+    /// Earliest time to dial this boot of it, after a refusal for a lasting reason.
     pub(super) not_before: Instant,
     pub(super) index: u16,
     pub(super) task: Option<Task>,
@@ -48,24 +48,24 @@ pub struct Known<E> {
     pub(super) after: u16,
 }
 
-/// A link that waits until the older one of the same identity has been challenged.
+/// A link that waits until the older one with the same identity has been challenged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Newcomer<E> {
     pub(super) link: LinkId,
     pub(super) epoch: Epoch,
     pub(super) claim: Option<ClaimReport>,
-    /// It has a higher claim than the one that is connected.
+    /// It has a higher claim than the connected one.
     pub(super) is_higher: bool,
     pub(super) limits: Limits,
     pub(super) address: E,
-    /// It takes the place whether the older one answers or not.
+    /// It replaces the older link even if that answers.
     pub(super) decided: bool,
 }
 
 /// Whether a node is connected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NodeState {
-    /// Heard of, or gone.
+    /// Only heard of, or disconnected.
     Away,
     /// A link to it is being opened.
     Dialing,
@@ -79,17 +79,17 @@ impl<E> Known<E> {
         matches!(self.state, NodeState::Joined(_))
     }
 
-    /// Whether the node is connected, or about to be.
+    /// Whether the node is connected, being dialled, or away.
     pub const fn state(&self) -> NodeState {
         self.state
     }
 
-    /// It is under another manager of this unit's identity, with this claim: it refuses this one.
+    /// The claim of the other manager of this unit's identity that the node obeys, so that it refuses this one.
     pub const fn under(&self) -> Option<Claim> {
         self.under
     }
 
-    /// Where it was heard last.
+    /// Its address, as last heard.
     pub const fn address(&self) -> &E {
         &self.address
     }
@@ -102,14 +102,14 @@ impl<E> Known<E> {
         }
     }
 
-    /// Its place among the nodes of its role, in the order of joining; `None` for a node that has never joined. It keeps
-    /// its meaning while other nodes come and go, and while this one is away.
+    /// Its stable index among the nodes of its role, in the order of joining; `None` if it has never joined. It does not change
+    /// while other nodes come and go, or while this one is away.
     pub const fn index(&self) -> Option<u16> {
         if self.index == NONE { None } else { Some(self.index) }
     }
 
-    /// Whether an answer is newer than what is known. An earlier boot cannot answer this unit's question; within a boot
-    /// sequence numbers rise, so an equal or lower one is a replay.
+    /// Whether an answer is newer than the last. An earlier boot cannot have answered this unit's question; within a boot
+    /// sequence numbers increase, so an equal or lower one is a replay.
     pub(super) fn is_news(&self, epoch: Epoch, sequence: u32) -> bool {
         self.newest.is_none_or(|(newest, last)| newest != epoch || sequence > last)
     }

@@ -1,4 +1,4 @@
-//! Links that are being opened, and links that have ended.
+//! Links that are being opened, and links that have ended: when to dial again.
 
 use super::known::NodeState;
 use super::search::{LOST_LISTENING, back_off};
@@ -10,9 +10,9 @@ use crate::host::mailman::LinkId;
 use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
-/// A link that lasted shorter than this counts as a failed try, so that it is not retried without back-off.
+/// A link that lasted shorter counts as a failed attempt, so that it is dialled again with back-off.
 const SETTLED: Duration = Duration::from_secs(1);
-/// Number of failed tries that a refusal counts as if its reason needs an operator.
+/// As many failed attempts a refusal counts for if an operator has to remove its cause.
 const HOPELESS: u8 = 5;
 
 impl<P: Port> Node<P> {
@@ -21,7 +21,7 @@ impl<P: Port> Node<P> {
         let Some(place) = identity.and_then(|identity| self.table.find(identity)) else { return };
         let Some(known) = self.table.node_mut(place) else { return };
         match known.state {
-            // The hello was quicker than the port's note.
+            // The hello has arrived before the port's call.
             NodeState::Joined(joined) if joined == link => known.dialed = true,
             NodeState::Joined(_) | NodeState::Dialing => {
                 known.dialing = Some(link);
@@ -31,10 +31,10 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// The link that [`Command::Dial`](super::Command::Dial) asked for could not be opened at all.
+    /// The link that [`Command::Dial`](super::Command::Dial) asked for could not be opened.
     pub fn dial_failed(&mut self, now: Instant, identity: Option<&Identity>) {
         let place = identity.and_then(|identity| self.table.find(identity));
-        // An earlier dial to another address of it may still come through.
+        // An earlier dial to another address of the node may still succeed.
         let dialing = |place: &usize| {
             self.table.node(*place).is_some_and(|known| known.state == NodeState::Dialing && known.dialing.is_none())
         };
@@ -43,7 +43,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// A link has ended, whatever it was. May free a newcomer that waited for that.
+    /// A link has ended, in whatever state. A newcomer may have waited for that.
     pub fn left(&mut self, now: Instant, link: LinkId, reason: CloseReason) {
         let Some(place) = self.table.of_link(link) else { return };
         self.table.set_link(link, None);
@@ -72,7 +72,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// The link of a node that was connected has ended.
+    /// The link of a connected node has ended.
     fn part(&mut self, now: Instant, place: usize, reason: CloseReason) {
         self.table.set_state(place, NodeState::Away);
         self.table.cancel(place);
@@ -81,7 +81,7 @@ impl<P: Port> Node<P> {
         if settled {
             known.attempts = 0;
         } else {
-            // A peer's hello comes before its refusal.
+            // The peer's hello precedes its refusal, so a link that it refuses may have joined here first.
             self.lose_hope(now, place, reason);
         }
         if let Some(newcomer) = self.table.node_mut(place).and_then(|known| known.newcomer.take()) {
@@ -90,12 +90,12 @@ impl<P: Port> Node<P> {
         let is_followed = reason == CloseReason::PeerRestarted
             && self.table.node(place).is_some_and(|known| known.listens.is_some() && self.dials(&known.identity));
         if is_followed {
-            // Another boot of it has been found, and is where this one is dialled.
+            // Another boot of the node has been found: dial that one.
             self.table.schedule(place, now, Task::Dial);
         }
         match self.config.target {
             _ if is_followed => {}
-            // One that was stopped in an orderly way says so itself when it is back.
+            // A node that was stopped in an orderly way announces itself when it is back.
             Target::Everybody if matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere) => {}
             Target::Everybody | Target::Fixed(..) => self.retry(now, place),
             Target::Manager(_) => {}

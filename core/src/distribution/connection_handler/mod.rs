@@ -1,17 +1,13 @@
-//! The paper's `Connection_handler`: finds nodes, decides which links are accepted, and has the state of each node.
+//! The paper's `Connection_handler`: finds nodes, decides which links are admitted, and keeps the state of each node.
 //!
-//! A [`Node`] is one unit's membership. It knows links by their ids only; frames on them are the sessions' matter. The
-//! port polls it ([`Node::poll`]), gives it the datagrams that arrive ([`Node::datagram`]) and reports the end of each link
-//! ([`Node::left`]); a session asks it about the hello of its peer. What is to be done comes back as [`Command`]s.
+//! A [`Node`] is one unit's membership. It knows links only by their ids; their frames belong to sessions. The port polls it
+//! ([`Node::poll`]), passes it datagrams ([`Node::datagram`]) and reports the end of each link ([`Node::left`]); a session asks
+//! it whether to admit its peer. What the port has to do is returned as [`Command`]s.
 //!
 //! # Discovery (paper, section 2: "it works like the Address Resolution Protocol")
-//! - An s_unit broadcasts a search ([`WhoHas`](super::datagram::WhoHas)) for its manager, with growing back-off, and
-//!   dials the one that answers. A unit that hears another one search for the same manager defers its own search: the
-//!   manager answers both with one broadcast.
-//! - An m_unit broadcasts a search for all. Its own s_units ask it, after a random delay, and dial it when it answers;
-//!   of two m_units the smaller identity dials.
-//! - Only a node that has answered a question of this unit is dialled, in secured mode with the code of the pair.
-//!   Everything else that is heard is a hint of an address.
+//! - An s_unit broadcasts a search ([`WhoHas`](super::datagram::WhoHas)) for its manager, with growing back-off, and dials the manager when it answers. A unit that hears another search for its manager defers its own: the manager answers both with one broadcast.
+//! - An m_unit broadcasts a search for all. Its own s_units ask it, after a random delay, and dial it when it answers; of two m_units the smaller identity dials.
+//! - A unit dials only a node that has answered its own question, in secured mode with the code of the pair. Everything else that it hears is a mere hint at an address.
 
 mod admission;
 mod answers;
@@ -60,12 +56,12 @@ pub enum Target<E> {
     Everybody,
     /// The one manager of an s_unit, wherever it is.
     Manager(Manager),
-    /// The one manager of an s_unit, at a fixed address: no broadcasts.
+    /// The one manager of an s_unit, at a fixed address; without broadcasts.
     Fixed(Manager, E),
 }
 
 impl Manager {
-    /// A manager's name and id; [`Error::BadName`] for what is [no name](Identity::new).
+    /// A manager's name and id; [`Error::BadName`] if the name is [not valid](Identity::new).
     pub fn new(name: &str, id: u32) -> Result<Self, Error> {
         Identity::m_unit(name, id)?;
         Ok(Self { name: heapless::String::try_from(name).map_err(|_| Error::BadName)?, id })
@@ -82,62 +78,62 @@ impl Manager {
     }
 }
 
-/// What a node is told when it is made.
+/// A node's settings.
 #[derive(Clone, Debug)]
 pub struct NodeConfig<E> {
     /// Its identity.
     pub identity: Identity,
     /// Its fleet.
     pub fleet: Fleet,
-    /// Its boot epoch; must differ from boot to boot.
+    /// Its boot epoch, which must differ from boot to boot.
     pub epoch: Epoch,
     /// The nodes that it connects to.
     pub target: Target<E>,
-    /// Where it can be dialled; 0 for nowhere.
+    /// The TCP port at which it can be dialled; 0 for none.
     pub tcp_port: u16,
-    /// Where its session datagrams go; 0 for nowhere.
+    /// The UDP port for its session datagrams; 0 for none.
     pub udp_port: u16,
     /// Its constraints.
     pub constraints: Constraints,
-    /// Seed of its delays and of plain mode's nonces.
+    /// Seed of its random delays and of plain mode's nonces.
     pub seed: u64,
 }
 
-/// What is to be done, to one link at a time.
+/// What the port has to do, to one link at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command<E> {
-    /// Open a link and report it with [`Node::dialing`], or [`Node::dial_failed`].
+    /// Open a link and report it with [`Node::dialing`] or [`Node::dial_failed`].
     Dial {
         /// Where.
         to: E,
-        /// The expected identity; unknown for a fixed address.
+        /// The expected identity; `None` if a fixed address is dialled.
         identity: Option<Identity>,
     },
-    /// Pass this on to a link.
+    /// Pass the directive to the link's session.
     Notify(LinkId, Directive),
 }
 
-/// A directive to a link because of another one. Only the node makes one.
+/// What a link has to do because of another link. Only the node makes these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Directive {
-    /// The peer shows whether it is alive: another link has its identity.
+    /// Check that the peer is alive: another link has the same identity.
     #[non_exhaustive]
     Challenge,
-    /// The same, because a manager with a higher claim wants to command: when nothing moves, or after a while, the link ends.
+    /// The same for a manager with a higher claim: end the link once nothing moves, or after a time limit.
     #[non_exhaustive]
     Yield,
-    /// It has waited, and is accepted.
+    /// Admit the peer, which has waited.
     #[non_exhaustive]
     Admit,
-    /// It has waited, and the link in its way is alive.
+    /// Refuse the peer, which has waited: the older link is alive.
     #[non_exhaustive]
     Refuse(Refusal),
-    /// Another link takes its place.
+    /// End the link: another one takes its place.
     #[non_exhaustive]
     Close(CloseReason),
 }
 
-/// The last time that something was refused, here or there, for the operator.
+/// The last refusal of one kind, by either end, shown to the operator.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding<E> {
     /// When.
@@ -150,16 +146,15 @@ pub struct Finding<E> {
     pub refusal: Refusal,
 }
 
-/// The slices that a node lives in.
+/// The memory of a node.
 pub struct NodeStorage<P: Port> {
-    /// One slot per node that is known, connected or not. More than `maximum_nodes` of them let nodes that left be
-    /// remembered.
+    /// One slot per known node, connected or not. More slots than `maximum_nodes` let it remember nodes that have left.
     pub nodes: Slice<P, Option<Known<P::Endpoint>>>,
-    /// As many.
+    /// As many slots.
     pub order: Slice<P, Order>,
     /// One slot per link.
     pub links: Slice<P, Option<u16>>,
-    /// A few: the last refusals.
+    /// A few slots, for the last refusals.
     pub findings: Slice<P, Option<Finding<P::Endpoint>>>,
 }
 
@@ -167,11 +162,11 @@ pub struct NodeStorage<P: Port> {
 #[doc(alias = "Connection_handler")]
 pub struct Node<P: Port> {
     config: NodeConfig<P::Endpoint>,
-    /// The manager of an s_unit.
+    /// The manager, of an s_unit.
     target: Option<Identity>,
-    /// The m_units that an m_unit connects to, if not all.
+    /// The m_units that an m_unit connects to; all if `None`.
     chosen: Option<Slice<P, Identity>>,
-    /// Nodes that there are to be met at most.
+    /// Upper bound on how many nodes there are to meet.
     known_nodes: u16,
     table: Table<P>,
     findings: Slice<P, Option<Finding<P::Endpoint>>>,
@@ -183,14 +178,14 @@ pub struct Node<P: Port> {
     answers: Answers<P::Endpoint>,
     duplicates: Duplicates<P::Endpoint>,
     claims: Claims,
-    /// Of the last search or answer.
+    /// Sequence number of the last search or answer.
     sequence: u32,
-    /// What happened.
+    /// The unit's counters.
     pub counters: Counters<NodeCounter, { NodeCounter::COUNT }>,
 }
 
 impl<P: Port> Node<P> {
-    /// A node that begins to search at once.
+    /// A node, which begins to search at once.
     pub fn new(now: Instant, config: NodeConfig<P::Endpoint>, storage: NodeStorage<P>) -> Self {
         let mut random = Random::new(config.seed);
         let target = match &config.target {
@@ -234,7 +229,7 @@ impl<P: Port> Node<P> {
         &self.config.identity
     }
 
-    /// This unit's role. Where a port has s_units alone the compiler knows it.
+    /// This unit's role; a constant on ports that have only s_units.
     const fn role(&self) -> Role {
         if P::MANAGES { self.config.identity.role() } else { Role::SUnit }
     }
@@ -244,7 +239,7 @@ impl<P: Port> Node<P> {
         self.config.fleet
     }
 
-    /// This life of the unit.
+    /// This boot of the unit.
     pub const fn epoch(&self) -> Epoch {
         self.config.epoch
     }
@@ -254,12 +249,12 @@ impl<P: Port> Node<P> {
         &self.config.constraints
     }
 
-    /// Changes the constraints. Nodes above a lower maximum stay; the next one is refused.
+    /// Changes the constraints. A lower maximum of nodes disconnects none, but the next is refused.
     pub fn set_constraints(&mut self, constraints: Constraints) {
         self.config.constraints = constraints;
     }
 
-    /// Moves to longer tables, for a higher maximum of nodes; does nothing where one is shorter. Findings stay where they are.
+    /// Moves to longer tables for a higher maximum of nodes. Does nothing if one is shorter. The findings keep their slots.
     pub fn grow(
         &mut self,
         nodes: Slice<P, Option<Known<P::Endpoint>>>,
@@ -269,24 +264,24 @@ impl<P: Port> Node<P> {
         self.table.grow(nodes, order, links);
     }
 
-    /// Changes the most nodes that may be connected at a time.
+    /// Sets how many nodes may be connected at a time.
     #[cfg(test)]
     pub(crate) fn set_maximum_nodes(&mut self, maximum_nodes: u16) {
         self.config.constraints.maximum_nodes = maximum_nodes;
     }
 
-    /// Of all m_units this one connects to these alone, from here on; links that there are stay. A link of two m_units takes
-    /// both: one that is not chosen is not answered, and refused where it dials.
+    /// Restricts the m_units to connect to; existing links stay. Two m_units connect only if each selects the other: one that is
+    /// not chosen gets no answer, and is refused if it dials.
     pub fn choose(&mut self, m_units: Slice<P, Identity>) {
         self.chosen = Some(m_units);
     }
 
-    /// An m_unit has no more than so many nodes to meet, as far as the port knows: they answer it the sooner the fewer they are.
+    /// Tells an m_unit how many nodes there are at most: the fewer they are, the shorter are the delays of their answers.
     pub fn expect(&mut self, nodes: u16) {
         self.known_nodes = nodes;
     }
 
-    /// A nonce for a new link, of which this unit tells the peer in its hello.
+    /// A nonce for a new link, to be sent in its hello.
     pub fn nonce(&mut self) -> u64 {
         self.random.bits()
     }
@@ -313,7 +308,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// Whom a link that is being opened is meant for, if that is known.
+    /// The node that a link is being opened to, if it is known.
     fn peer_of(&self, link: LinkId) -> Option<&Identity> {
         let place = self.table.of_link(link);
         self.target.as_ref().or_else(|| Some(&self.table.node(place?)?.identity))
@@ -326,12 +321,12 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// The last refusals, in no order.
+    /// The last refusals, in no particular order.
     pub fn findings(&self) -> impl Iterator<Item = &Finding<P::Endpoint>> {
         self.findings.iter().flatten()
     }
 
-    /// When [`poll`](Self::poll) has something to do next.
+    /// When [`poll`](Self::poll) has to be called next.
     pub fn next_deadline(&self) -> Instant {
         if self.is_standby() {
             return self.claims.next();
@@ -340,7 +335,7 @@ impl<P: Port> Node<P> {
         if P::DISCOVERS { own.min(self.answers.next()).min(self.hints.next()).min(self.search.next()) } else { own }
     }
 
-    /// Does what is due. Returns one command at a time; call it until it returns `None`.
+    /// Does what is due and returns one command. Call it until it returns `None`.
     pub fn poll(
         &mut self,
         now: Instant,
@@ -381,8 +376,8 @@ impl<P: Port> Node<P> {
         None
     }
 
-    /// Takes a datagram that arrived at any of the unit's sockets and is [for no session](crate::distribution::datagram::for_session)
-    /// of this unit.
+    /// Takes a datagram that arrived at any of the unit's sockets, unless it is [for a
+    /// session](crate::distribution::datagram::for_session).
     pub fn datagram(&mut self, now: Instant, from: P::Endpoint, bytes: &[u8], authenticator: &dyn Authenticator) {
         if !P::DISCOVERS {
             return self.counters.count(NodeCounter::DatagramNotForUs);
@@ -421,7 +416,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// Keeps a refusal for the operator: the newest of each host, unit and reason, the oldest of all gives way.
+    /// Records a refusal for the operator: the newest for each host, unit and reason, in place of the oldest of all.
     fn note(&mut self, finding: Finding<P::Endpoint>) {
         let same = |known: &Finding<P::Endpoint>| {
             known.address.is_of_host(&finding.address)

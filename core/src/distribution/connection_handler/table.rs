@@ -1,7 +1,6 @@
 //! The table of nodes: lent slots, an index by identity, one entry per link, and stable indices.
 //!
-//! Each event costs a binary search at most. Only a new node costs more: inserting into the sorted index moves two
-//! bytes for each entry behind it.
+//! Each event costs one binary search at most. Only a new node moves two bytes for each entry behind it in the sorted index.
 
 use super::known::{Known, NodeState};
 use crate::distribution::identity::{Epoch, Identity, Role};
@@ -9,23 +8,23 @@ use crate::host::endpoint::Endpoint as _;
 use crate::host::mailman::LinkId;
 use crate::host::port::{Port, Slice};
 
-/// No place, position or index.
+/// No slot, position or index.
 pub(super) const NONE: u16 = u16::MAX;
 
 /// Capacity for nodes that were heard of and have never joined: the oldest gives way to the next. However many names an
 /// attacker makes up, they displace at most this many disconnected nodes from a full table.
 pub(super) const UNJOINED: usize = 8;
 
-/// One row of the table's orders; ports allocate a slice of default ones. It belongs to no node in particular.
+/// One row of the table's indexes, as slot numbers; ports allocate a slice of default ones. A row does not belong to one node.
 #[derive(Clone, Copy, Debug)]
 pub struct Order {
-    /// Places, ordered by identity.
+    /// Slots, sorted by identity.
     sorted: u16,
-    /// Places, as a heap by when something is due.
+    /// Slots, as a heap by next deadline.
     pub(super) due: u16,
-    /// Places of the s_units by index.
+    /// Slots of the s_units, by their stable index.
     s_unit: u16,
-    /// Places of the m_units by index.
+    /// Slots of the m_units, by their stable index.
     m_unit: u16,
 }
 
@@ -59,10 +58,10 @@ pub(super) struct Table<P: Port> {
     pub(super) due_len: usize,
     s_units: u16,
     m_units: u16,
-    /// The node that has been away longest, and the one that left last.
+    /// The nodes that left first and last of those that are away: the ends of a linked list.
     oldest: u16,
     youngest: u16,
-    /// Places of nodes that were heard of and have not joined, in that order.
+    /// Slots of nodes that were heard of and have not joined, in the order in which they were heard of.
     unjoined: heapless::Vec<u16, UNJOINED>,
 }
 
@@ -86,7 +85,7 @@ impl<P: Port> Table<P> {
         }
     }
 
-    /// Moves to longer slices; does nothing where one is shorter. Places, indices and orders stay.
+    /// Moves to longer slices; does nothing if one is shorter. Slots, indexes and orders are unchanged.
     pub(super) fn grow(
         &mut self,
         mut nodes: Slice<P, Option<Known<P::Endpoint>>>,
@@ -116,12 +115,12 @@ impl<P: Port> Table<P> {
         self.nodes.get_mut(place)?.as_mut()
     }
 
-    /// How many are connected.
+    /// How many nodes are connected.
     pub(super) const fn joined(&self) -> u16 {
         self.s_units.saturating_add(self.m_units)
     }
 
-    /// How many of one role are connected.
+    /// How many nodes of one role are connected.
     pub(super) const fn joined_as(&self, role: Role) -> u16 {
         match role {
             Role::SUnit => self.s_units,
@@ -129,7 +128,7 @@ impl<P: Port> Table<P> {
         }
     }
 
-    /// The nodes of one role that have joined, by index.
+    /// The nodes of one role that have joined, by their stable index.
     pub(super) fn by_index(&self, role: Role) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.order.iter().take(self.len).filter_map(move |row| self.node(usize::from(row.of(role))))
     }
@@ -138,7 +137,7 @@ impl<P: Port> Table<P> {
         self.node(usize::from(self.order.get(usize::from(index))?.of(role)))
     }
 
-    /// The first node with this id, connected ones before others.
+    /// The first node with this id; connected ones precede others.
     pub(super) fn with_id(&self, id: u32) -> Option<&Known<P::Endpoint>> {
         let sorted = self.order.get(..self.len)?;
         let place = |row: &Order| self.node(usize::from(row.sorted));
@@ -156,7 +155,7 @@ impl<P: Port> Table<P> {
         self.links.get(usize::from(link.0)).copied().flatten().map(usize::from)
     }
 
-    /// Notes whose a link is.
+    /// Records which node a link belongs to.
     pub(super) fn set_link(&mut self, link: LinkId, place: Option<usize>) {
         if let Some(slot) = self.links.get_mut(usize::from(link.0)) {
             *slot = place.and_then(|place| u16::try_from(place).ok());
@@ -176,8 +175,8 @@ impl<P: Port> Table<P> {
         })
     }
 
-    /// The place of a node that was heard of, new if need be; `true` when another one had to be forgotten for it. `None`
-    /// when there is no capacity for another unjoined node.
+    /// The slot of a node that was heard of, a new one if it is unknown; `true` if another node was forgotten for it. `None` if
+    /// there is no capacity for another unjoined node.
     pub(super) fn hear_of(&mut self, identity: &Identity, address: P::Endpoint, epoch: Epoch) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
             return Some((place, false));
@@ -193,14 +192,14 @@ impl<P: Port> Table<P> {
         Some((place, forgotten))
     }
 
-    /// The unjoined node that was heard of first, of those that are not being dialled.
+    /// The first unjoined node that is not being dialled.
     fn idle_unjoined(&self) -> Option<usize> {
         let away = |place: &usize| self.node(*place).is_some_and(|known| known.state == NodeState::Away);
         self.unjoined.iter().copied().map(usize::from).find(away)
     }
 
-    /// The place of an identity, new if need be; `true` when an unjoined node, or else the node that was away longest, had to
-    /// be forgotten for it. `None` when every place is taken by a node that is connected or being dialled.
+    /// The slot of an identity, a new one if it is unknown; `true` if an unjoined node, or else the one that was away longest,
+    /// was forgotten for it. `None` if every slot has a node that is connected or being dialled.
     pub(super) fn place_of(
         &mut self,
         identity: &Identity,
@@ -221,7 +220,7 @@ impl<P: Port> Table<P> {
         Some((self.settle(place, identity, address, epoch)?, forgotten))
     }
 
-    /// Puts a new node into a free place.
+    /// Puts a new node into a free slot.
     fn settle(&mut self, place: usize, identity: &Identity, address: P::Endpoint, epoch: Epoch) -> Option<usize> {
         let at = self.search(identity).err()?;
         let mut carried = u16::try_from(place).ok()?;
@@ -234,7 +233,7 @@ impl<P: Port> Table<P> {
         Some(place)
     }
 
-    /// Empties a place of a node that is away.
+    /// Frees the slot of a node that is away.
     fn forget(&mut self, place: usize) -> Option<()> {
         let at = self.search(&self.node(place)?.identity).ok()?;
         self.cancel(place);
@@ -252,7 +251,7 @@ impl<P: Port> Table<P> {
         Some(())
     }
 
-    /// Changes a node's state, and with it the counts and whether it may be forgotten.
+    /// Changes a node's state, and updates the counts and whether the node may be forgotten.
     pub(super) fn set_state(&mut self, place: usize, state: NodeState) {
         let Some(known) = self.node_mut(place) else { return };
         let role = known.identity.role();
@@ -273,7 +272,7 @@ impl<P: Port> Table<P> {
         }
     }
 
-    /// Gives a node that joins for the first time the lowest index that is free among its role.
+    /// Gives a node that joins for the first time the lowest free index of its role, which it then keeps.
     pub(super) fn keep_index(&mut self, place: usize) {
         self.unjoined.retain(|unjoined| usize::from(*unjoined) != place);
         let Some(known) = self.node(place).filter(|known| known.index == NONE) else { return };
@@ -286,7 +285,7 @@ impl<P: Port> Table<P> {
         }
     }
 
-    /// Puts a node behind all others that are away.
+    /// Appends a node to the list of those that are away.
     fn begin_rest(&mut self, place: usize) {
         let before = self.youngest;
         self.youngest = u16::try_from(place).unwrap_or(NONE);
@@ -299,7 +298,7 @@ impl<P: Port> Table<P> {
         }
     }
 
-    /// Takes a node out of those that are away.
+    /// Removes a node from the list of those that are away.
     fn end_rest(&mut self, place: usize) {
         let Some(known) = self.node_mut(place) else { return };
         let before = core::mem::replace(&mut known.before, NONE);

@@ -1,31 +1,30 @@
-//! When something is due for a node of the table: a binary heap, so that neither setting nor finding the next one looks
-//! at all nodes.
+//! Deadlines of the nodes in a binary heap, so that neither setting nor finding the next one looks at all nodes.
 
 use super::table::{NONE, Table};
 use crate::host::port::Port;
 use crate::time::Instant;
 
-/// What is due for a node. One thing at a time: each excludes the others.
+/// What is due for a node: one task at a time, since they exclude each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Task {
-    /// Open a link to it.
+    /// Dial it.
     Dial,
-    /// Stop waiting for the link that is being opened.
+    /// Give up the dial.
     GiveUp,
-    /// Ask its link for a sign of life: a newcomer has its identity.
+    /// Challenge its link: a newcomer has its identity.
     Challenge,
-    /// Let its link end when nothing moves: a manager with a higher claim wants to command.
+    /// Let its link end once nothing moves: a manager with a higher claim wants to command.
     Yield,
-    /// End the link that has not answered: the newcomer takes its place.
+    /// End the link, which has not answered the challenge: the newcomer replaces it.
     Supersede,
-    /// Tell the newcomer that it has taken the place.
+    /// Notify the newcomer that it is admitted.
     Admit,
-    /// Tell the newcomer that the link in its way is alive.
+    /// Notify the newcomer that the older link is alive.
     Refuse,
 }
 
 impl<P: Port> Table<P> {
-    /// Sets what is due for a node, in place of what was.
+    /// Schedules a node's task, in place of the one before.
     pub(super) fn schedule(&mut self, place: usize, at: Instant, task: Task) {
         let Some(known) = self.node_mut(place) else { return };
         known.task = Some(task);
@@ -42,7 +41,7 @@ impl<P: Port> Table<P> {
         self.sift_up(last);
     }
 
-    /// Nothing is due for a node any more.
+    /// Cancels a node's task.
     pub(super) fn cancel(&mut self, place: usize) {
         let Some(known) = self.node_mut(place) else { return };
         known.task = None;
@@ -60,12 +59,12 @@ impl<P: Port> Table<P> {
         }
     }
 
-    /// When the first thing is due.
+    /// The earliest deadline.
     pub(super) fn next_due(&self) -> Instant {
         if self.due_len == 0 { Instant::FAR_FUTURE } else { self.due_of(0) }
     }
 
-    /// Takes the first thing that is due.
+    /// Removes the first task that is due.
     pub(super) fn pop_due(&mut self, now: Instant) -> Option<(usize, Task)> {
         if self.due_len == 0 || self.due_of(0) > now {
             return None;
@@ -99,7 +98,7 @@ impl<P: Port> Table<P> {
         self.set_heap(other, first);
     }
 
-    /// Moves an entry towards the root as far as it belongs; returns where it ends.
+    /// Moves an entry towards the root as far as needed; returns its new position.
     fn sift_up(&mut self, mut position: usize) -> usize {
         while position > 0 {
             let parent = position.saturating_sub(1) / 2;

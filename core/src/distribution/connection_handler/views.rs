@@ -7,39 +7,39 @@ use crate::host::mailman::LinkId;
 use crate::host::port::Port;
 
 impl<P: Port> Node<P> {
-    /// All known nodes, in the order in which they were first heard of, as long as none had to be forgotten.
+    /// All known nodes, in the order in which they were first heard of, unless some were forgotten.
     pub fn nodes(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.iter()
     }
 
-    /// The s_units that have joined, those that left included, in the order of joining (paper, listing line 8). The
-    /// index of each is its [`Known::index`].
+    /// The s_units that have joined, including those that have left, in the order of joining (paper, listing line 8). The index
+    /// of each is its [`Known::index`].
     pub fn s_units(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.by_index(Role::SUnit)
     }
 
-    /// The m_units that have joined, those that left included, in the order of joining.
+    /// The m_units that have joined, including those that have left, in the order of joining.
     pub fn m_units(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.by_index(Role::MUnit)
     }
 
-    /// The s_unit with this index. It keeps its index while others leave, and while it is away itself.
+    /// The s_unit with this stable index.
     pub fn s_unit(&self, index: u16) -> Option<&Known<P::Endpoint>> {
         self.table.at_index(Role::SUnit, index)
     }
 
-    /// The m_unit with this index.
+    /// The m_unit with this stable index.
     pub fn m_unit(&self, index: u16) -> Option<&Known<P::Endpoint>> {
         self.table.at_index(Role::MUnit, index)
     }
 
-    /// The node of an identity.
+    /// The node with this identity.
     pub fn node(&self, identity: &Identity) -> Option<&Known<P::Endpoint>> {
         self.table.find(identity).and_then(|place| self.table.node(place))
     }
 
-    /// The node with this name among those that have joined, connected or not. [`Error::NotConnected`] where there is none,
-    /// [`Error::Ambiguous`] where there are several: the one that is connected may not be the one that is meant.
+    /// The node with this name among those that have joined, connected or not. [`Error::NotConnected`] if there is none,
+    /// [`Error::Ambiguous`] if there are several: the connected one may not be the one that is meant.
     pub fn find(&self, name: &str) -> Result<&Known<P::Endpoint>, Error> {
         let mut same = self.s_units().chain(self.m_units()).filter(|known| known.identity.name() == name);
         let first = same.next().ok_or(Error::NotConnected)?;
@@ -49,12 +49,12 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// The first node with this id, connected ones before others.
+    /// The first node with this id; connected ones precede others.
     pub fn find_id(&self, id: u32) -> Option<&Known<P::Endpoint>> {
         self.table.with_id(id)
     }
 
-    /// The nodes at the host of an address.
+    /// The nodes on the host of an address.
     pub fn find_address(&self, address: P::Endpoint) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.of_host(address)
     }

@@ -1,4 +1,4 @@
-//! Signatures that are made when compiling, and the rules that they keep.
+//! Signatures that are made at compile time, and the rules that they obey.
 
 use super::Units;
 use crate::ability::{HELP, NESTED};
@@ -11,32 +11,32 @@ use crate::distribution::{help, spec};
 /// All variables of a function.
 #[derive(Clone, Copy, Debug)]
 pub struct Declared<'a> {
-    /// What a caller must pass.
+    /// The arguments.
     pub arguments: &'a [VariableSpec<'a>],
-    /// What it gets back.
+    /// The results.
     pub results: &'a [VariableSpec<'a>],
-    /// What its calls tell while they run.
+    /// The variables of progress reports.
     pub progress: &'a [VariableSpec<'a>],
-    /// The values of its failures.
+    /// The values of failures.
     pub fails: &'a [VariableSpec<'a>],
-    /// What it does, in a line for people.
+    /// One line of help: what the function does.
     pub help: &'a str,
-    /// Units of variables, as the function and the structs in it have them.
+    /// Units of variables, from the function and from its structs.
     pub units: &'a [Units],
 }
 
 impl Declared<'_> {
-    /// Bytes that the signature of a function of this name takes.
+    /// Bytes of the signature of a function with this name.
     pub const fn encoded_bytes(&self, name: &str) -> usize {
         let fixed = name.len().saturating_add(3);
         let bytes = fixed.saturating_add(bytes_of_specs(self.arguments)).saturating_add(bytes_of_specs(self.results));
         let bytes = bytes.saturating_add(bytes_of_section(self.progress)).saturating_add(bytes_of_section(self.fails));
         let with_help = bytes.saturating_add(self.bytes_of_help());
-        // What there is no room for is the help.
+        // If the signature would become too long, leave out the help.
         if with_help > SIGNATURE_BYTES { bytes } else { with_help }
     }
 
-    /// None where the core is built without help.
+    /// 0 if the core is built without help.
     const fn bytes_of_help(&self) -> usize {
         let mut bytes = if self.help.is_empty() { 0 } else { self.help.len().saturating_add(6) };
         let mut units = EachUnit { now: &[], later: self.units };
@@ -47,7 +47,7 @@ impl Declared<'_> {
     }
 }
 
-/// The units of several lists, one behind the other.
+/// The units of several lists, one after the other.
 struct EachUnit<'a> {
     now: Units,
     later: &'a [Units],
@@ -66,7 +66,7 @@ impl EachUnit<'_> {
     }
 }
 
-/// A section without variables is not there.
+/// 0 without variables: then the section is left out.
 const fn bytes_of_section(specs: &[VariableSpec<'_>]) -> usize {
     if specs.is_empty() { 0 } else { bytes_of_specs(specs).saturating_add(2) }
 }
@@ -80,8 +80,8 @@ const fn bytes_of_specs(mut specs: &[VariableSpec<'_>]) -> usize {
     bytes
 }
 
-/// Bytes that a variable takes in a `Parameters` beside its name. A list or record is there twice while it is set, the old
-/// one as short as it can be, and lists are as long as they may become.
+/// Capacity in bytes that a variable takes in a `Parameters` beside its name. A list or record counts twice, since the old value
+/// stays until the new one is complete: once at its shortest, once at its longest.
 const fn bytes_of_value(spec: VariableSpec<'_>) -> usize {
     if !spec.kind.is_nested() {
         return (spec.size as usize).saturating_mul(spec.kind.width());
@@ -90,14 +90,14 @@ const fn bytes_of_value(spec: VariableSpec<'_>) -> usize {
     inner.least.saturating_add(inner.longest).saturating_add(spec.inner.len())
 }
 
-/// What the bytes of a signature say of a type, when compiling.
+/// What is known of an encoded type at compile time.
 struct Insides<'a> {
     /// Bytes of the shortest and of the longest value in a block.
     least: usize,
     longest: usize,
-    /// What is behind them.
+    /// The bytes that follow.
     rest: &'a [u8],
-    /// The rule that is broken, or nothing.
+    /// The rule that it breaks; empty if none.
     wrong: &'static str,
 }
 
@@ -169,7 +169,7 @@ impl<'a> Insides<'a> {
     }
 }
 
-/// The rule that a variable breaks by what it is made of, or nothing.
+/// The rule that the inner types of a variable break; empty if none.
 const fn wrong_inside(spec: VariableSpec<'_>) -> &'static str {
     let inside = Insides::of(spec.kind, spec.size, spec.inner, 0);
     if !inside.wrong.is_empty() {
@@ -181,12 +181,12 @@ const fn wrong_inside(spec: VariableSpec<'_>) -> &'static str {
     }
 }
 
-/// Bytes of what a list of such elements is made of.
+/// Bytes of the inner types of a list with such elements.
 pub const fn element_bytes(element: VariableSpec<'_>) -> usize {
     element.inner.len().saturating_add(5)
 }
 
-/// What a list of such elements is made of, in [`element_bytes`].
+/// The inner types of a list with such elements, in [`element_bytes`] bytes.
 pub const fn element<const BYTES: usize>(element: VariableSpec<'_>) -> [u8; BYTES] {
     let mut bytes = [0; BYTES];
     let rest = put(&mut bytes, &[element.kind as u8]);
@@ -194,12 +194,12 @@ pub const fn element<const BYTES: usize>(element: VariableSpec<'_>) -> [u8; BYTE
     bytes
 }
 
-/// Bytes of what a record with such fields is made of.
+/// Bytes of the inner types of a record with such fields.
 pub const fn fields_bytes(fields: &[VariableSpec<'_>]) -> usize {
     bytes_of_specs(fields)
 }
 
-/// What a record with such fields is made of, in [`fields_bytes`]; two fields of one name are a rule that is broken.
+/// The inner types of a record with such fields, in [`fields_bytes`] bytes. Fails if two fields have the same name.
 pub const fn fields<const BYTES: usize>(fields: &[VariableSpec<'_>]) -> Result<[u8; BYTES], &'static str> {
     let mut rest = fields;
     while let Some((field, others)) = rest.split_first() {
@@ -213,7 +213,7 @@ pub const fn fields<const BYTES: usize>(fields: &[VariableSpec<'_>]) -> Result<[
     Ok(bytes)
 }
 
-/// Bytes of a `Parameters` that holds all arguments and results of a function.
+/// Capacity in bytes of a `Parameters` with all arguments and results of a function.
 pub const fn parameters_bytes(arguments: &[VariableSpec<'_>], results: &[VariableSpec<'_>]) -> usize {
     let (mut bytes, mut rest, mut is_argument) = (0_usize, arguments, true);
     loop {
@@ -231,14 +231,14 @@ pub const fn parameters_bytes(arguments: &[VariableSpec<'_>], results: &[Variabl
     }
 }
 
-/// A signature that is encoded when compiling.
+/// A signature that was encoded at compile time.
 #[derive(Debug)]
 pub struct Encoded<const BYTES: usize> {
     bytes: [u8; BYTES],
 }
 
 impl<const BYTES: usize> Encoded<BYTES> {
-    /// Encodes a signature of [`Declared::encoded_bytes`], or says which rule it breaks.
+    /// Encodes a signature, in [`Declared::encoded_bytes`] bytes, or returns the rule that it breaks.
     pub const fn new(name: &str, declared: Declared<'_>) -> Result<Self, &'static str> {
         if let Err(rule) = check(name, &declared) {
             return Err(rule);
@@ -264,7 +264,7 @@ impl<const BYTES: usize> Encoded<BYTES> {
     }
 }
 
-/// The rules of a [`Definition`](super::function::Definition).
+/// Checks the rules of a [`Definition`](super::function::Definition).
 const fn check(name: &str, declared: &Declared<'_>) -> Result<(), &'static str> {
     let Declared { arguments, results, progress, fails, help, units } = *declared;
     if !is_name(name) {
@@ -341,7 +341,7 @@ const fn check(name: &str, declared: &Declared<'_>) -> Result<(), &'static str> 
     Ok(())
 }
 
-/// The rules of variables that stand side by side.
+/// Checks the rules of one list of variables.
 const fn check_list(
     list: &[VariableSpec<'_>],
     named_wrongly: &'static str,
@@ -415,7 +415,7 @@ const fn are_same(mut one: &[u8], mut other: &[u8]) -> bool {
     one.is_empty() && other.is_empty()
 }
 
-/// Writes `bytes`, and returns what is free behind them.
+/// Writes `bytes`, and returns the rest of `to`.
 const fn put<'a>(mut to: &'a mut [u8], mut bytes: &[u8]) -> &'a mut [u8] {
     while let Some((byte, rest)) = bytes.split_first() {
         match to.split_first_mut() {
