@@ -1,5 +1,4 @@
-//! The frames of one link, sealed in place: each with the next number of its direction, so that none can be left out,
-//! repeated or moved.
+//! The frames of one link, sealed in place, each with the next number of its direction: none can be lost, repeated or reordered.
 
 use cara_core::error::CloseReason;
 use cara_core::host::secure::Seal;
@@ -9,9 +8,9 @@ use crate::suite::ChaCha20Poly1305;
 
 /// Bytes that sealing adds.
 pub const TAG_BYTES: usize = 16;
-/// Frames that are sealed with one key; then both ends derive the next one from it.
+/// Frames that one key seals; then both ends derive the next key from it.
 pub const FRAMES_PER_KEY: u64 = 1 << 20;
-/// Frames of one direction after which a new handshake is due, however young the keys are.
+/// Number of frames in one direction after which a new handshake is due, whatever the age of the keys.
 pub const FRAMES_PER_HANDSHAKE: u64 = 1 << 32;
 
 /// The two directions of a link after its handshake.
@@ -23,7 +22,7 @@ pub struct Channel {
 #[derive(Clone)]
 struct Direction {
     cipher: CipherState<ChaCha20Poly1305>,
-    /// A frame that did not open ends the channel: what comes after it cannot be told from noise.
+    /// A frame could not be opened, which ends the channel: nothing after it can be trusted.
     broken: bool,
 }
 
@@ -33,12 +32,12 @@ impl Channel {
         Self { sending: direction(sending), receiving: direction(receiving) }
     }
 
-    /// What is sent from here on is sealed with the key of the other channel, and the old one is with that.
+    /// Exchanges the sending keys with another channel.
     pub(crate) const fn swap_sending(&mut self, other: &mut Self) {
         core::mem::swap(&mut self.sending, &mut other.sending);
     }
 
-    /// The same for what comes.
+    /// Exchanges the receiving keys with another channel.
     pub(crate) const fn swap_receiving(&mut self, other: &mut Self) {
         core::mem::swap(&mut self.receiving, &mut other.receiving);
     }
@@ -53,7 +52,7 @@ impl Channel {
         self.receiving.cipher = CipherState::new(&[0; 32], number);
     }
 
-    /// The key and the number of the next frame that is sealed.
+    /// The key and number of the next frame to be sealed.
     pub(crate) fn next_seal(&self) -> ([u8; 32], u64) {
         let mut sending = self.sending.clone();
         sending.turn();
@@ -63,7 +62,7 @@ impl Channel {
 }
 
 impl Direction {
-    /// The key of the next frame.
+    /// Rekeys before every 2^20th frame (Noise, section 11.3).
     fn turn(&mut self) {
         let number = self.cipher.get_next_n();
         if number != 0 && number.is_multiple_of(FRAMES_PER_KEY) {

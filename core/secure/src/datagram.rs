@@ -1,8 +1,7 @@
-//! Datagrams beside a link: they are lost, doubled and overtake each other, so each tells its number, and a window
-//! tells those that came before.
+//! Datagrams beside a link. They may be lost, duplicated or reordered, so each has a number, and a window detects replays.
 //!
-//! Their keys are never those of the stream: each end draws its own and tells it in the first sealed frames of the link.
-//! When an end tells a new key, datagrams of the one before are taken for as long as its owner lets them.
+//! Their keys are not the stream's: each end draws its own and sends it in the first sealed frames of the link. When an end sends
+//! a new key, datagrams under the previous one are accepted until the owner ends that.
 
 use noise_protocol::Cipher;
 use noise_protocol::U8Array;
@@ -13,13 +12,13 @@ use crate::channel::TAG_BYTES;
 use crate::keys::KEY_BYTES;
 use crate::suite::ChaCha20Poly1305;
 
-/// Bytes in front of a sealed body: the key's generation, and the datagram's number, little-endian.
+/// Bytes before a sealed body: the key's generation, and the datagram's number, little-endian.
 pub const HEADER_BYTES: usize = 1 + 8;
-/// Bytes that sealing adds in all.
+/// Bytes that sealing adds in total.
 pub const OVERHEAD: usize = HEADER_BYTES + TAG_BYTES;
-/// Datagrams of one direction after which a new key is due, however young it is.
+/// Number of datagrams in one direction after which a new key is due, whatever its age.
 pub const DATAGRAMS_PER_KEY: u64 = 1 << 32;
-/// Numbers behind the newest one that can still be told apart.
+/// How many numbers behind the newest the replay window remembers.
 pub const WINDOW: u64 = 64;
 
 /// A key for datagrams of one direction.
@@ -27,12 +26,12 @@ pub const WINDOW: u64 = 64;
 pub struct DatagramKey([u8; KEY_BYTES]);
 
 impl DatagramKey {
-    /// A key from 32 bytes that were drawn for it.
+    /// A key of 32 random bytes, drawn for it.
     pub const fn new(bytes: [u8; KEY_BYTES]) -> Self {
         Self(bytes)
     }
 
-    /// Its bytes, to be told in a sealed frame.
+    /// Its bytes, to be sent in a sealed frame.
     pub const fn expose(&self) -> &[u8; KEY_BYTES] {
         &self.0
     }
@@ -42,20 +41,20 @@ impl DatagramKey {
     }
 }
 
-/// Why a datagram is not taken.
+/// Why a datagram is dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum DatagramError {
     /// Shorter than any sealed one.
     #[error("the datagram is too short")]
     Short,
-    /// Of a key that is not known, or no longer.
+    /// Sealed with a key that is unknown, or no longer accepted.
     #[error("the datagram is sealed with a key that is not in use")]
     Key,
-    /// It, or one much newer, came before.
+    /// A duplicate, or too far behind the newest to tell.
     #[error("the datagram came before")]
     Repeated,
-    /// Not sealed by the other end, or changed on the way.
+    /// Not sealed by the peer, or changed in transit.
     #[error("the datagram is not from the other end of the link")]
     Forged,
 }
@@ -68,12 +67,12 @@ pub struct Sealer {
 }
 
 impl Sealer {
-    /// Begins with a key that has sealed nothing yet.
+    /// Seals with a key that was not used before.
     pub const fn new(key: DatagramKey, generation: u8) -> Self {
         Self { key, generation, next: 0 }
     }
 
-    /// The key, to be told to the other end.
+    /// The key, to be sent to the peer.
     pub const fn key(&self) -> &DatagramKey {
         &self.key
     }
@@ -97,8 +96,8 @@ impl Sealer {
         self.next
     }
 
-    /// Seals `datagram` in place: [`HEADER_BYTES`] of room, the body, [`TAG_BYTES`] of room. `bound` is what the
-    /// datagram's plain header says; it is not sealed, and cannot be changed. `None` without that room.
+    /// Seals `datagram` in place: [`HEADER_BYTES`] free bytes, the body, [`TAG_BYTES`] free bytes. `bound` is the plain header of
+    /// the datagram, which is authenticated but not encrypted. `None` without these free bytes.
     pub fn seal(&mut self, bound: &[u8], datagram: &mut [u8]) -> Option<()> {
         let length = datagram.len().checked_sub(OVERHEAD)?;
         let number = self.next;
@@ -110,10 +109,10 @@ impl Sealer {
     }
 }
 
-/// Longest plain header that is bound.
+/// Longest plain header.
 const BOUND_BYTES: usize = 48;
 
-/// What is authenticated beside the body, in one piece.
+/// The associated data: what is authenticated beside the body, in one piece.
 struct Bound([u8; BOUND_BYTES + HEADER_BYTES + 1]);
 
 impl Bound {
@@ -146,12 +145,12 @@ struct Keyed {
 }
 
 impl Opener {
-    /// Begins with the key that the other end has told.
+    /// Opens with the key that the peer has sent.
     pub const fn new(key: DatagramKey, generation: u8) -> Self {
         Self { current: Keyed { key, generation, window: Window::NEW }, previous: None }
     }
 
-    /// The other end has told a new key. Datagrams of the old one are taken until [`Self::forget_previous`].
+    /// The peer has sent a new key. Datagrams under the old one are accepted until [`Self::forget_previous`].
     pub fn replace(&mut self, key: DatagramKey, generation: u8) {
         let new = Keyed { key, generation, window: Window::NEW };
         self.previous = Some(core::mem::replace(&mut self.current, new));
@@ -162,7 +161,7 @@ impl Opener {
         self.current.generation
     }
 
-    /// A datagram of the newest key has been opened.
+    /// Whether a datagram under the newest key has been opened.
     pub const fn hears_newest(&self) -> bool {
         self.current.window.end > 0
     }
@@ -171,13 +170,12 @@ impl Opener {
         self.current.window.end >= DATAGRAMS_PER_KEY
     }
 
-    /// Datagrams of the key before are taken no longer.
+    /// No longer accepts datagrams under the previous key.
     pub fn forget_previous(&mut self) {
         self.previous = None;
     }
 
-    /// Opens a datagram in place; its body. A forged one changes nothing, so that forgeries cannot move the replay
-    /// window.
+    /// Opens a datagram in place; returns its body. A forged datagram has no effect: it must not move the replay window.
     pub fn open<'d>(&mut self, bound: &[u8], datagram: &'d mut [u8]) -> Result<&'d mut [u8], DatagramError> {
         let (header, body) = datagram.split_first_chunk_mut::<HEADER_BYTES>().ok_or(DatagramError::Short)?;
         let length = body.len();
@@ -202,18 +200,18 @@ impl Opener {
     }
 }
 
-/// Which numbers have come: the newest one, and a bit for each of those behind it.
+/// The numbers seen: the newest, and one bit for each before it.
 struct Window {
     /// One above the newest.
     end: u64,
-    /// Bit n: `end - 1 - n` has come.
+    /// Bit n: `end - 1 - n` was seen.
     seen: u64,
 }
 
 impl Window {
     const NEW: Self = Self { end: 0, seen: 0 };
 
-    /// The last number is never used: behind it there is no end.
+    /// Whether a number is new. The last number is never valid, since `end` could not be above it.
     fn is_new(&self, number: u64) -> bool {
         if number == u64::MAX {
             return false;
@@ -235,7 +233,7 @@ impl Window {
     }
 }
 
-/// The bit of a number that is `behind` the end, 1 to [`WINDOW`].
+/// The bit of the number that is `behind` numbers below the end, 1 to [`WINDOW`].
 fn bit(behind: u64) -> u64 {
     u32::try_from(behind.saturating_sub(1)).ok().and_then(|at| 1_u64.checked_shl(at)).unwrap_or(0)
 }

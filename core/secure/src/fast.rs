@@ -1,4 +1,4 @@
-//! ChaCha20-Poly1305 of *ring*, whose assembly takes a tenth of the time for short frames and half of it for long ones.
+//! ChaCha20-Poly1305 of *ring*, whose assembly needs a tenth of the time for short frames and half of it for long ones.
 
 use noise_protocol::{Cipher, U8Array};
 use noise_rust_crypto::sensitive::Sensitive;
@@ -6,7 +6,7 @@ use ring::aead::{Aad, CHACHA20_POLY1305, LessSafeKey, NONCE_LEN, Nonce, UnboundK
 
 const TAG_BYTES: usize = 16;
 
-/// The cipher, as `noise-protocol` asks for it.
+/// The cipher, behind `noise-protocol`'s trait.
 pub(crate) enum ChaCha20Poly1305 {}
 
 impl Cipher for ChaCha20Poly1305 {
@@ -25,14 +25,14 @@ impl Cipher for ChaCha20Poly1305 {
 
     fn encrypt_in_place(key: &Self::Key, nonce: u64, bound: &[u8], buffer: &mut [u8], length: usize) -> usize {
         if seal(key, nonce, bound, buffer, length).is_none() {
-            // Beyond 256 GiB, or without room for the tag. Nothing may go out in clear.
+            // Beyond 256 GiB, or without capacity for the tag. Never send plain text.
             buffer.fill(0);
         }
         length.saturating_add(TAG_BYTES)
     }
 
     fn decrypt(key: &Self::Key, nonce: u64, bound: &[u8], sealed: &[u8], out: &mut [u8]) -> Result<(), ()> {
-        // One buffer holds body and tag; the handshake's messages are the only ones that are opened like this.
+        // Body and tag in one buffer. Only handshake messages, which are short, are opened like this.
         let mut both = [0; 64 + TAG_BYTES];
         let both = both.get_mut(..sealed.len()).ok_or(())?;
         both.copy_from_slice(sealed);
@@ -66,7 +66,7 @@ fn cipher(key: &Sensitive<[u8; 32]>) -> Option<LessSafeKey> {
     UnboundKey::new(&CHACHA20_POLY1305, key.as_slice()).ok().map(LessSafeKey::new)
 }
 
-/// Noise's nonce of this cipher: 32 zero bits, then the number, little-endian.
+/// The cipher's nonce in Noise: 32 zero bits, then the number, little-endian.
 fn number(nonce: u64) -> Nonce {
     let mut bytes = [0; NONCE_LEN];
     let number = nonce.to_le_bytes();

@@ -1,10 +1,10 @@
-//! Two messages that prove that both ends have the pair's key, and agree on keys with forward secrecy: a pair key that
-//! leaks later does not reveal them.
+//! Two messages that prove that both ends have the pair's key, and agree on keys with forward secrecy: a pair key that leaks
+//! later does not reveal them.
 //!
-//! The **prologue** is what both ends must have seen alike: a hash over it goes into every key, so that a bit that was
-//! changed on the way fails the handshake. The initiator is the end that was dialled, since it has both hellos first. A
-//! rekey is begun by the dialler. An end decides and runs nothing before a sealed frame of the other end has opened. The
-//! first message proves its sender as well where the prologue has fresh bytes of the responder.
+//! The **prologue** is what both ends must have seen alike: its hash enters every key, so that a bit changed in transit fails the
+//! handshake. The initiator is the end that was dialled, since it has both hellos first; a rekey is initiated by the dialling
+//! end. An end decides and runs nothing before it has opened a sealed frame of the peer. If the prologue has fresh bytes of the
+//! responder, the first message proves its sender, too.
 
 use blake2::{Blake2s256, Digest};
 use noise_protocol::patterns::noise_nn_psk0;
@@ -15,17 +15,17 @@ use crate::channel::Channel;
 use crate::keys::PairKey;
 use crate::suite::{Blake2s, ChaCha20Poly1305, X25519};
 
-/// Bytes of each of the two messages: a public key and a tag.
+/// Length of each of the two messages: a public key and a tag.
 pub const MESSAGE_BYTES: usize = 48;
 
-/// A handshake that cannot go on: the other end has another key or another prologue, or the message was changed. One
-/// error for all, so that an attacker that tries keys learns nothing else.
+/// The handshake failed: the peer has another key or another prologue, or a message was changed. One error for all cases, so that
+/// an attacker who tries keys learns nothing else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the handshake failed: the other end has another key for this pair, or a message was changed")]
 pub struct HandshakeError;
 
-/// The end that begins, until the other one has answered. It keeps what its message was made of, and makes
-/// it again when the answer comes: the state of a handshake is three times as large.
+/// The initiator, until the responder has answered. It stores what its first message was made of and makes the message again
+/// then: the state of a handshake is three times as large.
 pub struct Initiator {
     key: PairKey,
     prologue: [u8; 32],
@@ -36,13 +36,13 @@ type State = HandshakeState<X25519, ChaCha20Poly1305, Blake2s>;
 
 /// What both ends have agreed on.
 pub struct Agreed {
-    /// The frames of the link.
+    /// Seals the frames of the link.
     pub channel: Channel,
-    /// A number that is this link's alone: it depends on all that both ends have sent, and on the pair's key.
+    /// The handshake hash: unique to this link, since it depends on everything both ends have sent, and on the pair's key.
     pub binding: [u8; 32],
 }
 
-/// What both ends have seen, in the order of its coming: the dialler's, then that of the end that was dialled.
+/// The prologue of a link: the dialling end's hello, then the dialled end's.
 pub fn prologue(dialler: &[u8], dialed: &[u8]) -> [u8; 32] {
     let mut transcript = Transcript::new();
     transcript.add(dialler);
@@ -50,27 +50,27 @@ pub fn prologue(dialler: &[u8], dialed: &[u8]) -> [u8; 32] {
     transcript.prologue()
 }
 
-/// The prologue of a handshake that rekeys a link: it covers the one before, and by that all that this one covered.
+/// The prologue of a rekey: the hash of the previous handshake, and so everything that covered.
 pub fn renewal(binding: &[u8; 32]) -> [u8; 32] {
     Blake2s256::new_with_prefix(b"CARA renewal 1").chain_update(binding).finalize().into()
 }
 
-/// The prologue while it is being seen.
+/// The prologue while it is being hashed.
 pub struct Transcript(Blake2s256);
 
 impl Transcript {
-    /// Nothing seen yet.
+    /// An empty transcript.
     pub fn new() -> Self {
         Self(Blake2s256::new_with_prefix(b"CARA prologue 1"))
     }
 
-    /// The next part: the dialler's, then that of the end that was dialled.
+    /// Adds a part: first the dialling end's, then the dialled end's.
     pub fn add(&mut self, part: &[u8]) {
         self.0.update((part.len() as u64).to_le_bytes());
         self.0.update(part);
     }
 
-    /// The prologue of what was seen.
+    /// The prologue of the parts added.
     pub fn prologue(self) -> [u8; 32] {
         self.0.finalize().into()
     }
@@ -103,7 +103,7 @@ fn read(state: &mut State, message: &[u8]) -> Result<(), HandshakeError> {
 }
 
 impl Initiator {
-    /// Begins. `ephemeral` is 32 bytes that were drawn for this handshake and are used for nothing else.
+    /// Begins. `ephemeral` is 32 random bytes that are used for nothing else.
     pub fn begin(
         key: &PairKey,
         prologue: &[u8; 32],
@@ -115,14 +115,14 @@ impl Initiator {
         Ok((started, message))
     }
 
-    /// As it is when the message has been made.
+    /// The state after the first message.
     fn state(&self) -> Result<(State, [u8; MESSAGE_BYTES]), HandshakeError> {
         let mut state = state(true, &self.key, &self.prologue, &self.ephemeral);
         let message = write(&mut state)?;
         Ok((state, message))
     }
 
-    /// Takes the responder's answer, which proves its identity.
+    /// Processes the responder's answer, which proves its identity.
     pub fn finish(self, message: &[u8]) -> Result<Agreed, HandshakeError> {
         let (mut state, _) = self.state()?;
         read(&mut state, message)?;
@@ -131,8 +131,7 @@ impl Initiator {
     }
 }
 
-/// The other end answers an initiator's message. The channel must open a frame before anything that
-/// came is believed.
+/// The responder answers the initiator's message. It must open a frame of the channel before it believes anything.
 pub fn answer(
     key: &PairKey,
     prologue: &[u8; 32],

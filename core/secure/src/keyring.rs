@@ -1,4 +1,4 @@
-//! Where a unit's keys are found, and the codes of discovery that are made with them.
+//! Where a unit finds its keys, and the authentication of discovery with them.
 
 use cara_core::config::Mode;
 use cara_core::distribution::authenticator::{Authenticator, CODE_BYTES};
@@ -8,27 +8,27 @@ use crate::keys::{DiscoveryKey, PairKey};
 use crate::link::Credentials;
 use crate::mac::Authenticates;
 
-/// The keys of one unit, wherever they are kept. While the keys of a fleet are changed a unit has two of each: what it
-/// says is said with the first, and what it hears may be of either.
+/// The keys of one unit, wherever they are stored. While a fleet changes its keys, a unit has two of each: it sends with the
+/// first and accepts either.
 pub trait Keyring {
-    /// The fleet's keys for discovery.
+    /// The fleet's discovery keys.
     fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>);
 
-    /// The keys of this unit and `peer`. `None` where there are none.
+    /// The keys of this unit and `peer`. `None` if there are none.
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)>;
 
-    /// What proves this unit to `peer` on one link. `fresh` is 32 bytes drawn for this link alone.
+    /// What authenticates this unit to `peer` on one link. `fresh` is 32 random bytes for this link only.
     fn credentials(&self, peer: &Identity, fresh: [u8; 32]) -> Option<Credentials> {
         self.pair(peer).map(|(key, other)| Credentials::new(key, fresh).or(other))
     }
 }
 
-/// The codes of a unit's discovery: none in plain mode.
+/// Authenticates a unit's discovery; not in plain mode.
 #[derive(Clone, Debug)]
 pub enum Codes<K> {
-    /// Nothing is signed, and nothing asked for.
+    /// Nothing is authenticated.
     Plain,
-    /// Made with these keys.
+    /// Codes are made and checked with these keys.
     Keyed(K),
 }
 

@@ -1,8 +1,8 @@
-//! The keys of a fleet.
+//! The keys of a fleet (docs/keys.md).
 //!
-//! A **root** stays where units are provisioned. From it are derived a **pair key** for each two units that may talk,
-//! and a **discovery key** for the whole fleet. A pair key lets its holder speak as either unit of the pair, to the
-//! other one only. A unit is revoked by leaving its pairs out when the generation is raised.
+//! A **root** stays on the provisioning host. From it are derived a **pair key** for each two units that may communicate, and a
+//! **discovery key** for the fleet. A pair key lets its holder act as either unit of the pair, towards the other only. To revoke
+//! a unit, leave its pairs out when raising the generation.
 
 use core::fmt;
 
@@ -33,13 +33,13 @@ macro_rules! key {
                 &self.0
             }
 
-            /// What may be shown of it: the same for the same key, and nothing of the key can be computed from it.
+            /// Identifies the key in public: equal for equal keys, and nothing of the key can be computed from it.
             pub fn fingerprint(&self) -> [u8; FINGERPRINT_BYTES] {
                 fingerprint(&self.0)
             }
         }
 
-        /// Tells that there is a key, and nothing of it.
+        /// Reveals nothing of the key.
         impl fmt::Debug for $name {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str(concat!(stringify!($name), "(…)"))
@@ -61,13 +61,13 @@ key! {
     DiscoveryKey
 }
 key! {
-    /// The seed of a board's random numbers. It is drawn whenever a board is provisioned and is not derived from the
-    /// root: a leaked root does not reveal what the board drew.
+    /// The seed of a board's random numbers. Drawn whenever a board is provisioned, and not derived from the root: a leaked root
+    /// does not reveal what the board has drawn.
     DeviceSecret
 }
 
 impl RootKey {
-    /// The key of two units, whichever is named first.
+    /// The key of two units, in either order.
     pub fn pair(&self, fleet: Fleet, generation: u32, one: &Identity, other: &Identity) -> PairKey {
         let (first, second) = if one <= other { (one, other) } else { (other, one) };
         let mut mac = self.begin(b"pair", fleet, generation);
@@ -75,7 +75,7 @@ impl RootKey {
         PairKey(mac.finalize().into_bytes().into())
     }
 
-    /// The fleet's key for discovery.
+    /// The fleet's discovery key.
     pub fn discovery(&self, fleet: Fleet, generation: u32) -> DiscoveryKey {
         DiscoveryKey(self.begin(b"disc", fleet, generation).finalize().into_bytes().into())
     }
@@ -89,7 +89,7 @@ impl RootKey {
     }
 }
 
-/// Every identity has one form, and no two share one.
+/// Hashes an identity, unambiguously.
 fn name(mac: &mut Blake2sMac256, identity: &Identity) {
     let role = match identity.role() {
         Role::MUnit => 0,

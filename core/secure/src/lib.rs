@@ -1,12 +1,12 @@
 //! The cipher of CARA: one suite, `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`, with a key for each pair of units.
 //!
-//! - [`keys`]: the keys of a fleet, derived from one root that stays where they are made;
-//! - [`handshake`]: two messages that prove the pair's key and agree on keys for this link alone;
+//! - [`keys`]: the keys of a fleet, derived from one root that stays on the host where they are made;
+//! - [`handshake`]: two messages that prove the pair's key and agree on keys for one link;
 //! - [`channel`]: the frames of a link, sealed in place;
-//! - [`datagram`]: the datagrams beside it, with keys of their own and a replay window;
-//! - [`link`]: the cipher of one link, made of the three above;
+//! - [`datagram`]: the link's datagrams, with their own keys and a replay window;
+//! - [`link`]: the cipher of one link, composed of these three;
 //! - [`keyring`]: where a unit finds its keys, and the authentication codes that it makes with them;
-//! - [`mac`]: codes for discovery, which is authenticated and not secret;
+//! - [`mac`]: codes for discovery, which is authenticated but not encrypted;
 //! - [`random`]: random numbers for boards, whose sources of noise may be poor.
 //!
 //! # What is implemented
@@ -20,12 +20,12 @@
 //!
 //! `docs/wire.md`, section 17, has the bytes.
 //!
-//! With the feature `ring`, frames and datagrams are sealed by *ring*, which is several times as fast on a Linux host;
-//! without it, by portable code, which boards use. Both seal alike.
+//! With the feature `ring`, frames and datagrams are sealed by *ring*, several times as fast on a Linux host; without it, by
+//! portable code, as on boards. Both produce the same bytes.
 //!
 //! Another suite would be another bit of the hello; nothing is negotiated within a handshake. This crate has no source of
-//! randomness, reads no file and allocates nothing: the caller supplies 32 fresh bytes for each handshake. It does not
-//! decide which peer may do what; that is the task of access tables.
+//! randomness, reads no file and allocates nothing: the caller supplies 32 fresh bytes for each handshake. Which peer may do what
+//! is decided by access tables, not here.
 
 #![no_std]
 

@@ -1,5 +1,4 @@
-//! The cipher of one link, from its first hello to its end: [`Noise`], and [`Cipher`] for units that choose their mode
-//! when they start.
+//! The cipher of one link, from its hellos to its end: [`Noise`], and [`Cipher`] for units that choose their mode at their start.
 
 use blake2::digest::Mac;
 use cara_core::config::Mode;
@@ -12,7 +11,7 @@ use crate::datagram::{self, DatagramError, DatagramKey, Opener, Sealer};
 use crate::handshake::{self, Agreed, Initiator, Transcript};
 use crate::keys::{KEY_BYTES, PairKey, keyed};
 
-/// What a link is proven with: the pair's key, and 32 bytes that were drawn for this proof and are used for nothing else.
+/// What a handshake needs: the pair's key, and 32 random bytes that are used for nothing else.
 #[derive(Zeroize, ZeroizeOnDrop)]
 pub struct Credentials {
     key: PairKey,
@@ -21,13 +20,12 @@ pub struct Credentials {
 }
 
 impl Credentials {
-    /// To prove `key`.
+    /// Credentials with this key.
     pub const fn new(key: PairKey, fresh: [u8; KEY_BYTES]) -> Self {
         Self { key, other: None, fresh: Fresh(fresh) }
     }
 
-    /// Also takes a peer that begins with `other`, the key of the generation before or behind: so keys are changed in a
-    /// fleet that runs.
+    /// Also accepts a peer with `other`, the key of the previous or next generation, so that a running fleet can change keys.
     #[must_use]
     pub fn or(mut self, other: Option<PairKey>) -> Self {
         self.other = other;
@@ -35,7 +33,7 @@ impl Credentials {
     }
 }
 
-/// What was drawn for one proof.
+/// The random bytes of one handshake.
 #[derive(Clone, Zeroize, ZeroizeOnDrop)]
 struct Fresh([u8; KEY_BYTES]);
 
@@ -47,13 +45,13 @@ impl Fresh {
         mac.finalize().into_bytes().into()
     }
 
-    /// The handshake's own secret. The keys that come of it do not depend on the prologue by themselves; made like this
-    /// they do, so two links have two keys even if both ends draw what they drew before.
+    /// The ephemeral secret of the handshake. Derived from the prologue, too: so two links have different keys even if both ends
+    /// draw the same bytes twice.
     fn ephemeral(&self, prologue: &[u8; 32]) -> [u8; KEY_BYTES] {
         self.secret(b"ephe", prologue)
     }
 
-    /// The key of this end's datagrams, another one than that of the other end whatever is drawn.
+    /// The key of this end's datagrams; differs from the other end's even if both draw the same bytes.
     fn datagrams(&self, began: bool, binding: &[u8; 32]) -> DatagramKey {
         DatagramKey::new(self.secret(if began { b"dgrI" } else { b"dgrR" }, binding))
     }
@@ -62,7 +60,7 @@ impl Fresh {
 /// The cipher of a secured link.
 pub struct Noise(State);
 
-// One of them lives in each link; boxing the larger ones would need an allocator.
+// Each link has one; boxing the large variants would need an allocator.
 #[allow(clippy::large_enum_variant)]
 enum State {
     Introducing(Transcript),
@@ -71,18 +69,18 @@ enum State {
     Ended,
 }
 
-/// A proof that has begun.
+/// A handshake in progress.
 #[allow(clippy::large_enum_variant)]
 enum Proving {
     Initiating(Initiator, Fresh),
     Responding([u8; 32], Credentials),
 }
 
-/// A message, where there is one to send.
+/// A message to send, if there is one.
 type Message = Option<[u8; PROOF_BYTES]>;
 
 impl Proving {
-    /// What was begun, and the message of the end that begins.
+    /// Begins; the initiator has a message to send.
     fn begin(begins: bool, prologue: [u8; 32], credentials: Credentials) -> Result<(Self, Message), CloseReason> {
         if !begins {
             return Ok((Self::Responding(prologue, credentials), None));
@@ -92,7 +90,7 @@ impl Proving {
         Ok((Self::Initiating(initiator, credentials.fresh.clone()), Some(message)))
     }
 
-    /// What both ends have agreed on, the key of this end's datagrams, and the answer of the end that did not begin.
+    /// Finishes: what both ends have agreed on, the key of this end's datagrams, and the responder's answer.
     fn finish(self, message: &[u8]) -> Result<(Agreed, DatagramKey, Message), CloseReason> {
         match self {
             Self::Initiating(initiator, fresh) => {
@@ -112,10 +110,10 @@ impl Proving {
 /// A link whose ends have agreed on keys.
 struct Sealing {
     channel: Channel,
-    /// Of the last handshake; the next one covers it.
+    /// The hash of the last handshake, which the next one covers.
     binding: [u8; 32],
     sealer: Sealer,
-    /// Once the peer has told its key.
+    /// `None` until the peer has sent its key.
     opener: Option<Opener>,
     renewing: Renewing,
 }
@@ -128,15 +126,15 @@ enum Renewing {
     Turning(Turning),
 }
 
-/// New keys, while the two directions go over to them.
+/// New keys, while the two directions change over to them.
 struct Turning {
-    /// The new keys, and those of a direction that has turned.
+    /// The new keys, or the old ones of a direction that has changed over.
     channel: Channel,
     /// The new key of this end's datagrams.
     own: DatagramKey,
     sent: bool,
     received: bool,
-    /// The peer has told the new key of its datagrams.
+    /// The peer has sent the new key of its datagrams.
     confirmed: bool,
 }
 
@@ -151,7 +149,7 @@ impl Sealing {
         }
     }
 
-    /// Begins a rekey.
+    /// Begins a handshake that rekeys the link.
     fn prove(&mut self, begins: bool, credentials: Credentials) -> Result<Message, CloseReason> {
         if !matches!(self.renewing, Renewing::No) {
             return Err(CloseReason::Protocol);
@@ -171,7 +169,7 @@ impl Sealing {
         Ok(answer)
     }
 
-    /// The generation and the key of this end's datagrams that the peer is told.
+    /// The generation and key of this end's datagrams, to be sent to the peer.
     const fn reported(&self) -> (u8, &DatagramKey) {
         match &self.renewing {
             Renewing::Turning(turning) => (self.next_generation(), &turning.own),
@@ -219,7 +217,7 @@ impl Sealing {
         }
     }
 
-    /// The renewal is over: the old keys are gone, but for what may still come of the peer's datagrams.
+    /// The renewal is complete. The old keys are dropped, except for late datagrams of the peer.
     fn acknowledged(&mut self) -> Result<(), CloseReason> {
         match &self.renewing {
             Renewing::Turning(turning) if turning.sent && turning.confirmed => {
@@ -237,7 +235,7 @@ impl Sealing {
 }
 
 impl Noise {
-    /// The cipher of a link that begins.
+    /// The cipher of a new link.
     pub fn new() -> Self {
         Self(State::Introducing(Transcript::new()))
     }
@@ -374,7 +372,7 @@ impl Secure for Noise {
     }
 }
 
-/// Answers with whichever key the message was made with.
+/// Answers with the key that the message was made with.
 fn respond(
     prologue: &[u8; 32],
     credentials: &Credentials,
@@ -386,17 +384,17 @@ fn respond(
     answers.next().ok_or(CloseReason::BadProof)
 }
 
-/// The cipher of a link of a unit that chooses its mode when it starts.
+/// The cipher of a link, for units that choose their mode at their start.
 #[allow(clippy::large_enum_variant)]
 pub enum Cipher {
-    /// Everything travels as it is.
+    /// Nothing is encrypted.
     Plain(Plain),
     /// Secured.
     Noise(Noise),
 }
 
 impl Cipher {
-    /// The cipher of a link that begins.
+    /// The cipher of a new link.
     pub fn new(mode: Mode) -> Self {
         match mode {
             Mode::Plain => Self::Plain(Plain),
@@ -404,8 +402,7 @@ impl Cipher {
         }
     }
 
-    /// What the next frame and the next datagram would be sealed with: a hash of the key, and the number. So a test can tell
-    /// that nothing is ever sealed twice with the same.
+    /// For tests that no key and number seal twice: a hash of the key, and the number, of the next frame and the next datagram.
     #[doc(hidden)]
     pub fn next_seals(&self) -> Option<[([u8; 16], u64); 2]> {
         let Self::Noise(noise) = self else { return None };

@@ -1,20 +1,19 @@
-//! Codes that show that a datagram of discovery comes from a unit of the fleet, or of the pair. What they cover is not
-//! secret.
+//! Codes that prove that a datagram of discovery comes from a unit of the fleet, or of the pair. The datagram is not encrypted.
 
 use blake2::digest::Mac;
 
 use crate::keys::{DiscoveryKey, KEY_BYTES, PairKey, keyed};
 
-/// Bytes of a code.
+/// Length of a code.
 pub const MAC_BYTES: usize = 16;
 
 /// A key that makes codes.
 pub trait Authenticates {
-    /// The key, and what keeps its codes apart from those of other uses.
+    /// The key, and a label that separates its codes from those of other uses.
     #[doc(hidden)]
     fn secret(&self) -> (&[u8; KEY_BYTES], &'static [u8; 4]);
 
-    /// The code of `parts`, which are taken together; what is variable in them must tell its own length.
+    /// The code of the concatenated `parts`. Parts of variable length must contain their length.
     fn code(&self, parts: &[&[u8]]) -> [u8; MAC_BYTES] {
         let whole = self.whole(parts).finalize().into_bytes();
         let mut code = [0; MAC_BYTES];
@@ -22,7 +21,7 @@ pub trait Authenticates {
         code
     }
 
-    /// Whether `code` is that of `parts`; takes the same time wherever it differs.
+    /// Whether `code` is that of `parts`, in constant time.
     fn is_code(&self, parts: &[&[u8]], code: &[u8]) -> bool {
         code.len() == MAC_BYTES && self.whole(parts).verify_truncated_left(code).is_ok()
     }

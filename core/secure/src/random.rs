@@ -1,16 +1,14 @@
-//! Random numbers for a board, whose sources of noise may be poor, or constant.
+//! Random numbers for boards, whose noise sources may be poor or constant.
 //!
-//! What is drawn comes from a keyed hash over all that may differ: the board's own secret as the key, which life of the
-//! board this is, how often it has drawn in this life, noise of the hardware, and what a peer has drawn. The secret
-//! makes it unpredictable, the two counters make it unique. Each of the two is enough for what it does:
+//! A draw is a keyed hash over everything that may differ: the board's secret as the key, the count of its boots, the count of
+//! draws in this boot, noise of the hardware, and what peers have drawn. The secret makes draws unpredictable, the two counters
+//! make them unique, each independently:
 //!
-//! - with noise that never changes, no two draws are alike as long as the boot counter moves;
-//! - where the counter has stood still as well, what a peer has drawn still tells two lives apart, for all that is drawn
-//!   after [`Random::stir`];
-//! - with a secret that others know, only the noise is left.
+//! - with constant noise no two draws are equal, as long as the boot counter advances;
+//! - if the boot counter stands still, too, what peers have drawn distinguishes two boots, for draws after [`Random::stir`];
+//! - if the secret is known to others, only the noise is left.
 //!
-//! A [`BootCounter`] is therefore moved, and its new value kept where a loss of power leaves it, before the network
-//! starts.
+//! Therefore a [`BootCounter`] is advanced, and stored where it survives a loss of power, before the network starts.
 
 use blake2::digest::Mac;
 use zeroize::Zeroize;
@@ -20,39 +18,39 @@ use crate::keys::{DeviceSecret, KEY_BYTES, keyed};
 /// Bytes of one draw.
 pub const DRAW_BYTES: usize = 32;
 
-/// Which life of the board this is, kept where a loss of power leaves it.
+/// The count of the board's boots, stored where it survives a loss of power.
 pub trait BootCounter {
-    /// Why the counter could not be kept.
+    /// Why the counter could not be stored.
     type Error;
 
-    /// Moves the counter on, and returns the new value once it is kept: no value is returned twice. With an error the
-    /// board must not start its network, since it could draw what it has drawn before.
+    /// Advances the counter, and returns the new value once it is stored: no value is returned twice. After an error the board
+    /// must not start its network, since it could repeat earlier draws.
     fn advance(&mut self) -> Result<u64, Self::Error>;
 }
 
-/// Where a board's random numbers come from. One for each life of the board; it cannot be copied.
+/// A board's random numbers. One for each boot; it cannot be cloned.
 pub struct Random {
     secret: DeviceSecret,
     boot: u64,
     drawn: u64,
-    /// All noise that came, and what peers have drawn.
+    /// All noise so far, and what peers have drawn.
     pool: [u8; DRAW_BYTES],
 }
 
 impl Random {
-    /// Begins a life: moves the counter, and takes what noise there is.
+    /// Starts a boot: advances the counter, and mixes in the available noise.
     pub fn start<C: BootCounter>(secret: DeviceSecret, counter: &mut C, noise: &[u32]) -> Result<Self, C::Error> {
         let mut random = Self { secret, boot: counter.advance()?, drawn: 0, pool: [0; DRAW_BYTES] };
         random.stir_words(noise);
         Ok(random)
     }
 
-    /// A generator for tests that must draw the same in each life: a known secret, and life 0.
+    /// A generator for tests that must draw the same in each boot: a known secret, and boot 0.
     pub const fn constant() -> Self {
         Self { secret: DeviceSecret::new([0; KEY_BYTES]), boot: 0, drawn: 0, pool: [0; DRAW_BYTES] }
     }
 
-    /// What the hardware's noise was, goes into all that is drawn from now on.
+    /// Mixes noise of the hardware into all later draws.
     pub fn stir_words(&mut self, noise: &[u32]) {
         let mut mac = keyed(self.secret.expose());
         mac.update(b"stir");
@@ -61,7 +59,7 @@ impl Random {
         self.pool = mac.finalize().into_bytes().into();
     }
 
-    /// What a peer has drawn, as the nonce of its hello, goes into all that is drawn from now on.
+    /// Mixes what a peer has drawn, such as the nonce of its hello, into all later draws.
     pub fn stir(&mut self, nonce: &[u8]) {
         let mut mac = keyed(self.secret.expose());
         mac.update(b"peer");
@@ -77,7 +75,7 @@ impl Random {
         mac.update(&self.boot.to_le_bytes());
         mac.update(&self.drawn.to_le_bytes());
         mac.update(&self.pool);
-        // At a million draws a second it wraps after half a million years.
+        // Wraps after half a million years at a million draws a second.
         self.drawn = self.drawn.wrapping_add(1);
         mac.finalize().into_bytes().into()
     }
@@ -98,7 +96,7 @@ impl Drop for Random {
     }
 }
 
-/// Tells that there is one, and nothing of what it draws.
+/// Reveals nothing of its draws.
 impl core::fmt::Debug for Random {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         f.write_str("Random(…)")

@@ -1,5 +1,5 @@
-//! The primitives in the form that `noise-protocol` asks for. X25519 and BLAKE2s stand here, since the ready-made glue
-//! draws its own random numbers and does not build without an operating system.
+//! The primitives behind `noise-protocol`'s traits. X25519 and BLAKE2s are implemented here, since the ready-made adapters draw
+//! their own random numbers and do not build without an operating system.
 
 use blake2::{Blake2s256, Digest};
 use noise_protocol::{DH, Hash, U8Array};
@@ -31,14 +31,13 @@ impl DH for X25519 {
         "25519"
     }
 
-    /// Never asked for: every handshake is given its key. A constant would not be a secret, so this one is refused by
-    /// [`Self::dh`] at the other end and here.
+    /// Never called: every handshake is given its key. The constant would be no secret, but [`Self::dh`] rejects it at both ends.
     fn genkey() -> Self::Key {
         Self::Key::new()
     }
 
-    /// With the tables that the crate has for the base point where there is room for them; elsewhere as any other product,
-    /// which saves 2 KB of code that nothing else would use.
+    /// Uses the crate's tables for the base point on hosts, where code size does not matter. Elsewhere it is an ordinary product,
+    /// which saves 2 KB of code that nothing else uses.
     fn pubkey(key: &Self::Key) -> Self::Pubkey {
         let secret = StaticSecret::from(**key);
         if cfg!(feature = "ring") {
@@ -49,7 +48,7 @@ impl DH for X25519 {
 
     fn dh(key: &Self::Key, public: &Self::Pubkey) -> Result<Self::Output, ()> {
         let shared = StaticSecret::from(**key).diffie_hellman(&PublicKey::from(*public));
-        // A point of small order makes the same secret with every key.
+        // A point of small order gives the same secret with every key.
         if shared.was_contributory() { Ok(Self::Output::from_slice(shared.as_bytes())) } else { Err(()) }
     }
 }
