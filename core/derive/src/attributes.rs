@@ -1,25 +1,25 @@
-//! Attributes of fields, arguments and functions.
+//! Attributes of fields, arguments and functions, as the macros parse them.
 
 use syn::punctuated::Punctuated;
 use syn::spanned::Spanned;
 use syn::{Attribute, Error, Expr, ExprLit, Ident, Lit, LitInt, LitStr, Meta, Result, Token};
 
-/// Most bytes of text or bytes, or elements of a list, that can be declared.
+/// Largest size that can be declared, of text, bytes or a list.
 const LARGEST: u64 = u32::MAX as u64;
-/// As the core has it, which looks at what is written here.
+/// As in `cara_core::config`, where this crate cannot look; the core checks the result.
 const HELP_BYTES: usize = 160;
 
 /// `#[size(200)]`, `#[name = "…"]` and `#[unit = "m"]` of a variable.
 #[derive(Default)]
 pub(crate) struct OfVariable {
-    /// As `#[size(50, 32)]` has them: of a list, then of its elements.
+    /// The sizes in `#[size(50, 32)]`: of a list, then of its elements.
     pub(crate) size: Vec<LitInt>,
     pub(crate) name: Option<String>,
     pub(crate) unit: Option<LitStr>,
 }
 
 impl OfVariable {
-    /// Takes its attributes away from others.
+    /// Takes these attributes out of a list.
     pub(crate) fn take(attributes: &mut Vec<Attribute>) -> Result<Self> {
         let mut found = Self::default();
         let mut size = None;
@@ -36,7 +36,7 @@ impl OfVariable {
         Ok(found)
     }
 
-    /// The name, where it is not the Rust name.
+    /// The name, or by default the Rust name.
     pub(crate) fn name_or(&mut self, ident: &Ident) -> String {
         self.name.take().unwrap_or_else(|| plain(ident))
     }
@@ -53,19 +53,19 @@ pub(crate) fn is_one_of(attribute: &Attribute, names: &[&str]) -> bool {
     names.iter().any(|name| attribute.path().is_ident(name))
 }
 
-/// Takes the attributes of these names out.
+/// Takes the attributes with these names out of a list.
 pub(crate) fn extract(attributes: &mut Vec<Attribute>, names: &[&str]) -> Vec<Attribute> {
     extract_if(attributes, |attribute| is_one_of(attribute, names))
 }
 
-/// Takes those out that are wanted.
+/// Takes the attributes that `is_wanted` accepts out of a list.
 pub(crate) fn extract_if(attributes: &mut Vec<Attribute>, is_wanted: impl FnMut(&Attribute) -> bool) -> Vec<Attribute> {
     let (taken, kept) = std::mem::take(attributes).into_iter().partition(is_wanted);
     *attributes = kept;
     taken
 }
 
-/// Sets what may be said once.
+/// Sets an attribute that may be given only once.
 pub(crate) fn set<T>(place: &mut Option<T>, value: T, attribute: &Attribute) -> Result<()> {
     match place.replace(value) {
         None => Ok(()),
@@ -84,7 +84,7 @@ pub(crate) fn text(attribute: &Attribute) -> Result<LitStr> {
     Err(Error::new(attribute.span(), format!("write #[{name} = \"…\"]")))
 }
 
-/// The documentation's first paragraph as one line, with as much of it as a line of help may have.
+/// The first paragraph of the documentation, as one line, cut to the length of a line of help.
 pub(crate) fn first_line(attributes: &[Attribute]) -> String {
     let text = |attribute: &Attribute| match &attribute.meta {
         Meta::NameValue(pair) if attribute.path().is_ident("doc") => match &pair.value {

@@ -1,4 +1,4 @@
-//! How a function wants to be called, as its attributes say.
+//! Attributes of a function: priority, lease, actuator and flags.
 
 use proc_macro2::TokenStream;
 use quote::{format_ident, quote};
@@ -8,26 +8,26 @@ use syn::{Attribute, Error, Ident, Lit, LitInt, Meta, Result, Token};
 
 use crate::attributes::{extract, extract_if, is_one_of, set};
 
-/// How a function wants to be called.
+/// The attributes of a function.
 #[derive(Default)]
 pub(crate) struct Attributes {
     pub(crate) priority: Option<Ident>,
     pub(crate) lease: Option<LitInt>,
     pub(crate) actuator: Option<Ident>,
-    /// Those without a value. The core knows which there are: each sets the field of its name.
+    /// The attributes without a value. The core knows which exist: each sets the field with its name.
     flags: Vec<Ident>,
 }
 
-/// The classes, as the attribute and as `Priority` name them.
+/// The classes, as the attribute and the enum `Priority` name them.
 const PRIORITIES: [(&str, &str); 4] =
     [("emergency", "Emergency"), ("high", "High"), ("normal", "Normal"), ("low", "Low")];
-/// Attributes without a value that are Rust's own, or that have one where they are right.
+/// Attributes of Rust itself, or with a value, which are no flags.
 const NO_FLAGS: [&str; 8] = ["cold", "deprecated", "help", "inline", "must_use", "name", "returns", "track_caller"];
-/// A shorter lease cannot be kept.
+/// A shorter lease cannot be renewed in time.
 const SHORTEST_LEASE: u64 = 20;
 
 impl Attributes {
-    /// Takes them away from others.
+    /// Takes these attributes out of a list.
     pub(crate) fn take(attributes: &mut Vec<Attribute>) -> Result<Self> {
         let mut found = Self::default();
         for attribute in extract(attributes, &["priority", "lease", "actuator"]) {
@@ -51,12 +51,12 @@ impl Attributes {
         Ok(found)
     }
 
-    /// Whether it has this one of those without a value.
+    /// Whether it has this flag.
     pub(crate) fn has(&self, flag: &str) -> bool {
         self.flags.iter().any(|found| found == flag)
     }
 
-    /// As an expression of the core's type.
+    /// An expression of the core's `Attributes`.
     pub(crate) fn expression(&self, root: &TokenStream) -> TokenStream {
         let Self { priority, lease, flags, .. } = self;
         let parts = quote!(#root::typed::parts);

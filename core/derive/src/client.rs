@@ -1,4 +1,4 @@
-//! The client of an interface, and a request for each of its functions: what a call is made of.
+//! Generates the client of an interface, and a request type for each of its functions.
 
 use proc_macro2::TokenStream;
 use quote::{format_ident, quote};
@@ -16,12 +16,12 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
     }
 }
 
-/// The name of the request of a function.
+/// The name of a function's request type.
 fn name(interface: &Interface, function: &Function) -> Ident {
     format_ident!("__{}_{}", interface.item.ident, crate::attributes::plain(&function.ident))
 }
 
-/// A call of one function: its arguments, and how they become variables and results.
+/// The request type of a function: its arguments, and how they are encoded and results decoded.
 fn request(interface: &Interface, function: &Function, root: &TokenStream) -> TokenStream {
     let (typed, parts, holder) = (quote!(#root::typed), quote!(#root::typed::parts), interface.holder());
     let (visibility, name) = (&interface.item.vis, name(interface, function));
@@ -114,13 +114,13 @@ fn read(interface: &Interface, function: &Function, root: &TokenStream) -> Token
     }
 }
 
-/// `<'a>` of a function with borrowed arguments.
+/// `<'a>` if the function has borrowed arguments.
 fn lifetime(function: &Function) -> Option<TokenStream> {
     let is_borrowed = |input: &Input| matches!(input, Input::Variable(_, variable) if variable.is_borrowed());
     function.inputs.iter().any(is_borrowed).then(|| quote!(<'a>))
 }
 
-/// The arguments as a client takes them.
+/// The arguments of the client's method.
 fn inputs(function: &Function) -> Vec<TokenStream> {
     let input = |input: &Input| match input {
         Input::Call(_) => None,
@@ -136,7 +136,7 @@ fn inputs(function: &Function) -> Vec<TokenStream> {
     function.inputs.iter().filter_map(input).collect()
 }
 
-/// Their names.
+/// The names of the arguments.
 fn names(function: &Function) -> Vec<TokenStream> {
     let name = |input: &Input| match input {
         Input::Call(_) => None,
@@ -205,8 +205,8 @@ fn client(interface: &Interface, root: &TokenStream) -> TokenStream {
     }
 }
 
-/// The documentation of a call.
+/// The documentation of a client's method.
 fn help(function: &Function) -> String {
-    // A line of help that is an attribute may be another node's, which is no documentation: rustdoc would run code in it.
+    // Do not use `#[help]` here: it may be a peer's text (`--rust`), in which rustdoc would run code.
     if function.about.is_empty() { format!("Calls `{}`.", function.name) } else { function.about.clone() }
 }

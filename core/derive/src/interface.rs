@@ -1,4 +1,4 @@
-//! `#[interface]`: what the trait says, and what is made of it.
+//! `#[interface]`: parses the trait, checks its rules, and puts the generated parts together.
 
 use proc_macro2::{Span, TokenStream, TokenTree};
 use quote::{ToTokens, format_ident, quote, quote_spanned};
@@ -15,19 +15,19 @@ use crate::calling::Attributes;
 use crate::kind::Variable;
 use crate::{client, server};
 
-/// A trait, read.
+/// A parsed trait.
 pub(crate) struct Interface {
     pub(crate) item: ItemTrait,
     pub(crate) functions: Vec<Function>,
 }
 
-/// One of its functions.
+/// A function of the trait.
 pub(crate) struct Function {
     pub(crate) ident: Ident,
     /// Its name in the signature.
     pub(crate) name: String,
     pub(crate) takes_state: bool,
-    /// It takes it as `&self`.
+    /// It takes the state as `&self`.
     pub(crate) only_reads: bool,
     pub(crate) is_async: bool,
     pub(crate) inputs: Vec<Input>,
@@ -37,38 +37,38 @@ pub(crate) struct Function {
     pub(crate) attributes: Attributes,
     /// The first paragraph of its documentation.
     pub(crate) about: String,
-    /// What people at other nodes are told.
+    /// The line of help that is published.
     pub(crate) help: String,
 }
 
-/// What a function is called with.
+/// An argument of a function.
 pub(crate) enum Input {
-    /// What tells about the call, or lends an `async fn` the state.
+    /// `call`, or the state of an `async fn`.
     Call(Call),
     Variable(Ident, Variable),
     /// A struct whose fields are the arguments.
     Struct(Ident, Type),
 }
 
-/// What an argument that tells about the call says of it.
+/// An argument that is not a variable: `call` or `state`.
 pub(crate) struct Call {
-    /// It lends the state, and tells nothing.
+    /// It is `state`.
     pub(crate) is_state: bool,
-    /// The traits behind `impl`, for a state of the type `T`.
+    /// The traits after `impl`, for a state of type `T`.
     pub(crate) bounds: TokenStream,
-    /// The first and the second type of `TypedCall<Left, Blocked>`: the progress, and the values of failures.
+    /// The types in `TypedCall<Left, Blocked>`: the progress, and the values of failures.
     reported: Vec<Type>,
 }
 
-/// What a function gives back.
+/// The results of a function.
 pub(crate) enum Results {
-    /// A type that names them itself, as `()` does.
+    /// A type that has the names, such as `()`.
     Struct(Type),
-    /// One or, as a tuple, several with names that are told.
+    /// One result or, as a tuple, several, with names in `#[returns(…)]`.
     Named(Vec<Variable>),
 }
 
-/// The trait with all that is made of it, or what is wrong with it.
+/// The trait with everything generated from it, or an error.
 pub(crate) fn expand(attribute: TokenStream, input: TokenStream, root: &TokenStream) -> TokenStream {
     let made = || {
         if !attribute.is_empty() {
@@ -94,7 +94,7 @@ impl Interface {
         for member in &mut item.items {
             match member {
                 TraitItem::Fn(function) => functions.push(Function::read(function)?),
-                // As for the order of a call, whose type differs from port to port.
+                // Such as the type of an order, which differs between ports.
                 TraitItem::Type(_) => {}
                 other => return Err(Error::new_spanned(other, "an interface has functions only")),
             }
@@ -105,12 +105,12 @@ impl Interface {
         Ok(Self { item, functions })
     }
 
-    /// The type that holds the constants of its functions.
+    /// The type with the constants of the functions.
     pub(crate) fn holder(&self) -> Ident {
         format_ident!("__{}Functions", self.item.ident)
     }
 
-    /// What its functions move, stop and reset, each once.
+    /// All actuators that functions move, stop or reset, without duplicates.
     pub(crate) fn actuators(&self) -> Vec<&Ident> {
         let mut found: Vec<&Ident> = Vec::new();
         for actuator in self.functions.iter().filter_map(|function| function.attributes.actuator.as_ref()) {
@@ -185,7 +185,7 @@ impl Function {
         Ok(function)
     }
 
-    /// What holds between its attributes and the rest.
+    /// Checks rules about combinations of attributes.
     fn check(&self, span: Span) -> Result<()> {
         let Attributes { priority, lease, actuator, .. } = &self.attributes;
         let (stops, resets) = (self.attributes.has("stop"), self.attributes.has("reset"));
@@ -214,7 +214,7 @@ impl Function {
         Ok(())
     }
 
-    /// Arguments and results that are told one by one.
+    /// Arguments and results that are declared one by one.
     fn variables(&self) -> impl Iterator<Item = &Variable> {
         let results: &[Variable] = match &self.results {
             Results::Named(results) => results,
@@ -227,7 +227,7 @@ impl Function {
         arguments.chain(results)
     }
 
-    /// The structs whose fields are variables of it.
+    /// The structs whose fields are variables of the function.
     fn structs(&self) -> Vec<Type> {
         let arguments = self.inputs.iter().filter_map(|input| match input {
             Input::Struct(_, rust) => Some(rust.clone()),
@@ -241,7 +241,7 @@ impl Function {
         arguments.chain(results).chain(reported.into_iter().flatten()).collect()
     }
 
-    /// What the argument says that tells about the call.
+    /// The argument `call`, if there is one.
     pub(crate) fn call(&self) -> Option<&Call> {
         self.inputs.iter().find_map(|input| match input {
             Input::Call(call) if !call.is_state => Some(call),
@@ -249,19 +249,19 @@ impl Function {
         })
     }
 
-    /// What its calls tell while they run and, second, when they fail; `None` where it says neither.
+    /// The types of the progress and of failure values; `None` if neither is declared.
     pub(crate) fn reported(&self) -> Option<(Type, Type)> {
         let reported = &self.call()?.reported;
         let second = || reported.get(1).cloned().unwrap_or_else(|| syn::parse_quote!(()));
         Some((reported.first()?.clone(), second()))
     }
 
-    /// A constant of this function.
+    /// The name of a constant of this function.
     pub(crate) fn constant(&self, what: &str) -> Ident {
         format_ident!("{}_{}", what, plain(&self.ident))
     }
 
-    /// The Rust type that it gives back, without `Result`.
+    /// The Rust type of the results, without `Result`.
     pub(crate) fn returned(&self) -> TokenStream {
         match &self.results {
             Results::Struct(rust) => rust.to_token_stream(),
@@ -300,8 +300,8 @@ impl Input {
     }
 }
 
-/// An `async fn` as any executor can run it: its future is `Send`, and so is what it borrows. What implements the trait writes
-/// `async fn`, and `&impl AnyCall` as the trait does.
+/// Turns an `async fn` into one that returns a `Send` future, for any executor; its borrows are `Send`, too. Implementations
+/// write `async fn`, and `&impl AnyCall` like the trait.
 fn make_future(item: &mut TraitItemFn) {
     let signature = &mut item.sig;
     let Some(word) = signature.asyncness.take() else { return };
@@ -326,13 +326,13 @@ fn make_future(item: &mut TraitItemFn) {
     }
 }
 
-/// Of the bound `AsyncState<Self>`.
+/// Whether the bound is `AsyncState<Self>`.
 fn lends_state(bound: &TypeParamBound) -> bool {
     let TypeParamBound::Trait(bound) = bound else { return false };
     bound.path.segments.last().is_some_and(|last| last.ident == "AsyncState")
 }
 
-/// What implements the trait is `Self` there, and `T` in the server's functions.
+/// Replaces `Self` of the trait by `T`, the state in the server's functions.
 fn of_state(token: TokenTree) -> TokenTree {
     match token {
         TokenTree::Ident(word) if word == "Self" => Ident::new("T", word.span()).into(),
@@ -356,7 +356,7 @@ fn types_of(bound: &TypeParamBound) -> Vec<Type> {
     }
 }
 
-/// The name of a result, as `sum`, `"pos-x"` or `#[size(64)] text`.
+/// The name of a result, such as `sum`, `"pos-x"` or `#[size(64)] text`.
 struct Named {
     name: String,
     span: Span,
@@ -373,7 +373,7 @@ impl Parse for Named {
     }
 }
 
-/// The results, and whether the function can fail.
+/// Parses the results, and whether the function can fail.
 fn read_results(output: &ReturnType, returns: Option<Punctuated<Named, Token![,]>>) -> Result<(Results, bool)> {
     let unit = || syn::parse_quote!(());
     let (rust, can_fail) = match output {
@@ -428,7 +428,7 @@ fn of_result(rust: &Type) -> Option<Type> {
     }
 }
 
-/// Signatures, and the places of results.
+/// Constants: signatures, and indexes of results.
 fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
     let Interface { item, functions } = interface;
     let (visibility, holder) = (&item.vis, interface.holder());

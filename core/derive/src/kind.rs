@@ -1,4 +1,4 @@
-//! One variable: its name, its Rust type, and how that is read and set.
+//! One variable: its name, its Rust type, and code that reads and sets it.
 
 use proc_macro2::{TokenStream, TokenTree};
 use quote::{ToTokens, quote, quote_spanned};
@@ -7,7 +7,7 @@ use syn::{Error, GenericArgument, LitInt, LitStr, PathArguments, Result, Type};
 
 use crate::attributes::OfVariable;
 
-/// A variable as a field, an argument or a result declares it.
+/// A variable, declared by a field, an argument or a result.
 pub(crate) struct Variable {
     /// Its name in the signature.
     pub(crate) name: String,
@@ -16,19 +16,19 @@ pub(crate) struct Variable {
     unit: Option<LitStr>,
 }
 
-/// How a Rust type is a variable.
+/// How a Rust type becomes a variable.
 pub(crate) enum Kind {
-    /// By the trait `Field`.
+    /// It implements `Field`.
     Field,
-    /// `String` or `&str`, of at most so many bytes.
+    /// `String` or `&str` of at most this many bytes.
     Text(LitInt),
-    /// `Vec<u8>` or `&[u8]`, likewise.
+    /// `Vec<u8>` or `&[u8]` of at most this many bytes.
     Bytes(LitInt),
-    /// A list of at most so many elements.
+    /// A list of at most this many elements.
     List(Holder, TokenStream, Box<Variable>),
 }
 
-/// What holds the elements of a list.
+/// The Rust type of a list.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum Holder {
     /// `Vec`.
@@ -39,17 +39,17 @@ pub(crate) enum Holder {
     Optional,
 }
 
-/// What the spelling of a type tells.
+/// What the spelling of a type says.
 enum Spelling {
     Text,
     Bytes,
-    /// A list of elements of this type; how many, where the type says it.
+    /// A list of elements of this type, and the most elements if the type says that.
     List(Holder, Box<Type>, Option<TokenStream>),
     Other,
 }
 
 impl Variable {
-    /// Or what is wrong with its type.
+    /// A variable, or an error about its type.
     pub(crate) fn new(name: String, rust: Type, said: OfVariable) -> Result<Self> {
         let mut sizes = said.size.into_iter();
         let variable = Self::nested(name, rust, &mut sizes)?;
@@ -65,7 +65,7 @@ impl Variable {
         }
     }
 
-    /// Takes the sizes that it needs, from the outermost to the innermost.
+    /// Consumes the sizes that it needs, from the outermost type to the innermost.
     fn nested(name: String, rust: Type, sizes: &mut impl Iterator<Item = LitInt>) -> Result<Self> {
         let mut size = |what: &str| {
             let wrong = || format!("say how many {what} of `{}` there are at most: #[size(200)]", spelled(&rust));
@@ -89,18 +89,18 @@ impl Variable {
         Ok(Self { name, rust, kind, unit: None })
     }
 
-    /// Its name and its unit, where it has one.
+    /// Its name and unit, if it has a unit.
     pub(crate) fn unit(&self) -> Option<TokenStream> {
         let (name, unit) = (&self.name, self.unit.as_ref()?);
         Some(quote!((#name, #unit)))
     }
 
-    /// Whether it is borrowed.
+    /// Whether the type is a reference.
     pub(crate) const fn is_borrowed(&self) -> bool {
         matches!(self.rust, Type::Reference(_))
     }
 
-    /// Its `VariableSpec`.
+    /// An expression of its `VariableSpec`.
     pub(crate) fn spec(&self, root: &TokenStream) -> TokenStream {
         let Self { name, rust, kind, .. } = self;
         let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
@@ -130,13 +130,13 @@ impl Variable {
         }
     }
 
-    /// Reads it, as a `Result<_, Error>`.
+    /// Code that reads it, of type `Result<_, Error>`.
     pub(crate) fn read(&self, root: &TokenStream, place: &TokenStream) -> TokenStream {
         let read = self.reader(root);
         quote!(parameters.value_of(#place).and_then(#read))
     }
 
-    /// A function from its `Value` to a `Result<_, Error>`.
+    /// A closure from its `Value` to a `Result<_, Error>`.
     pub(crate) fn reader(&self, root: &TokenStream) -> TokenStream {
         let rust = &self.rust;
         let from = |borrowed: TokenStream| {
@@ -169,7 +169,7 @@ impl Variable {
         }
     }
 
-    /// Reads it for a service, as a `Result<_, ServiceError>`.
+    /// Code that reads it for a service, of type `Result<_, ServiceError>`.
     pub(crate) fn argument(&self, root: &TokenStream, place: usize) -> TokenStream {
         let rust = &self.rust;
         match self.kind {
@@ -191,13 +191,13 @@ impl Variable {
         }
     }
 
-    /// Sets it from an expression, as a `Result<(), Error>`.
+    /// Code that sets it from an expression, of type `Result<(), Error>`.
     pub(crate) fn write(&self, root: &TokenStream, value: &TokenStream, place: &TokenStream) -> TokenStream {
         let write = self.writer(root, value);
         quote!(parameters.slot_of(#place).and_then(|slot| #write))
     }
 
-    /// Sets what `slot` is, as a `Result<(), Error>`.
+    /// Code that sets the target `slot`, of type `Result<(), Error>`.
     pub(crate) fn writer(&self, root: &TokenStream, value: &TokenStream) -> TokenStream {
         let rust = &self.rust;
         match &self.kind {
@@ -216,7 +216,7 @@ impl Variable {
         }
     }
 
-    /// An expression for a list: an error at its type where the core does not have them.
+    /// An expression for a list: an error at its type if the core is built without lists.
     fn list(&self, root: &TokenStream, list: &TokenStream) -> TokenStream {
         let span = self.rust.span();
         let here = |mut token: TokenTree| {
@@ -228,7 +228,7 @@ impl Variable {
     }
 }
 
-/// The type as it is written, for messages.
+/// The type as written, for messages.
 fn spelled(rust: &Type) -> String {
     rust.to_token_stream().to_string().replace(' ', "")
 }
@@ -274,7 +274,7 @@ fn is_u8(rust: &Type) -> bool {
     matches!(rust, Type::Path(path) if path.path.is_ident("u8"))
 }
 
-/// The generic arguments, `None` for each that is no type.
+/// The generic arguments; `None` for each that is not a type.
 fn generic_types(arguments: &PathArguments) -> Vec<Option<&Type>> {
     match arguments {
         PathArguments::AngleBracketed(generic) => generic
@@ -289,7 +289,7 @@ fn generic_types(arguments: &PathArguments) -> Vec<Option<&Type>> {
     }
 }
 
-/// The second generic argument, where it is a number.
+/// The second generic argument, if it is a number.
 fn bound(arguments: &PathArguments) -> Option<TokenStream> {
     let PathArguments::AngleBracketed(generic) = arguments else { return None };
     match generic.args.get(1)? {

@@ -1,8 +1,8 @@
-//! The macros of CARA's typed services: `#[derive(Variables)]` for structs and enums, and `#[interface]`, which makes a
-//! server and a client of a trait.
+//! The macros of CARA's typed services: `#[derive(Variables)]` for structs and enums, and `#[interface]`, which generates a
+//! server and a client from a trait.
 //!
-//! Use them as exported by `cara_core`, `cara_std` or `cara_embassy` (feature `derive`): the three forms of each macro differ
-//! only in the crate that the generated code names.
+//! Use them as re-exported by `cara_core`, `cara_std` or `cara_embassy` (feature `derive`): the three forms of each macro differ
+//! only in the crate that the generated code refers to.
 
 mod attributes;
 mod calling;
@@ -15,7 +15,7 @@ mod variables;
 use proc_macro::TokenStream;
 use quote::quote;
 
-/// As `cara_core::Variables`: the fields of a struct are variables by their names, an enum without fields is one integer.
+/// As `cara_core::Variables`: each field of a struct is a variable with its name; an enum without fields is one integer.
 ///
 /// ```
 /// use cara_core::Variables;
@@ -36,13 +36,13 @@ use quote::quote;
 /// # Ok::<(), cara_core::error::Error>(())
 /// ```
 ///
-/// With the feature `nested` of the core, which Linux has always, a field that is such a struct itself is a record, `Vec<T>`
-/// and `heapless::Vec<T, N>` are lists, and `Option<T>` is a list of one at most.
+/// With the feature `nested` of the core, which is always on for Linux, a field whose type is such a struct is a record, `Vec<T>`
+/// and `heapless::Vec<T, N>` are lists, and `Option<T>` is a list of at most one element.
 ///
 /// | attribute of a field | means |
 /// |---|---|
-/// | `#[size(200)]` | how many bytes a `String` or `Vec<u8>`, or elements a `Vec<T>`, has at most; `#[size(50, 32)]` for a `Vec<String>` |
-/// | `#[name = "x-1"]` | the variable's name, where it is not the field's |
+/// | `#[size(200)]` | the most bytes of a `String` or `Vec<u8>`, or elements of a `Vec<T>`; `#[size(50, 32)]` for a `Vec<String>` |
+/// | `#[name = "x-1"]` | the variable's name, if it is not the field's |
 /// | `#[unit = "m"]` | its unit, for people |
 #[proc_macro_derive(Variables, attributes(size, name, unit))]
 pub fn variables(input: TokenStream) -> TokenStream {
@@ -61,7 +61,7 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
     variables::derive(input.into(), &quote!(::cara_embassy)).into()
 }
 
-/// As `cara_core::interface`: makes `DriveServer` and `DriveClient` of a trait `Drive`.
+/// As `cara_core::interface`: generates `DriveServer` and `DriveClient` from a trait `Drive`.
 ///
 /// ```
 /// use cara_core::error::ServiceError;
@@ -81,7 +81,7 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// }
 /// ```
 ///
-/// What moves has an actuator and a lease. This function also declares progress and the values of its failures:
+/// Functions that move something have an actuator and a lease. This one also declares progress and the values of its failures:
 ///
 /// ```
 /// use cara_core::{ServiceError, TypedCall, Variables, interface};
@@ -125,24 +125,24 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// | attribute of a function | means |
 /// |---|---|
 /// | `#[returns(sum)]` | the names of the results; not needed for `()` and for structs that derive `Variables` |
-/// | `#[priority(high)]` | the class of calls that name none: `emergency`, `high`, `normal`, `low` |
-/// | `#[actuator(drive)]` | what it moves, stops or resets, which the server is made with |
-/// | `#[lease(ms = 400)]` | how long it moves it after the caller's last sign that it wants it |
-/// | `#[stop]`, `#[reset]` | it stops, or lets move again, its actuator or, without one, all |
-/// | `#[idempotent]` | running it twice is as good as running it once |
-/// | `#[help = "…"]` | what it does, in a line for people; the first paragraph of its documentation otherwise. Every peer that may see the function reads it: `#[help = ""]` keeps it back |
-/// | `#[name = "go-to"]` | its name, where it is not the method's |
+/// | `#[priority(high)]` | the default class of calls: `emergency`, `high`, `normal`, `low` |
+/// | `#[actuator(drive)]` | what it moves, stops or resets: a field of the server |
+/// | `#[lease(ms = 400)]` | how long motion continues after the caller's last renewal |
+/// | `#[stop]`, `#[reset]` | it stops or resets its actuator or, without one, all |
+/// | `#[idempotent]` | callers may repeat it |
+/// | `#[help = "…"]` | one line of help; by default the first paragraph of its documentation. Every peer that may see the function can read it: `#[help = ""]` publishes none |
+/// | `#[name = "go-to"]` | its name, if it is not the method's |
 ///
-/// Arguments have `#[size(200)]`, `#[name = "…"]` and `#[unit = "m"]` as fields do, and names of results too: `#[returns(#[unit = "%"] charge)]`. One
-/// argument alone may be `#[variables] order: Order`, whose fields are the arguments then. An argument `call: &impl AnyCall` tells
-/// about the call; where its bounds need types that differ from port to port, the trait declares them (`type Order;`).
+/// Arguments have `#[size(200)]`, `#[name = "…"]` and `#[unit = "m"]` as fields do; so have names of results: `#[returns(#[unit =
+/// "%"] charge)]`. A single argument may be `#[variables] order: Order`: then the fields of `Order` are the arguments. `call:
+/// &impl AnyCall` describes the call; a trait declares types in its bounds that differ between ports (`type Order;`).
 ///
-/// `call: &impl TypedCall<Left, Blocked>` declares also what calls tell while they run, and the values of their failures: structs that
-/// derive `Variables`, or `()` for nothing. A client's `.watch(…)` hands each `Left` to a closure, and its error has `values()`, a
-/// `Blocked`. It needs the feature `details` of the core, which Linux has always. On a board a function with
-/// `call: &impl LongCall<Left, Blocked, State = Agv>` declares the same, and takes the call for a task.
+/// `call: &impl TypedCall<Left, Blocked>` also declares the progress of calls and the values of failures: structs that derive
+/// `Variables`, or `()` for none. A client's `.watch(…)` passes each `Left` to a closure, and `values()` of its error is a
+/// `Blocked`. This needs the feature `details` of the core, which is always on for Linux. On a board, `call: &impl LongCall<Left,
+/// Blocked, State = Agv>` declares the same, for a task that takes the call.
 ///
-/// A method of the client sends nothing: it returns a `Call`, which is sent by `.wait()` (Linux), `.await` or `.send()`.
+/// A method of the client sends nothing: it returns a `Call`, which `.wait()` (Linux), `.await` or `.send()` sends.
 ///
 /// | a function | has the state |
 /// |---|---|
@@ -151,13 +151,13 @@ pub fn variables_embassy(input: TokenStream) -> TokenStream {
 /// | `fn stop()` | never, as an emergency service |
 /// | `async fn fetch(state: &impl AsyncState<Self>, …)` | in `state.with(\|agv\| …).await?`, and not while it waits; on Linux, with the feature `async` |
 ///
-/// On Linux a state with functions that take `&self` is `Sync`: what is not, as a serial port may be, goes into a `Mutex`, or the
-/// functions take `&mut self`. Those that wait for the state have it in the order in which they began. A function that waits or sleeps with
-/// `&mut self` keeps all others waiting, `&self` as well: it begins what takes long, and returns. One that has had the state for over a
-/// second is warned about in the log.
+/// On Linux the state must be `Sync` if functions take `&self`: put what is not, such as a serial port, into a `Mutex`, or take
+/// `&mut self`. Functions that wait for the state get it in the order in which they began. A function with `&mut self` that
+/// blocks keeps all others waiting, including those with `&self`: let it start what takes long, and return. One that has held the
+/// state for over a second is logged as a warning.
 ///
-/// An `async fn` becomes a `fn` that returns a future which is `Send`, so that any executor can run it; what implements the trait writes
-/// `async fn`. Attributes, `call` and clients are as of any other function.
+/// An `async fn` becomes a `fn` that returns a `Send` future, so that any executor can run it; implementations still write `async
+/// fn`. Attributes, `call` and clients are the same as for other functions.
 #[proc_macro_attribute]
 pub fn interface(attribute: TokenStream, input: TokenStream) -> TokenStream {
     interface::expand(attribute.into(), input.into(), &quote!(::cara_core)).into()

@@ -1,4 +1,4 @@
-//! The server of an interface: plain functions that read arguments, call the trait, and set results.
+//! Generates the server of an interface: plain functions that read arguments, call the trait, and set results.
 
 use proc_macro2::TokenStream;
 use quote::{format_ident, quote};
@@ -136,7 +136,7 @@ fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> Toke
     }
 }
 
-/// How the arguments are read, and what the function is called with.
+/// Code that reads the arguments, and the arguments of the trait's method.
 fn arguments(function: &Function, root: &TokenStream) -> (Vec<TokenStream>, Vec<TokenStream>) {
     let typed = quote!(#root::typed);
     let mut place = 0;
@@ -166,7 +166,7 @@ fn arguments(function: &Function, root: &TokenStream) -> (Vec<TokenStream>, Vec<
     (reads, passed)
 }
 
-/// Sets the results in the places that they have in a view made from the signature.
+/// Code that sets the results at their indexes in parameters made from the signature.
 fn write_results(function: &Function, root: &TokenStream) -> TokenStream {
     let (holder_places, typed) = (function.constant("PLACES"), quote!(#root::typed));
     match &function.results {

@@ -8,7 +8,7 @@ use syn::{Data, DataEnum, DeriveInput, Error, Fields, FieldsNamed, Ident, Result
 use crate::attributes::{OfVariable, first_line};
 use crate::kind::Variable;
 
-/// The implementation for a struct or an enum, or what is wrong with it.
+/// The implementation for a struct or an enum, or an error.
 pub(crate) fn derive(input: TokenStream, root: &TokenStream) -> TokenStream {
     syn::parse2(input).and_then(|input| implement(input, root)).unwrap_or_else(Error::into_compile_error)
 }
