@@ -1,5 +1,5 @@
-//! What a build of the core can do: its features. The code of an ability that is off is checked like all other, and left out of
-//! the program; what its events carry cannot be made, and its state takes no room.
+//! The optional features of the core, as types and constants. Code of a feature that is off is still type-checked, then left out
+//! of the program: its events cannot be constructed, and its state is empty.
 
 use core::convert::Infallible;
 use core::ops::Deref;
@@ -17,36 +17,36 @@ pub use On as Nested;
 #[cfg(feature = "streams")]
 pub use On as Streams;
 
-/// Values that change, sent to those that subscribe to them.
+/// Streams: values that change, sent to subscribers.
 pub const STREAMS: bool = Streams::IS_ON;
-/// Failures with text and values, progress of running calls, and their cancellation.
+/// Failures with text and values, progress of running calls, and cancellation.
 pub const DETAILS: bool = Details::IS_ON;
 /// Lists and records.
 pub const NESTED: bool = Nested::IS_ON;
-/// Calls that wait begin by their deadlines. Where the build cannot, they begin as they came, whatever the constraints say.
+/// Waiting calls begin by deadline. Without this they begin in order of arrival, whatever the constraints are.
 pub const SCHEDULING: bool = cfg!(feature = "scheduling");
-/// Calls that cannot make their deadlines can be refused. Where the build cannot, none is.
+/// Calls that cannot make their deadlines can be refused. Without this none is.
 pub const ADMISSION: bool = cfg!(feature = "admission");
-/// Lines for people behind signatures.
+/// Help and units in signatures.
 pub const HELP: bool = cfg!(feature = "help");
 
-/// An ability as a type, [`On`] or [`Off`].
+/// A feature as a type, [`On`] or [`Off`].
 pub trait Ability {
     /// Whether the build has it.
     const IS_ON: bool;
-    /// A `T` where the ability is on; otherwise what cannot be, so that a `match` needs no arm for it.
+    /// `T` if the feature is on; otherwise an uninhabited type, so that a `match` needs no arm for it.
     type Of<T>;
-    /// `None` where the ability is off.
+    /// `None` if the feature is off.
     fn of<T>(value: T) -> Option<Self::Of<T>>;
     /// The value.
     fn get<T>(of: Self::Of<T>) -> T;
 }
 
-/// An ability that this build has.
+/// A feature that this build has.
 #[derive(Clone, Copy, Debug)]
 pub enum On {}
 
-/// An ability that this build has not.
+/// A feature that this build lacks.
 #[derive(Clone, Copy, Debug)]
 pub enum Off {}
 
@@ -76,11 +76,11 @@ impl Ability for Off {
     }
 }
 
-/// The state of an ability. Where that is off it takes no room, and stays as it began.
+/// The state of a feature. If that is off, it is empty and `change` does nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct State<T, const IS_ON: usize>([T; IS_ON]);
 
-/// How the state of an ability begins.
+/// The initial state of a feature.
 pub(crate) trait Begins: Copy + 'static {
     const BEGIN: &'static Self;
 }
@@ -92,7 +92,7 @@ impl<T: Begins, const IS_ON: usize> State<T, IS_ON> {
         self.0.as_mut_slice().first_mut()
     }
 
-    /// Changes it, where there is any.
+    /// Changes the state, if there is any.
     pub(crate) fn change(&mut self, change: impl FnOnce(&mut T)) {
         if let Some(state) = self.get_mut() {
             change(state);

@@ -1,9 +1,8 @@
-//! Copying bytes without a panic: the slices' own methods panic when lengths differ, and the optimiser does not always
-//! see that they agree.
+//! Byte operations that cannot panic: those of slices panic if lengths differ, and the optimiser cannot always exclude that.
 
 use core::ops::Range;
 
-/// Copies slices of equal length; does nothing for others.
+/// Copies slices of equal length; does nothing if the lengths differ.
 #[inline]
 pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
     if from.len() == to.len() {
@@ -11,7 +10,7 @@ pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
     }
 }
 
-/// Whether two names are equal, compared word by word: the `memcmp` of boards compares byte by byte.
+/// Whether two names are equal. Compares words: the `memcmp` of boards compares bytes.
 pub(crate) fn are_same(one: &[u8], other: &[u8]) -> bool {
     let ((words, rest), (other_words, other_rest)) = (one.as_chunks::<4>(), other.as_chunks::<4>());
     let same = |(one, other): (&[u8; 4], &[u8; 4])| u32::from_ne_bytes(*one) == u32::from_ne_bytes(*other);
@@ -29,20 +28,20 @@ pub(crate) fn as_text(bytes: &[u8]) -> Option<&str> {
     text.ok()
 }
 
-/// Whether the bytes are UTF-8, with a fast path for ASCII. Inlined, its loop would have too few registers.
+/// Whether the bytes are UTF-8, with a fast path for ASCII. Not inlined, because its loop would run out of registers.
 #[inline(never)]
 pub(crate) fn is_text(bytes: &[u8]) -> bool {
     (cfg!(not(feature = "simd")) && bytes.is_ascii()) || as_text(bytes).is_some()
 }
 
-/// Moves the bytes of `range` to the front; does nothing for a range that is not inside.
+/// Moves the bytes of `range` to the front; does nothing if the range is out of bounds.
 pub(crate) fn move_down(bytes: &mut [u8], range: Range<usize>) {
     if range.start <= range.end && range.end <= bytes.len() {
         bytes.copy_within(range, 0);
     }
 }
 
-/// Moves the last `count` bytes to the front, behind each other as they were; does nothing if there are fewer.
+/// Moves the last `count` bytes to the front, in order; does nothing if there are fewer.
 pub(crate) fn rotate_up(bytes: &mut [u8], count: usize) {
     let Some((front, back)) = bytes.len().checked_sub(count).and_then(|at| bytes.split_at_mut_checked(at)) else {
         return;

@@ -1,11 +1,11 @@
-//! Every limit of CARA in one place: what can be set while running ([`Constraints`]) and what is fixed when compiling.
+//! Every limit of CARA in one place: those that can be set while running ([`Constraints`]) and those fixed at compile time.
 
 use core::fmt;
 
 use crate::time::Duration;
 
-/// The versions of the protocol that this unit speaks, told in every hello and who-has. Two units use the highest one
-/// that both speak, and refuse each other where there is none.
+/// The protocol versions that this unit speaks, announced in every hello and who-has. Two units use the highest common version,
+/// and refuse each other if there is none.
 pub const VERSIONS: Versions = Versions { first: 2, last: 2 };
 /// First four bytes of every datagram and hello in plain mode. Secured mode has its own, so the two never meet.
 pub const PLAIN_MAGIC: [u8; 4] = *b"CARp";
@@ -22,22 +22,22 @@ pub const NODE_NAME_BYTES: usize = 32;
 pub const NAME_BYTES: usize = 32;
 /// Most variables in one `Parameters`, and in the arguments or results of one function. Costs 16 bytes each per `Parameters`.
 pub const VARIABLES: usize = 16;
-/// Longest text of a failure, in bytes; a longer one is cut. Costs so many bytes for each failure that is made or taken.
+/// Longest text of a failure, in bytes; a longer one is cut. Each failure that is made or received costs this much.
 pub const FAILURE_TEXT_BYTES: usize = 96;
-/// Names and values of one failure, in bytes; what does not fit is refused as [`ParametersBytes`](crate::error::Limit::ParametersBytes).
+/// Capacity for names and values of one failure, in bytes; beyond it [`ParametersBytes`](crate::error::Limit::ParametersBytes).
 pub const FAILURE_VALUES_BYTES: usize = 256;
-/// Progress of the calls of one peer is sent at most this often, so that a handler that publishes all the time fills no network.
+/// Least interval between progress messages to one peer, so that a handler that reports continuously cannot flood the network.
 pub const PROGRESS_INTERVAL: Duration = Duration::from_millis(10);
 /// Longest encoded signature (name, arguments and results of one function), in bytes: 384, or 1,024 for units that have
 /// lists and records. Stored as long as it is.
 pub const SIGNATURE_BYTES: usize = if crate::ability::NESTED { 1024 } else { 384 };
-/// Longest line of help on a function, in bytes; a longer one is cut. Stored as long as it is, with the signature.
+/// Longest line of help on a function, in bytes; a longer one is cut. Stored with the signature, as long as it is.
 pub const HELP_BYTES: usize = 160;
-/// Longest unit of a variable, in bytes; a longer one is cut. Stored as long as it is, with the signature.
+/// Longest unit of a variable, in bytes; a longer one is cut. Stored with the signature, as long as it is.
 pub const UNIT_BYTES: usize = 16;
-/// Most lists and records inside each other, the outermost included. Costs 32 bytes of stack each while a block is checked.
+/// Deepest nesting of lists and records, the outermost included. Each level costs 32 bytes of stack while a block is checked.
 pub const DEPTH: usize = 4;
-/// Bytes of the values and names in a `Parameters` whose size is not given.
+/// Default capacity for names and values in a `Parameters`, in bytes.
 pub const PARAMETERS_BYTES: usize = 512;
 
 /// Longest frame body that the protocol allows, in bytes; a peer may advertise less. Bounds how long an emergency waits
@@ -45,100 +45,100 @@ pub const PARAMETERS_BYTES: usize = 512;
 pub const CHUNK_BYTES: usize = 4096;
 /// Shortest chunk that a unit may advertise as its limit: an emergency must fit into one.
 pub const MINIMUM_CHUNK_BYTES: usize = 320;
-/// Longest emergency message, in bytes: fits one chunk and one datagram. Each link reserves room for one.
+/// Longest emergency message, in bytes: fits one chunk and one datagram. Each link reserves capacity for one.
 pub const EMERGENCY_BYTES: usize = 256;
-/// Calls of emergency services, or of those that stop, that may be in flight to a peer when its table of calls is full; one
-/// more is refused as [`Calls`](crate::error::Limit::Calls). Costs 24 bytes each per link.
+/// Calls of emergency or stop functions that may be in flight to a peer when its table of calls is full; beyond it
+/// [`Calls`](crate::error::Limit::Calls). Each costs 24 bytes per link.
 pub const EMERGENCY_CALLS: usize = 8;
 /// Longest message of best-effort delivery, in bytes: one UDP datagram that is not fragmented on Ethernet.
 pub const DATAGRAM_BYTES: usize = 1400;
-/// The buffer that each link owns: partial frames and handshakes up to this length need no buffer of the pool.
+/// Capacity of each link's own buffer: partial frames and handshakes up to this length need no buffer of the pool.
 pub const LINK_BUFFER_BYTES: usize = 512;
 
-/// Longest frame on a serial line, delimiters included: what an emergency waits for at most, 67 ms at 19,200 baud.
+/// Longest frame on a serial line, delimiters included: the longest wait of an emergency, 67 ms at 19,200 baud.
 pub const LINE_FRAME_BYTES: usize = 128;
-/// Longest datagram on a serial line, as long as the longest search. A longer one is refused, and counted. Costs a line four times as much.
+/// Longest datagram on a serial line, as long as the longest search; a longer one is refused and counted. Costs four times this.
 pub const LINE_DATAGRAM_BYTES: usize = 512;
-/// Frames of a serial line's stream that may be unacknowledged; a power of two. Costs a line 232 bytes each.
+/// Unacknowledged frames of a serial line's stream; a power of two. Each costs 232 bytes per line.
 pub const LINE_WINDOW: u8 = 4;
-/// How long a serial line's stream may go unanswered before it ends. An idle one is watched by keep-alives alone.
+/// How long a serial line's stream may go without an acknowledgement before it ends. If idle, only keep-alives watch it.
 pub const LINE_LOST: Duration = Duration::from_secs(4);
 
-/// Managers whose highest claim a unit keeps. Costs 104 bytes each on a board; that of a further one is not kept, which is counted.
+/// Managers whose highest claim a unit stores. Each costs 104 bytes on a board; claims of further managers are counted only.
 pub const OBEYED_MANAGERS: usize = 4;
 
-/// Leases that one peer may hold here, and this unit at one peer. Costs 32 bytes each per link.
+/// Leases that one peer may hold here, and this unit at one peer. Each costs 32 bytes per link.
 pub const LEASES: usize = 4;
 
-/// Ids behind the newest one that the at-most-once window of a priority remembers.
+/// How many ids behind the newest the at-most-once window of a priority remembers.
 pub const WINDOW: u32 = 64;
-/// How long a unit waits on a new link for the peer's hello, and in secured mode for the whole proof, before it closes it.
+/// How long a new link may take until the peer's hello, and in secured mode its proof; then it is closed.
 pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
-/// A secured link is rekeyed, in a new handshake, before its keys reach this age. Up to an eighth less, by chance, so
-/// that a fleet that joined at once does not do it at once.
+/// Age by which a secured link is rekeyed in a new handshake: at random up to an eighth earlier, so that a fleet that joined
+/// together does not rekey together.
 pub const HANDSHAKE_LIFE: Duration = Duration::from_secs(12 * 3_600);
-/// The least time from one handshake of a link to the next.
+/// Least time between two handshakes of a link.
 pub const SHORTEST_HANDSHAKE_LIFE: Duration = Duration::from_secs(1);
-/// How long a peer that is heard may take for its part of a new handshake on a live link before the link is given up.
+/// How long a peer that is alive may take for its part of a new handshake on a live link; then the link ends.
 pub const RENEWAL_TIMEOUT: Duration = Duration::from_secs(60);
 /// Datagrams under the previous key are accepted for this long after the first one under the new key.
 pub const PREVIOUS_KEY_LIFE: Duration = Duration::from_secs(5);
-/// How long an old link may take to answer the challenge that tells a restarted peer from a duplicate one.
+/// How long an old link has to answer the challenge that distinguishes a restarted peer from a duplicate.
 pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
-/// Shortest pause between two keep-alives.
+/// Shortest keep-alive interval.
 pub const SHORTEST_KEEP_ALIVE: Duration = Duration::from_millis(1);
-/// Longest pause between two keep-alives. A unit refuses a longer one of its own. A longer one that a peer advertises
-/// is taken as this, so that a vanished peer is lost after 210 s at most.
+/// Longest keep-alive interval. A unit refuses a longer one of its own, and limits a peer's to this, so that a vanished peer is
+/// lost after 210 s at most.
 pub const LONGEST_KEEP_ALIVE: Duration = Duration::from_secs(60);
-/// Keep-alives that may be missed in a row.
+/// How many keep-alives in a row may be missed.
 pub const MISSED_KEEP_ALIVES: u8 = 3;
-/// Where only the stream passes, no peer is lost earlier than this, however short its keep-alives: retransmissions after one lost
-/// segment take as long.
+/// If only the stream passes, no peer is lost earlier than this, however short its keep-alives: retransmission after one lost
+/// segment takes that long.
 pub const STREAM_ONLY_LOSS: Duration = Duration::from_secs(3);
-/// A stream into which nothing was written for this long is probed.
+/// A stream without writes for this long is probed.
 pub const PROBE: Duration = Duration::from_secs(4);
-/// A stream is dead when what was written does not reach the peer, and nothing else does, for this long.
+/// A stream is dead if bytes written do not reach the peer, and nothing arrives from it, for this long.
 pub const STREAM_DEAD: Duration = Duration::from_secs(8);
-/// And in this direction alone, while the other one gets on.
+/// A stream is dead if only this direction makes no progress for this long.
 pub const ONE_WAY_DEAD: Duration = Duration::from_secs(16);
-/// Both where a keep-alive was missed within the last minute: on a path that loses a tenth of all frames, a stack that resends after
-/// 1, 3, 7 and 15 s is stuck for more than 8 s every few hours.
+/// Replaces both limits if a keep-alive was missed within the last minute: on a path that loses a tenth of all frames, a TCP that
+/// retransmits after 1, 3, 7 and 15 s is stuck for more than 8 s every few hours.
 pub const LOSSY_DEAD: Duration = Duration::from_secs(60);
-/// The maximum segment size with which a stream is dialled again that died with more than this outstanding: the least that every
-/// IPv4 host takes (RFC 9293, section 3.7.1).
+/// The maximum segment size for dialling again after a stream died with more than this outstanding: the least that every IPv4
+/// host accepts (RFC 9293, section 3.7.1).
 pub const SHORT_SEGMENT: u16 = 536;
 /// One-way messages written this soon after the last write are gathered.
 pub const GATHER: Duration = Duration::from_micros(50);
-/// First back-off between two searches; doubles up to [`LONGEST_SEARCH`], each with full jitter on top.
+/// First back-off between searches; doubles up to [`LONGEST_SEARCH`], each with full jitter on top.
 pub const FIRST_SEARCH: Duration = Duration::from_millis(250);
-/// Longest back-off between two searches.
+/// Longest back-off between searches.
 pub const LONGEST_SEARCH: Duration = Duration::from_secs(8);
-/// Searches per [`SEARCH_WINDOW`] on a network, own and heard, above which a unit defers its own.
+/// Searches per [`SEARCH_WINDOW`] on a network, own and others', above which a unit defers its own.
 pub const SEARCH_BUDGET: u8 = 4;
 /// The window of [`SEARCH_BUDGET`].
 pub const SEARCH_WINDOW: Duration = Duration::from_secs(1);
-/// An answer to a broadcast is delayed at random by up to this much per node that is expected to answer as well.
+/// An answer to a broadcast is delayed at random by up to this much for each node that is expected to answer.
 pub const ANSWER_SPREAD: Duration = Duration::from_millis(1);
 
-/// Versions of the protocol, from the first to the last.
+/// A range of protocol versions.
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Versions {
-    /// The lowest one.
+    /// The lowest.
     pub first: u8,
-    /// The highest one.
+    /// The highest.
     pub last: u8,
 }
 
 impl Versions {
-    /// The highest version that is among both.
+    /// The highest version in both ranges.
     pub const fn common(self, other: Self) -> Option<u8> {
         let first = if self.first > other.first { self.first } else { other.first };
         let last = if self.last < other.last { self.last } else { other.last };
         if first <= last { Some(last) } else { None }
     }
 
-    /// Of the two bytes on the wire. Version 1 has something else where the last version is now.
+    /// Decodes the two bytes on the wire. In version 1 the second byte has another meaning.
     pub(crate) const fn from_wire(first: u8, last: u8) -> Self {
         Self { first, last: if first <= 1 || last < first { first } else { last } }
     }
@@ -152,30 +152,30 @@ impl fmt::Display for Versions {
     }
 }
 
-/// What can be set by hand (paper, section 2), before the start and while running. Peers are told what concerns them.
+/// What can be set (paper, section 2), before the start and while running. Peers are notified of what concerns them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Constraints {
-    /// Default time-out of blocking and asynchronous requests.
+    /// Default time-out of requests.
     pub request_timeout: Duration,
-    /// Least time between two requests to one node; zero switches the limit off. The callee enforces its own as well.
+    /// Least time between two requests to one node; zero switches the limit off. The callee enforces its own, too.
     pub minimum_interval: Duration,
-    /// Most nodes connected at a time; the next one is refused with `Full`.
+    /// Most nodes connected at a time; the next is refused with `Full`.
     pub maximum_nodes: u16,
-    /// Longest message received, in bytes of its block of parameters; told to peers, which refuse to send a longer one.
+    /// Longest message received, in bytes of its block of parameters; peers know it and send no longer one.
     pub message_size: u32,
-    /// Longest chunk received, in bytes; told to peers.
+    /// Longest chunk received, in bytes; peers know it.
     pub chunk_size: u16,
-    /// Pause between two keep-alives: [`SHORTEST_KEEP_ALIVE`] to [`LONGEST_KEEP_ALIVE`].
+    /// Keep-alive interval: [`SHORTEST_KEEP_ALIVE`] to [`LONGEST_KEEP_ALIVE`].
     pub keep_alive: Duration,
-    /// Calls that one peer may have waiting or running here; the next one is answered with `Busy`.
+    /// Calls of one peer that may wait or run here; the next is refused with `Busy`.
     pub calls_per_peer: u16,
-    /// Which of a peer's calls that wait here and move nothing begins next, within a class.
+    /// Which of a peer's waiting calls of one class begins next, if they move nothing.
     pub scheduling: Scheduling,
-    /// How long orders of a manager go on once another one of its identity, with a higher claim, wants to command.
+    /// How long orders of a manager may continue once another of its identity, with a higher claim, wants to command.
     pub handover: Duration,
-    /// Streams of this unit that one peer may be subscribed to; the next subscription is refused.
+    /// Streams of this unit that one peer may subscribe to; the next is refused.
     pub subscriptions_per_peer: u16,
-    /// Bytes of values of streams that one peer is sent in a second; what is above comes later, and is newer then.
+    /// Bytes of stream values that one peer is sent in a second; beyond it values are sent later, and newer.
     pub stream_bytes: u32,
 }
 
@@ -210,20 +210,20 @@ impl Constraints {
     };
 }
 
-/// Which of the calls that wait begins next. Calls that move, stop or reset something keep their order in each and are never refused
-/// for their deadlines, and of equal time-outs the call that came first is first in each.
+/// Which waiting call begins next. In all variants, calls that move, stop or reset something keep their order and are never
+/// refused for their deadlines, and calls with equal time-outs keep their order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Scheduling {
-    /// The one with the earliest deadline, but one that has waited half its time-out before all others. Where no more calls may
-    /// wait, the one with the latest deadline is refused.
+    /// The call with the earliest deadline, but one that has waited half of its time-out first of all. If no more may wait, the
+    /// call with the latest deadline is refused.
     #[default]
     EarliestDeadline,
-    /// The one that came first. Where no more calls may wait, the one that comes is refused.
+    /// The call that arrived first. If no more may wait, the new one is refused.
     Fifo,
-    /// As [`EarliestDeadline`](Self::EarliestDeadline), and a call is refused as [`Busy`](crate::error::Error::Busy), when it comes
-    /// or when its turn comes, if its function has lately taken longer on average than it has left. The averages of the eight functions that ran last are kept. On a
-    /// board with the feature `admission`. One a second begins all the
-    /// same, so that a function that was slow once is tried again. So more deadlines are met where more is asked than can be done.
+    /// As [`EarliestDeadline`](Self::EarliestDeadline), but a call is also refused as [`Busy`](crate::error::Error::Busy), on
+    /// arrival or in its turn, if its function has lately taken longer on average than the call has left. Under overload more
+    /// deadlines are met. One call a second begins all the same, so that a function that was slow is tried again. Averages are
+    /// kept for the eight functions that ran last. On boards with the feature `admission`.
     Admission,
 }
 
@@ -231,7 +231,7 @@ impl Scheduling {
     /// All of them.
     pub const ALL: [Self; 3] = [Self::EarliestDeadline, Self::Fifo, Self::Admission];
 
-    /// As people and files write it: `deadline`, `fifo` or `admission`.
+    /// The word in texts and files: `deadline`, `fifo` or `admission`.
     pub const fn word(self) -> &'static str {
         match self {
             Self::EarliestDeadline => "deadline",
@@ -241,17 +241,17 @@ impl Scheduling {
     }
 }
 
-/// Whether units prove their identity and seal their frames. Units of different modes never connect.
+/// Whether units authenticate each other and encrypt frames. Units of different modes never connect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Mode {
-    /// Frames are in clear, and every claimed identity is accepted.
+    /// Nothing is encrypted, and every claimed identity is accepted.
     Plain,
-    /// A peer is accepted only with a proof of the pair's key; frames are sealed.
+    /// A peer is accepted only if it proves the pair's key; frames are encrypted and authenticated.
     Secured,
 }
 
 impl Mode {
-    /// As people and files write it: `plain` or `secured`.
+    /// The word in texts and files: `plain` or `secured`.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Plain => "plain",
@@ -267,7 +267,7 @@ impl Mode {
         }
     }
 
-    /// The mode of these first four bytes.
+    /// The mode with this magic.
     pub const fn of_magic(magic: [u8; 4]) -> Option<Self> {
         match magic {
             PLAIN_MAGIC => Some(Self::Plain),
@@ -276,7 +276,7 @@ impl Mode {
         }
     }
 
-    /// Cipher suites that a unit of this mode has, a bit each: bit 0 is `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`.
+    /// The cipher suites of a unit in this mode, a bit each: bit 0 is `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`.
     pub const fn suites(self) -> u16 {
         match self {
             Self::Plain => 0,
@@ -293,7 +293,7 @@ impl Mode {
     }
 }
 
-/// Class of a request. An emergency goes between the chunks of other messages, ignores the minimum interval and has
+/// Priority class of a request. An emergency is sent between the chunks of other messages, ignores the minimum interval and has
 /// reserved capacity everywhere; the other classes take turns between messages, highest first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]

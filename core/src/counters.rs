@@ -54,7 +54,7 @@ impl<C: Counter, const N: usize> Counters<C, N> {
         C::ALL.iter().take(N).map(|&counter| (counter.name(), self.value(counter)))
     }
 
-    /// Adds the values of `other`, as when links are summed up.
+    /// Adds the values of `other`, to sum up links.
     pub fn merge(&mut self, other: &Self) {
         for (value, more) in self.values.iter_mut().zip(&other.values) {
             *value = value.saturating_add(*more);
@@ -74,7 +74,7 @@ impl<C: Counter, const N: usize> fmt::Debug for Counters<C, N> {
     }
 }
 
-/// Declares an enum of counters, and how many of them there are: `counters! { /// doc  pub enum Name[COUNT] { /// doc  Variant, … } }`.
+/// Declares an enum of counters and their number: `counters! { /// doc  pub enum Name[COUNT] { /// doc  Variant, … } }`.
 macro_rules! counters {
     ($(#[$meta:meta])* pub enum $name:ident[$count:expr] {
         $(#[doc = $help:literal] $variant:ident,)+
@@ -84,7 +84,7 @@ macro_rules! counters {
         pub enum $name { $(#[doc = $help] $variant,)+ }
 
         impl $name {
-            /// How many there are in this build, the first ones of all.
+            /// How many of them this build has: the first ones.
             pub const COUNT: usize = $count;
         }
 

@@ -1,25 +1,25 @@
-//! Everything that can go wrong, sorted by where the remedy lies. Small, `Copy`, and each text says what to do.
+//! Everything that can go wrong, sorted by who has to act. Errors are small and `Copy`; each text says what to do.
 
 use core::fmt;
 
 use crate::config::{VERSIONS, Versions};
 use crate::time::Duration;
 
-/// Where the remedy of an [`Error`] lies. There are these four and no others, so a `match` on it needs no other arm.
+/// Who has to act on an [`Error`]. Complete: a `match` needs no other arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Cause {
     /// The program or its configuration must change; trying again does not help.
     Configuration,
     /// The other unit refused, failed or went away.
     Peer,
-    /// A limit was reached; it passes, or the limit can be raised.
+    /// A limit was reached: wait, or raise the limit.
     Resource,
-    /// The network below failed.
+    /// The network failed.
     Transport,
 }
 
-/// A limit of [`crate::config`] or of the storage that the port lent. The text says which setting raises it; `Capacities`
-/// are those of the Linux port, on a board they are the lengths of the lent slices.
+/// A limit of [`crate::config`] or of the memory that the port lent. The text names the setting that raises it; `Capacities` are
+/// those of the Linux port, on a board they are the lengths of the lent slices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
 #[non_exhaustive]
@@ -39,7 +39,7 @@ pub enum Limit {
     /// The pool of message buffers.
     #[error("every message buffer is in use: try again later, or raise Capacities::message_buffers")]
     Buffers = 4,
-    /// Messages that wait to be written to one peer.
+    /// Messages that are queued for one peer.
     #[error("the peer reads more slowly than this unit sends: try again later, send less, or raise message_size here")]
     SendQueue = 5,
     /// The table of functions.
@@ -68,12 +68,12 @@ pub enum Limit {
     /// The peer's `Constraints::subscriptions_per_peer`.
     #[error("the peer lets this unit subscribe to no more streams: end one, or raise subscriptions_per_peer there")]
     Subscriptions = 13,
-    /// Lists and records inside each other.
+    /// Nesting of lists and records.
     #[error("lists and records are at most 4 deep in each other: make the inner ones arguments of their own")]
     Depth = 14,
 }
 
-/// A constraint for which a unit may have too little memory.
+/// A constraint that needs more memory than a unit may have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum Constraint {
@@ -86,7 +86,7 @@ pub enum Constraint {
 }
 
 impl Constraint {
-    /// The constraint, and the limit of the memory that it needs.
+    /// The constraint, and the limit that bounds it.
     pub const fn needs(self) -> &'static str {
         match self {
             Self::MaximumNodes => "maximum_nodes needs links",
@@ -96,18 +96,18 @@ impl Constraint {
     }
 }
 
-/// Why a unit refuses a link; sent to the other end.
+/// Why a unit refuses a link; sent to the peer.
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// The two have no version of the protocol in common; the peer speaks these.
+    /// The two have no common protocol version; the peer speaks these.
     #[error("the peer speaks version {0} of the protocol, and this unit {VERSIONS}: update one of the two")]
     Version(Versions),
     /// The two belong to different fleets.
     #[error("the peer belongs to another fleet: set the same fleet on both")]
     Fleet,
-    /// An s_unit of another manager.
+    /// The s_unit belongs to another manager.
     #[error("the s_unit belongs to another manager: check the manager's name and id set in it")]
     WrongManager,
     /// `Constraints::maximum_nodes` is reached.
@@ -119,13 +119,13 @@ pub enum Refusal {
     /// Both ends are s_units.
     #[error("the two roles cannot be joined: make one of them an m_unit, which s_units join")]
     Role,
-    /// The peers are connected already.
+    /// The two are already connected.
     #[error("the two nodes are connected already by another link: nothing need be done")]
     AlreadyConnected,
-    /// The hello could not be read.
+    /// The hello could not be decoded.
     #[error("the peer's hello could not be read: is it a CARA unit?")]
     Malformed,
-    /// One of the two is plain, and the other one secured.
+    /// One of the two is in plain mode, the other in secured mode.
     #[error("one of the two units is plain and the other one secured: give both keys, or start both in plain mode")]
     Mode,
     /// There is no key for these two units.
@@ -133,18 +133,18 @@ pub enum Refusal {
         "there is no key for this pair of units: one was revoked, or never added; if that is on purpose, do nothing"
     )]
     NoKey,
-    /// The two have no cipher suite in common.
+    /// The two have no common cipher suite.
     #[error("the two units have no cipher suite in common: update one of the two")]
     Suite,
-    /// The vehicle has obeyed a higher claim of another manager of the same identity.
+    /// The vehicle obeys a higher claim of another manager of the same identity.
     #[error(
         "the vehicle is under another manager of this name and id: find out which of the two is to command; `--take-over` brings the vehicle here"
     )]
     Fenced,
-    /// The vehicle has an order of another manager of the same identity, and joins this one afterwards.
+    /// The vehicle has an order of another manager of the same identity, and will join this one when that ends.
     #[error("the vehicle has an order of another manager of this name and id: it joins when that has ended")]
     Driving,
-    /// The manager stands by.
+    /// The manager is a standby.
     #[error("the manager stands by: another one of this name and id commands, and the link goes there")]
     Standby,
 }
@@ -170,8 +170,7 @@ impl Refusal {
         }
     }
 
-    /// The refusal of a byte on the wire. A unit that speaks other versions has told them in its hello before; only version
-    /// 1 did not.
+    /// Decodes the byte on the wire. A peer of other versions has sent them in its hello before; only version 1 did not.
     pub(crate) const fn from_wire(code: u8) -> Self {
         match code {
             1 => Self::Version(Versions { first: 1, last: 1 }),
@@ -198,25 +197,25 @@ impl Refusal {
 #[repr(u8)]
 #[non_exhaustive]
 pub enum CloseReason {
-    /// The other unit was stopped in an orderly way.
+    /// The peer was stopped in an orderly way.
     #[error("the peer was stopped: start it again if it is wanted")]
     Stopped = 1,
-    /// The connection was reset or closed below.
+    /// The connection was reset or closed by the transport.
     #[error("the connection was closed below: the peer's process ended, or the network reset it; it is opened again")]
     Reset = 2,
-    /// Nothing was heard for the time of three keep-alives.
+    /// Nothing was received for three keep-alives.
     #[error("nothing was heard from the peer: check power, cable and manager")]
     Silent = 3,
-    /// The same identity came back with a new boot epoch.
+    /// The same identity has returned with a new boot epoch.
     #[error("the peer restarted: it is connected again, repeat the request")]
     PeerRestarted = 4,
-    /// The other end broke the protocol.
+    /// The peer violated the protocol.
     #[error("the peer broke the protocol: check its version")]
     Protocol = 5,
-    /// A frame or message above the limit that this unit advertises.
+    /// A frame or message exceeded the limit that this unit advertises.
     #[error("the peer sent more than the limit that it was told: check its version, or raise message_size here")]
     Oversize = 6,
-    /// No hello came in time, or no proof behind it.
+    /// No hello, or no proof after it, came in time.
     #[error("no hello or no proof came in time: the other end is silent, or no CARA unit of this mode")]
     HelloTimeout = 7,
     /// One of the two units refused the link.
@@ -225,60 +224,60 @@ pub enum CloseReason {
     /// The connection could not be opened.
     #[error("the connection could not be opened: is the peer's port reachable?")]
     DialFailed = 9,
-    /// Request ids ran out, or keys that are not renewed; the pair connects again.
+    /// Request ids ran out, or keys that are not renewed; the link is opened anew.
     #[error("request ids or keys ran out: the link is opened again, repeat the request")]
     Exhausted = 10,
-    /// The other end ended the link before it had proven its identity, so the reason it gave is ignored.
+    /// The peer ended the link before it had proven its identity, so its reason is not believed.
     #[error("the other end left before it proved its identity: has it the key of this pair, and the same version?")]
     Unproven = 11,
-    /// The other end has another key for this pair, or a message was changed on its way.
+    /// The peer has another key for this pair, or a message was changed in transit.
     #[error(
         "the two have different keys for this pair, or what they sent was changed: compare their fingerprints; if one was revoked on purpose, do nothing"
     )]
     BadProof = 12,
-    /// This unit was stopped in an orderly way. Its peer is told [`Stopped`](Self::Stopped).
+    /// This unit was stopped in an orderly way. Its peer gets [`Stopped`](Self::Stopped).
     #[error("this unit was stopped")]
     StoppedHere = 13,
-    /// The stream brought nothing to one of the ends for 8 s, while the peer was heard and did not hold reading back.
+    /// The stream brought nothing to one of the ends for 8 s, while the peer was alive and did not hold back reading.
     #[error(
         "the stream is dead though the peer is heard: {}; it is opened again",
         if *.long { "look for a part of the path that drops long packets (its MTU)" }
         else { "look for a firewall or a NAT that forgets or drops TCP sessions" }
     )]
     StreamDead {
-        /// More than one segment of 536 bytes was outstanding: the stream is dialled again with segments of that size.
+        /// More than one segment of 536 bytes was outstanding: the link is dialled again with segments of that size.
         long: bool,
     } = 14,
 }
 
-/// What a handler returns instead of results. With the feature `details`, `Failure` adds a text and values.
+/// What a handler returns instead of results. With the feature `details`, a `Failure` adds text and values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum ServiceError {
-    /// The service failed with a code of its own.
+    /// The service failed with its own code.
     #[error("the service failed with code {0}: see the peer's documentation for its meaning")]
     Failed(u16),
-    /// The handler panicked; the unit runs on.
+    /// The handler panicked; the unit continues.
     #[error("the service's handler panicked: see the peer's log")]
     Panicked,
-    /// The service refuses now.
+    /// The service cannot do its work now.
     #[error("the service is not ready: try again later")]
     NotReady,
-    /// The handler set results that the signature does not hold.
+    /// The handler set results that do not match the signature.
     #[error("the service's results do not match its published signature: correct its handler")]
     BadResults,
 }
 
-/// The part of a signature in which a variable stands.
+/// The part of a signature that declares a variable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Part {
-    /// What a caller passes.
+    /// The arguments.
     Argument,
-    /// What it gets back.
+    /// The results.
     Result,
-    /// What it gets while the call runs.
+    /// The progress of running calls.
     Progress,
-    /// What it gets with a failure.
+    /// The values of failures.
     Failure,
 }
 
@@ -295,7 +294,7 @@ impl fmt::Display for Part {
 
 /// An error of any operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
-// A wide tag: the rest is then moved in words, and not byte by byte.
+// A 32-bit tag lets the compiler copy errors by words instead of bytes.
 #[repr(u32)]
 #[non_exhaustive]
 pub enum Error {
@@ -305,25 +304,25 @@ pub enum Error {
         "the peer has not published this function to this unit: check the name against its list, and publish it there"
     )]
     UnknownFunction,
-    /// The peer's function is of another version than this program's interface; nothing was sent.
+    /// The peer's version of the function differs from this program's interface; nothing was sent.
     #[error("the peer's function is of another version: its {0} differs: update one of the two")]
     Mismatch(Part),
-    /// The function was removed or changed since its list was read; the news follows.
+    /// The function was removed or changed since its list was received; the new list follows.
     #[error("the function was removed or changed: look at the new list and call again")]
     StaleFunction,
-    /// Argument number `index` of the signature is not among the parameters.
+    /// Argument `index` of the signature is not among the parameters.
     #[error("argument {index} of the signature is missing: add it by its name")]
     MissingArgument {
         /// Position in the signature, from 0.
         index: u8,
     },
-    /// A variable has another type than asked for.
+    /// A variable has another type than the one requested.
     #[error("variable {index} has another type than is asked for: use the type of the signature")]
     WrongType {
         /// Position in the signature (or table), from 0.
         index: u8,
     },
-    /// A variable has another size than asked for.
+    /// A variable has another size than the one requested.
     #[error("variable {index} has size {found}, and {expected} is needed: give it that size")]
     WrongSize {
         /// Position in the signature (or table), from 0.
@@ -339,8 +338,8 @@ pub enum Error {
     /// A variable, function or node of this name exists already.
     #[error("the name is taken already: choose another, or replace what has it")]
     NameTaken,
-    /// A name of a function or variable is empty or holds other characters than letters, digits, `_`, `-`, `.`, `/`; or a
-    /// name of a node is empty, longer than 32 bytes, or holds control characters.
+    /// A function's or variable's name is empty or has other characters than letters, digits, `_`, `-`, `.`, `/`; or a node's
+    /// name is empty, longer than 32 bytes, or has control characters.
     #[error("a name has letters, digits, '_', '-', '.' or '/'; a node's has 1 to 32 bytes and no control characters")]
     BadName,
     /// Several nodes have this name; `ids` are those of two of them.
@@ -351,10 +350,10 @@ pub enum Error {
         /// The ID numbers of two of the nodes.
         ids: [u32; 2],
     },
-    /// A number does not fit the Rust type that it was asked as, or the variable that it is put into.
+    /// A number does not fit the Rust type that it is read as, or the variable that it is written to.
     #[error("the number does not fit the type it was asked as: use a wider one")]
     OutOfRange,
-    /// The caller's parameters cannot hold the result.
+    /// The caller's parameters cannot hold the results.
     #[error("the result needs {need} bytes, and the parameters have room for {have}: make them larger")]
     ResultWouldNotFit {
         /// Bytes that the result needs.
@@ -362,7 +361,7 @@ pub enum Error {
         /// Bytes that are free.
         have: u32,
     },
-    /// The message is longer than the receiver allows, or than the sender's own buffers are.
+    /// The message is longer than the receiver accepts, or than the sender's buffers.
     #[error(
         "the message is longer than the {limit} bytes that one of the two units holds: send less, or raise its message_size"
     )]
@@ -373,7 +372,7 @@ pub enum Error {
     /// A blocking request that would wait for itself.
     #[error("the request would wait for itself: answer first, or request without blocking")]
     WouldDeadlock,
-    /// A constraint outside what its type or the lent storage allows.
+    /// A constraint is outside of what its type or the lent memory allows.
     #[error("a constraint or option is outside what this unit can do: compare it with the bounds in its documentation")]
     BadConstraint,
     /// A constraint needs more memory than the unit has.
@@ -386,10 +385,10 @@ pub enum Error {
         /// The limit that there is.
         have: u32,
     },
-    /// The heart that a call names beats too slowly: the function's lease may end between two beats.
+    /// The heart that a call names beats too slowly: the function's lease could end between two beats.
     #[error("the heart beats every {have} ms, and the function's lease needs it every {need} ms: let it beat as often")]
     SlowHeart {
-        /// Twice within the lease, in milliseconds.
+        /// Half of the lease in milliseconds, the longest period allowed.
         need: u32,
         /// The heart's period in milliseconds.
         have: u32,
@@ -409,33 +408,33 @@ pub enum Error {
         "no answer came in time, and the service may have run: ask for its state, or wait longer (request_timeout)"
     )]
     TimedOut,
-    /// The call was given up here; the service may have run.
+    /// The caller gave the call up; the service may have run.
     #[error("the call was given up here, and the service may have run: ask for its state")]
     Cancelled,
     /// The link ended while the call was in flight; the service may have run.
     #[error("the link ended during the call, and the service may have run: ask for its state when the peer is back")]
     Interrupted,
-    /// The callee found the request older than its remaining time and did not run it.
+    /// The request's remaining time was over when the callee received it; it was not run.
     #[error("the request arrived too late and was not run: ask again, or allow more time")]
     Expired,
-    /// The callee saw this id, or a much newer one, before and did not run it again.
+    /// The callee has seen this id, or a much newer one; it did not run the request again.
     #[error("the request is older than 64 others and was not run: ask again")]
     Stale,
-    /// The service ran, and its results cannot be read: the function was replaced or removed meanwhile, or the reply does
-    /// not fit the published signature.
+    /// The service ran, but its results cannot be read: the function was replaced or removed meanwhile, or the reply does not
+    /// match the published signature.
     #[error("the service ran, and its results are lost: it was replaced meanwhile, or answers other than it publishes")]
     ResultLost,
-    /// The callee holds as many calls of this unit as it may; it did not run it.
+    /// The callee has its limit of this unit's calls; it did not run the request.
     #[error("the peer is busy and did not run the request: try again later")]
     Busy,
-    /// The callee could not read the message; it did not run it.
+    /// The callee could not decode the message; it did not run the request.
     #[error("the peer could not read the request: check its version")]
     Malformed,
-    /// The callee is of an earlier version, which does not know something that the request depends on; it did not run it.
+    /// The callee's version does not know something that the request depends on; it did not run the request.
     #[error("the peer's version does not know what the request asks for: update the peer, or ask without it")]
     Unsupported,
-    /// Another holder moves what the function moves: the unit with this ID number, or an operator of it. A unit's program and
-    /// its operators are two holders. The callee did not run it.
+    /// Another holder has the actuator: the unit with this ID number, or an operator of it. A unit's program and its operators
+    /// are different holders. The callee did not run the request.
     #[error(
         "what this function moves is held by {}unit {by}: wait until it is released, or take it over",
         if *operator { "an operator of " } else { "" }
@@ -443,24 +442,24 @@ pub enum Error {
     Held {
         /// The ID number of the holder.
         by: u32,
-        /// An operator holds it, and not the unit's program.
+        /// An operator holds it, not the unit's program.
         operator: bool,
     },
-    /// What the function moves was stopped, by the unit with this ID number or, with 0, by the callee itself, and has not been
-    /// reset. The callee did not run it.
+    /// The actuator was stopped, by the unit with this ID number or, with 0, by the vehicle itself, and was not reset. The callee
+    /// did not run the request.
     #[error(
         "what it moves was stopped by {}, reason {reason}: look why, then call its function that resets", Stopper(*by)
     )]
     Inhibited {
-        /// The ID number of the unit that stopped it; 0 for the callee itself.
+        /// The ID number of the unit that stopped it; 0 for the vehicle itself.
         by: u32,
-        /// Why, as the callee numbers its reasons; 0 for a function that stops.
+        /// The vehicle's own number of the reason; 0 for a function that stops.
         reason: u16,
     },
-    /// The callee has begun a call that this unit made later and that moves the same thing, so it did not run this one.
+    /// The callee has begun a later call of this unit for the same actuator, so it did not run this one.
     #[error("a later call of this unit has what this function moves: if it is still wanted, call it again")]
     Replaced,
-    /// The callee's rules do not let this unit call the function.
+    /// The callee's access table does not let this unit call the function.
     #[error(
         "the peer's access table does not let this unit call the function: change the table, or ask with another unit"
     )]
@@ -476,7 +475,7 @@ pub enum Error {
     /// A table or queue of this unit is full.
     #[error("no room: {0}")]
     Full(Limit),
-    /// The minimum interval between requests to this node has not passed, or its access table's rate is used up.
+    /// The minimum interval between requests to this node has not passed, or the rate in its access table is used up.
     #[error("too soon after the last request: wait {} us, or lower minimum_interval, or raise the rate in the peer's access table", wait.as_micros())]
     TooSoon {
         /// How long to wait.
@@ -493,23 +492,23 @@ pub enum Error {
     /// Another process owns the port.
     #[error("the port is in use by a program that does not share it: choose another port, or end that program")]
     PortInUse,
-    /// The keys of an m_unit lack its key with itself, with which it makes its claims.
+    /// An m_unit lacks its key with itself, with which it makes its claims.
     #[error(
         "the keys of this m_unit lack its key with itself, without which it can claim no vehicle: provision it anew"
     )]
     NoOwnKey,
-    /// The system does not let this user have the port.
+    /// The system does not let this user open the port.
     #[error(
         "the system does not permit this port: below 1024 it takes root or CAP_NET_BIND_SERVICE; choose another one"
     )]
     PortNotPermitted,
-    /// The unit has been stopped, or cannot be started (again).
+    /// The unit was stopped, or is already running.
     #[error("the unit does not run: it was stopped or runs already; make a new one")]
     NotRunning,
 }
 
 impl Error {
-    /// Whether the service of a call that ended so may have run. `false` is certain.
+    /// Whether the service may have run if its call ended with this error. `false` is certain.
     pub const fn may_have_run(&self) -> bool {
         matches!(
             self,
@@ -526,7 +525,7 @@ impl Error {
         )
     }
 
-    /// Where the remedy lies.
+    /// Who has to act.
     pub const fn cause(&self) -> Cause {
         match self {
             Self::UnknownFunction
@@ -572,7 +571,7 @@ impl Error {
     }
 }
 
-/// What stopped an actuator, by the ID number that it is told with.
+/// Displays who stopped an actuator, by ID number.
 struct Stopper(u32);
 
 impl fmt::Display for Stopper {
@@ -590,9 +589,9 @@ impl From<ServiceError> for Error {
     }
 }
 
-/// So that a service may use `?` on what it does with its parameters and with other units. What it got from another service
-/// goes on to its caller; an error of the service's own program is [`ServiceError::BadResults`], and any other one, as of a
-/// peer that does not answer, [`ServiceError::NotReady`]: the service cannot do its work now.
+/// Lets a service use `?` on operations on its parameters and on calls of other units. An error of the called service is passed
+/// on; a mistake of the service's own program becomes [`ServiceError::BadResults`], and any other error, such as a peer that does
+/// not answer, [`ServiceError::NotReady`]: the service cannot do its work now.
 ///
 /// ```
 /// use cara_core::{ParametersView, ServiceError};

@@ -30,7 +30,7 @@
 //! use cara_core::time::Instant;
 //! use cara_core::{Context, Event, Port, Session};
 //!
-//! /// Does what is due on a link; returns when to come back.
+//! /// Does what is due on a link; returns when to call it again.
 //! fn poll<P: Port>(session: &mut Session<P>, cx: &mut Context<'_, P>) -> Instant {
 //!     while let Some(event) = session.poll(cx) {
 //!         match event {
@@ -42,7 +42,7 @@
 //!     session.deadline()
 //! }
 //!
-//! /// Lends what a stream has brought; returns how much of it was used. The rest is to be lent again.
+//! /// Passes received bytes to a session; returns how many it consumed. Pass the rest again later.
 //! fn read<P: Port>(session: &mut Session<P>, cx: &mut Context<'_, P>, bytes: &mut [u8]) -> usize {
 //!     let receipt = session.receive(cx, bytes, None);
 //!     if let Some(Event::Reply(_call, Ok(results))) = receipt.event {

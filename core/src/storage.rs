@@ -1,22 +1,22 @@
-//! Where tables and buffers live: lent by the port, sized at run time, never a type parameter of the machines.
+//! Where tables and buffers are: lent by the port and sized at run time, so that no size is a type parameter of the machines.
 //!
-//! A state machine names the *kind* of storage (`S: Storage`); how long each slice is, its provider decides: statics on
-//! a board ([`Lent`]), boxed slices on Linux and in the simulator (a type of the port).
+//! A state machine names the *kind* of storage (`S: Storage`); its provider chooses the length of each slice: statics on a board
+//! ([`Lent`]), boxed slices on Linux and in the simulator (a type of the port).
 
 use core::ops::DerefMut;
 
 /// A kind of owned slice. Two exist: [`Lent`] here and boxed slices in ports that have an allocator.
 pub trait Storage: 'static {
-    /// A slice of `T` that its holder owns for good.
+    /// An owned slice of `T`.
     type Slice<T: 'static>: DerefMut<Target = [T]>;
 
-    /// Makes a slice as long as that, with `value`s behind what it holds; changes nothing where there is no allocator.
+    /// Lengthens a slice, filling it up with `value`s; does nothing without an allocator.
     fn lengthen<T: 'static>(slice: &mut Self::Slice<T>, length: usize, value: impl FnMut() -> T) {
         let _ = (slice, length, value);
     }
 }
 
-/// Slices lent for ever, as from a `static` on a board.
+/// Slices lent for `'static`, as from a `static` on a board.
 #[derive(Debug, Clone, Copy)]
 pub enum Lent {}
 
@@ -40,22 +40,22 @@ impl Storage for Boxed {
     }
 }
 
-/// Takes an element out of a list, the last one into its place. The list's own method panics for an index that is not inside.
+/// Removes an element; the last one takes its place. `None` if the index is out of bounds, where the list's own method panics.
 #[inline]
 pub(crate) fn take_at<T, const N: usize>(list: &mut heapless::Vec<T, N>, index: usize) -> Option<T> {
     (index < list.len()).then(|| list.swap_remove(index))
 }
 
-/// A buffer for one whole message, taken from a [`Buffers`] pool and given back to it.
+/// A buffer for one whole message, taken from a [`Buffers`] pool and returned to it.
 pub type Buffer<S> = <S as Storage>::Slice<u8>;
 
 /// The bounded pool of full message buffers that all links of a unit share.
 ///
-/// A port that lends one pool to several threads locks inside.
+/// If several threads share one pool, the port's implementation locks.
 pub trait Buffers<S: Storage> {
-    /// Takes a buffer out of the pool; `None` when all are in use, which the caller counts and reports.
+    /// Takes a buffer; `None` if all are in use, which the caller counts and reports.
     fn take(&mut self) -> Option<Buffer<S>>;
-    /// Gives a buffer back.
+    /// Returns a buffer.
     fn give(&mut self, buffer: Buffer<S>);
     /// Takes a buffer out of the pool if at least `left` others remain in it.
     fn take_leaving(&mut self, left: usize) -> Option<Buffer<S>> {
@@ -76,12 +76,12 @@ pub trait Buffers<S: Storage> {
     }
 }
 
-/// Buffers that messages to be sent leave in the pool: two units that are full of messages to each other still read.
+/// How many buffers sending leaves in the pool: two units that are full of messages to each other can still read.
 pub const LEFT_BY_SENDING: usize = 1;
-/// Buffers that calls leave which wait for their turn: they go on only when answers go out, and those need one.
+/// How many buffers waiting calls leave in the pool: they proceed only when answers are sent, which need one.
 pub const LEFT_BY_WAITING: usize = 2;
 
-/// A pool over lent slots, for one-cell ports.
+/// A pool over lent slots, for single-threaded ports.
 pub struct Pool<S: Storage> {
     slots: S::Slice<Option<Buffer<S>>>,
 }
@@ -90,7 +90,7 @@ impl<S: Storage> Pool<S>
 where
     Buffer<S>: 'static,
 {
-    /// A pool of the buffers in `slots`; an empty slot is room for nothing.
+    /// A pool of the buffers in `slots`; slots may be empty.
     pub fn new(slots: S::Slice<Option<Buffer<S>>>) -> Self {
         Self { slots }
     }

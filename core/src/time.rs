@@ -29,14 +29,14 @@ impl Instant {
         self.0
     }
 
-    /// Time from `earlier` until `self`; zero where `earlier` is the later one.
+    /// Time from `earlier` to `self`; zero if `earlier` is later.
     pub const fn since(self, earlier: Self) -> Duration {
         Duration(self.0.saturating_sub(earlier.0))
     }
 }
 
 impl Duration {
-    /// No time at all.
+    /// Zero.
     pub const ZERO: Self = Self(0);
     /// Longer than any deadline.
     pub const MAX: Self = Self(u64::MAX);
@@ -66,7 +66,7 @@ impl Duration {
         self.0 / 1_000
     }
 
-    /// The span in microseconds as 32 bits, saturating after 71 minutes: the form that travels in a request.
+    /// The span in microseconds as 32 bits, saturating after 71 minutes, as encoded in a request.
     pub const fn as_wire(self) -> u32 {
         if self.0 > u32::MAX as u64 { u32::MAX } else { self.0 as u32 }
     }
@@ -76,7 +76,7 @@ impl Duration {
         Self(self.0.saturating_mul(factor))
     }
 
-    /// `self` divided by `divisor`; the whole span where the divisor is zero.
+    /// `self` divided by `divisor`; `self` if the divisor is zero.
     pub const fn divided_by(self, divisor: u64) -> Self {
         match self.0.checked_div(divisor) {
             Some(quotient) => Self(quotient),

@@ -1,4 +1,4 @@
-//! How a function wants to be called: priority, lease, idempotence, and their form on the wire.
+//! Attributes of a function: priority, lease, flags and others, and their encoding (docs/concepts.md, "Interfaces").
 
 use core::fmt;
 
@@ -7,29 +7,29 @@ use crate::config::Priority;
 use crate::error::Error;
 use crate::time::Duration;
 
-/// Declares [`Attributes`] and the table of its flags: each flag stands here once, with its bit on the wire, and derive, ports,
-/// control socket, page and command take it from [`Attributes::FLAGS`].
+/// Declares [`Attributes`] and the table of its flags. Each flag is defined here once, with its bit on the wire: derive, ports,
+/// control socket, page and command read [`Attributes::FLAGS`].
 macro_rules! attributes {
     ($($name:ident = $bit:literal, $means:literal;)+) => {
-        /// How a function wants to be called.
+        /// How a function is to be called.
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
         pub struct Attributes {
-            /// Priority of calls that name none.
+            /// The priority of calls that do not set one.
             pub priority: Priority,
-            /// How long what a call has started may go on after the call, or its last renewal, was made, in whole milliseconds.
-            /// Renewals are at least 5 ms apart: a lease of less than 20 ms cannot be kept.
+            /// How long the motion that a call has started may continue after the call, or its last renewal, was made; in whole
+            /// milliseconds. Renewals are at least 5 ms apart, so a lease of less than 20 ms cannot be kept.
             pub lease: Option<Duration>,
-            /// Functions of one unit with the same number move the same thing; 0 is none. A unit numbers its own functions when it
-            /// publishes them: those that share a lease get one number.
+            /// Functions of one unit with the same number share an actuator; 0 is none. A unit assigns the numbers when it
+            /// publishes its functions: those that share a lease get the same.
             pub actuator: u8,
-            /// It is a stream, whose results are values that change: subscribers get them, at least so many milliseconds apart.
-            /// It has no arguments, and is not called.
+            /// The function is a stream: its results are values that change, sent to subscribers at least this many milliseconds
+            /// apart. It has no arguments and cannot be called.
             pub stream: Option<u16>,
             $(#[doc = $means] pub $name: bool,)+
         }
 
         impl Attributes {
-            /// The default, for constants.
+            /// The default, as a constant.
             pub const NORMAL: Self = Self {
                 priority: Priority::Normal,
                 lease: None,
@@ -37,7 +37,7 @@ macro_rules! attributes {
                 stream: None,
                 $($name: false,)+
             };
-            /// What a function has or has not, in the order in which it is shown.
+            /// The flags, in the order in which they are shown.
             pub const FLAGS: &'static [Flag] = &[$(Flag {
                 word: stringify!($name),
                 get: |attributes| attributes.$name,
@@ -61,7 +61,7 @@ attributes! {
     idempotent = 2, "Running it twice is as good as running it once.";
 }
 
-/// An attribute that a function has or has not: a field of [`Attributes`] by its name, for what reads, writes and shows them all.
+/// A flag: a `bool` field of [`Attributes`], by name, for code that reads, writes or shows all flags.
 #[derive(Clone, Copy, Debug)]
 pub struct Flag {
     word: &'static str,
@@ -80,7 +80,7 @@ impl Flag {
         (self.get)(attributes)
     }
 
-    /// Sets it, or takes it back.
+    /// Sets or clears it.
     pub fn set(&self, attributes: &mut Attributes, is_set: bool) {
         (self.set)(attributes, is_set);
     }
@@ -92,19 +92,19 @@ impl Attributes {
     const PRIORITY: u8 = 0b11;
     const STREAM: u8 = 1 << 5;
 
-    /// Whether it is a [stream](Self::stream), and no function.
+    /// Whether it is a [stream](Self::stream) and not a function.
     pub const fn is_stream(&self) -> bool {
         STREAMS && self.stream.is_some()
     }
 
-    /// Whether a call in this class may use a place that is kept free: a stop, or an emergency call of an emergency service.
+    /// Whether a call in this class may use reserved capacity: a stop, or an emergency call of an emergency service.
     pub fn is_urgent(&self, class: Priority) -> bool {
         self.stop || class == Priority::Emergency && self.priority == Priority::Emergency
     }
 
-    /// Bits 0 and 1: priority; bits 2 to 4: the flags; bit 5: a stream; actuator, u8; of a stream the least interval in
-    /// milliseconds, u16 little-endian, otherwise zero; the lease in milliseconds, u32 little-endian, 0 for none. A lease is rounded down, but never to none,
-    /// and is 49 days at most.
+    /// Encodes: bits 0 and 1, priority; bits 2 to 4, flags; bit 5, stream; then the actuator, u8; the least interval of a stream
+    /// in milliseconds, u16 little-endian, otherwise zero; the lease in milliseconds, u32 little-endian, 0 for none. A lease is
+    /// rounded down, but not to zero, and limited to 49 days.
     pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
         let flags = self.priority as u8 | self.flags();
         let flags = flags | if self.is_stream() { Self::STREAM } else { 0 };
@@ -114,8 +114,8 @@ impl Attributes {
         [flags, self.actuator, low, high, a, b, c, d]
     }
 
-    /// The inverse of [`encode`](Self::encode). Other bits, and bytes that follow, are of a later version and passed over, as is the
-    /// stream's without the feature `streams`; [`Error::Malformed`] for fewer bytes.
+    /// The inverse of [`encode`](Self::encode). Ignores other bits and further bytes, which are of a later version, and the
+    /// stream without the feature `streams`; [`Error::Malformed`] for fewer bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
         let &[flags, actuator, low, high, a, b, c, d, ..] = bytes else { return Err(Error::Malformed) };
         let lease = u32::from_le_bytes([a, b, c, d]);
@@ -131,7 +131,7 @@ impl Attributes {
     }
 }
 
-/// In words, as `high, lease 400 ms, actuator 1, idempotent`.
+/// For people, as in `high, lease 400 ms, actuator 1, idempotent`.
 impl fmt::Display for Attributes {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.priority.word())?;

@@ -1,4 +1,4 @@
-//! Claims: which of two managers of one identity commands.
+//! Claims: which of two managers of one identity commands (docs/concepts.md, "Two managers of one identity").
 
 use core::fmt;
 
@@ -6,7 +6,7 @@ use super::authenticator::{Authenticator, CODE_BYTES};
 use super::identity::Identity;
 use crate::config::Mode;
 
-/// What a manager commands with: the higher claim commands. The claimant is drawn for each claim, so no two are equal.
+/// A manager's right to command: the higher claim wins. The claimant is drawn at random for each claim, so no two are equal.
 ///
 /// ```
 /// use cara_core::distribution::claim::Claim;
@@ -18,17 +18,17 @@ use crate::config::Mode;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Claim {
-    /// Counts the claims.
+    /// Increases with each claim.
     pub term: u64,
-    /// Drawn for this claim.
+    /// Random, for this claim only.
     pub claimant: u64,
 }
 
 impl Claim {
-    /// Below all others.
+    /// Lower than all others.
     pub const NONE: Self = Self { term: 0, claimant: 0 };
 
-    /// A claim above this one, with this claimant. At the end of all terms the claimant rises.
+    /// A claim above this one, with this claimant. At the highest term the claimant increases instead.
     pub const fn raised(self, claimant: u64) -> Self {
         match self.term.checked_add(1) {
             Some(term) => Self { term, claimant },
@@ -36,7 +36,7 @@ impl Claim {
         }
     }
 
-    /// What its tag covers. No datagram begins so.
+    /// The bytes that the tag authenticates. No datagram begins like this.
     fn bytes(self) -> [u8; 21] {
         let [t0, t1, t2, t3, t4, t5, t6, t7] = self.term.to_le_bytes();
         let [c0, c1, c2, c3, c4, c5, c6, c7] = self.claimant.to_le_bytes();
@@ -44,7 +44,7 @@ impl Claim {
         [k0, k1, k2, k3, k4, t0, t1, t2, t3, t4, t5, t6, t7, c0, c1, c2, c3, c4, c5, c6, c7]
     }
 
-    /// The claim with its tag, made with the key that the manager has with itself. `None` without that key.
+    /// Adds the tag, made with the manager's key with itself. `None` without that key.
     pub fn tagged(self, manager: &Identity, authenticator: &dyn Authenticator) -> Option<TaggedClaim> {
         let tag = match authenticator.mode() {
             Mode::Plain => [0; CODE_BYTES],
@@ -60,8 +60,7 @@ impl fmt::Display for Claim {
     }
 }
 
-/// A claim and what shows that a manager of its identity made it. Only managers of that identity can make or check it; a
-/// vehicle keeps it and shows it.
+/// A claim with its tag. Only managers of the identity can make or check the tag; a vehicle stores and presents it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TaggedClaim {
     /// The claim.
@@ -71,10 +70,10 @@ pub struct TaggedClaim {
 }
 
 impl TaggedClaim {
-    /// None, without a tag.
+    /// No claim, without a tag.
     pub const NONE: Self = Self { claim: Claim::NONE, tag: [0; CODE_BYTES] };
 
-    /// Whether a manager of this identity made it. In plain mode anybody did.
+    /// Whether a manager of this identity made the claim. In plain mode always `true`.
     pub fn is_genuine(&self, manager: &Identity, authenticator: &dyn Authenticator) -> bool {
         match authenticator.mode() {
             Mode::Plain => true,
@@ -83,10 +82,10 @@ impl TaggedClaim {
     }
 }
 
-/// Bytes of the fingerprint of a pair key.
+/// Length of a pair key's fingerprint.
 pub const KEY_FINGERPRINT_BYTES: usize = 6;
 
-/// A claim that a vehicle has obeyed, as it is stored: it counts while the pair key is there under which it was obeyed.
+/// A claim that a vehicle has obeyed, as stored. It is valid as long as the vehicle has the pair key under which it was obeyed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StoredClaim {
     /// The claim.

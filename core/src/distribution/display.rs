@@ -1,4 +1,4 @@
-//! Values as people read them. Firmware that shows none has none of this in its image, nor the formatting of floats.
+//! Values as text. Not linked into firmware that shows no values, nor is the formatting of floats.
 
 use core::fmt::{Display, Formatter, Result, Write};
 
@@ -23,7 +23,7 @@ impl Display for Value<'_> {
     }
 }
 
-/// `3`, or `[3, 4]` where there are several.
+/// `3`, or `[3, 4]` if there are several.
 fn elements<E: Display>(f: &mut Formatter<'_>, size: u32, elements: impl Iterator<Item = E>) -> Result {
     let is_list = size != 1;
     if is_list {
@@ -70,7 +70,7 @@ fn separated<E>(
     Ok(())
 }
 
-/// Names and values in their order; text stands in quotes.
+/// Names and values in order; text is quoted.
 ///
 /// ```
 /// let mut pose = cara_core::Parameters::new();

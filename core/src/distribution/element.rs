@@ -1,4 +1,4 @@
-//! The Rust types for one element of a variable, and how an element lies in memory: little-endian, fixed width.
+//! The Rust types for one element of a variable, and its layout in memory: little-endian, of fixed width.
 
 use super::value::Type;
 use crate::bytes::copy;
@@ -9,7 +9,7 @@ mod sealed {
 
 /// A Rust type for one element of a variable: the integers, `f32`, `f64` and `bool`.
 pub trait Element: Copy + Default + sealed::Sealed {
-    /// The type of the IDL that holds it.
+    /// The type of the variable.
     const KIND: Type;
     /// Reads an element; `None` if it is out of this type's range.
     #[doc(hidden)]
@@ -22,12 +22,12 @@ pub trait Element: Copy + Default + sealed::Sealed {
     fn fits(&self) -> bool {
         true
     }
-    /// The elements as bytes, if that is what they are.
+    /// The elements as bytes, if they are bytes.
     #[doc(hidden)]
     fn as_bytes(_: &[Self]) -> Option<&[u8]> {
         None
     }
-    /// The elements as bytes, if that is what they are.
+    /// The elements as bytes, if they are bytes.
     #[doc(hidden)]
     fn as_bytes_mut(_: &mut [Self]) -> Option<&mut [u8]> {
         None
@@ -87,7 +87,7 @@ impl Element for f64 {
 impl sealed::Sealed for f32 {}
 impl Element for f32 {
     const KIND: Type = Type::Float;
-    /// Rounds to the nearest; a finite number that would become infinite is out of range.
+    /// Rounds to nearest. A finite number that would become infinite is out of range.
     fn load(place: &[u8]) -> Option<Self> {
         let wide = f64::load(place)?;
         let narrow = wide as f32;

@@ -6,7 +6,7 @@ use super::parameters::{Parameters, ParametersView};
 use crate::config::{FAILURE_TEXT_BYTES, FAILURE_VALUES_BYTES};
 use crate::error::ServiceError;
 
-/// Why a service failed, as its handler says it and its caller reads it.
+/// Why a service failed: made by its handler, read by its caller.
 ///
 /// ```
 /// use cara_core::distribution::failure::Failure;
@@ -28,7 +28,7 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// A failure with its code, and the reason in words. What exceeds [`FAILURE_TEXT_BYTES`] is cut, between two characters.
+    /// A failure with a code and a text. What exceeds [`FAILURE_TEXT_BYTES`] is cut at a character boundary.
     pub fn new(code: u16, text: &str) -> Self {
         let length = text.floor_char_boundary(FAILURE_TEXT_BYTES);
         let text_kept = heapless::String::try_from(text.get(..length).unwrap_or_default()).unwrap_or_default();
@@ -40,18 +40,18 @@ impl Failure {
         self.code
     }
 
-    /// The reason in words; empty where there is none.
+    /// The reason in words; empty if there is none.
     pub fn text(&self) -> &str {
         &self.text
     }
 
-    /// The values that the signature declares; none where the callee sent none.
+    /// The values that the signature declares; none if the callee sent none.
     pub fn values(&self) -> &ParametersView {
         &self.values
     }
 
-    /// The place for values. They reach the caller if they have the names, types and sizes that the signature declares with
-    /// `fails (at: int[2])`, and are otherwise dropped and counted.
+    /// For setting values. They reach the caller only if names, types and sizes are those that the signature declares, as with
+    /// `fails (at: int[2])`; otherwise they are dropped and counted.
     pub fn values_mut(&mut self) -> &mut ParametersView {
         &mut self.values
     }
@@ -61,7 +61,7 @@ impl Failure {
         self.is_cut
     }
 
-    /// The error that it is without text and values.
+    /// The error without text and values.
     pub const fn error(&self) -> ServiceError {
         ServiceError::Failed(self.code)
     }

@@ -1,28 +1,28 @@
-//! A line of help on a function and the units of its variables, for people: they stand behind all else in a signature.
+//! One line of help on a function and the units of its variables, for people, at the end of a signature.
 //!
-//! They are the section 3 of a signature, and its lines have the form of variables, so that a unit which does not know them
-//! passes them over: type u8 of a text, length u8, what it is u32 little-endian, text. 0 is the help; 1 is a unit behind the
-//! name of its variable and a blank, as `position m`.
+//! They are section 3 of a signature. A line is encoded like a variable, so that units which do not know it skip it: type u8 of a
+//! text, length u8, kind u32 little-endian, text. Kind 0 is the help; kind 1 is a unit, after the name of its variable and a
+//! blank, as in `position m`.
 
 use super::function::{Definition, HELP_SECTION, Signature, VariableSpec, VariableSpecs};
 use super::value::Type;
 use crate::config::{HELP_BYTES, UNIT_BYTES};
 use crate::error::{Error, Limit};
 
-/// What a line is.
+/// The kinds of lines.
 const HELP: u32 = 0;
 const UNIT: u32 = 1;
 
-/// What stands in front of a line's text.
+/// The head of a line before its text.
 pub(super) const fn head(is_unit: bool, length: usize) -> [u8; 6] {
     let [a, b, c, d] = if is_unit { UNIT } else { HELP }.to_le_bytes();
     [Type::String as u8, length as u8, a, b, c, d]
 }
 
 impl Definition {
-    /// The same function with a line of help for people: what it does. A text of more than [`HELP_BYTES`] is cut.
+    /// The same function with one line of help: what it does. A text of more than [`HELP_BYTES`] is cut.
     ///
-    /// What changes arguments, results, progress or failures later takes help and units away, so they come last.
+    /// Set it last: changing arguments, results, progress or failures removes help and units.
     ///
     /// ```
     /// # use cara_core::Definition;
@@ -34,7 +34,7 @@ impl Definition {
     /// # Ok::<(), cara_core::error::Error>(())
     /// ```
     ///
-    /// [`Error::Full`] where the signature has no room for it, [`Error::NameTaken`] if it has help already.
+    /// [`Error::Full`] if the signature would be too long, [`Error::NameTaken`] if it has help already.
     pub fn help(self, text: &str) -> Result<Self, Error> {
         if !self.signature().help().is_empty() {
             return Err(Error::NameTaken);
@@ -42,9 +42,9 @@ impl Definition {
         self.with_line(false, &[cut(text, HELP_BYTES)])
     }
 
-    /// The same function with the unit of a variable of this name, wherever it stands. A text of more than [`UNIT_BYTES`] is cut.
+    /// The same function with the unit of a variable, wherever that is declared. A text of more than [`UNIT_BYTES`] is cut.
     ///
-    /// [`Error::UnknownVariable`], [`Error::Full`] where the signature has no room for it, [`Error::NameTaken`] if the variable has a
+    /// [`Error::UnknownVariable`], [`Error::Full`] if the signature would be too long, [`Error::NameTaken`] if the variable has a
     /// unit already.
     pub fn unit(self, variable: &str, unit: &str) -> Result<Self, Error> {
         let signature = self.signature();
@@ -75,29 +75,29 @@ impl Definition {
     }
 }
 
-/// As much of a text as there is room for, up to the end of a character.
+/// At most `most` bytes of a text, cut at a character boundary.
 fn cut(text: &str, most: usize) -> &str {
     text.get(..text.floor_char_boundary(most)).unwrap_or(text)
 }
 
 impl<'a> Signature<'a> {
-    /// What the function does, in a line for people; empty where nothing is said.
+    /// One line of help; empty if there is none.
     pub fn help(&self) -> &'a str {
         self.lines().find(|line| line.size == HELP).map_or("", |line| cut(line.name, HELP_BYTES))
     }
 
-    /// The unit of the variable of this name, as `m`.
+    /// The unit of a variable, such as `m`.
     pub fn unit_of(&self, variable: &str) -> Option<&'a str> {
         self.units().find(|(name, _)| *name == variable).map(|(_, unit)| unit)
     }
 
-    /// The variables that have units, and these.
+    /// Variables with their units.
     pub fn units(&self) -> impl Iterator<Item = (&'a str, &'a str)> + use<'a> {
         let units = self.lines().filter(|line| line.size == UNIT).filter_map(|line| line.name.split_once(' '));
         units.map(|(variable, unit)| (variable, cut(unit, UNIT_BYTES)))
     }
 
-    /// The lines in the form of variables, whose names are the texts.
+    /// The lines, as variables whose names are the texts.
     fn lines(&self) -> impl Iterator<Item = VariableSpec<'a>> + use<'a> {
         self.section(HELP_SECTION)
     }

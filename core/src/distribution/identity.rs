@@ -20,7 +20,7 @@ pub enum Role {
 }
 
 impl Role {
-    /// As people and files write it: `m_unit` or `s_unit`.
+    /// The word in texts and files: `m_unit` or `s_unit`.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::MUnit => "m_unit",
@@ -29,11 +29,11 @@ impl Role {
     }
 }
 
-/// Units of different fleets on one network do not meet.
+/// The number of a fleet. Units of different fleets never connect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Fleet(pub u32);
 
-/// One life of a node: differs from boot to boot.
+/// A boot of a node: different for each start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Epoch(pub u64);
 
@@ -66,7 +66,7 @@ impl Identity {
         if identity.is_sound() { Ok(identity) } else { Err(Error::BadName) }
     }
 
-    /// The item that says which unit this is, and which life of it.
+    /// Encodes the item with identity and epoch.
     pub(super) fn put(&self, epoch: Epoch, writer: &mut Writer<'_>) {
         let item = writer.begin(kind::UNIT);
         writer.number(self.id.into());

@@ -1,29 +1,28 @@
-//! Lists that can grow: hello, who-has, announce and control messages consist of items, so that a later version can say
-//! more without a word to those who do not understand it.
+//! Extensible lists: hello, who-has, announce and control messages consist of items; readers skip those that they do not know.
 //!
 //! | bytes | meaning |
 //! |---|---|
-//! | 0–1 | kind, little-endian; bit 15: the reader must understand it. 0 is room that means nothing |
+//! | 0–1 | kind, little-endian; bit 15: the reader must understand it. 0 is padding |
 //! | 2–3 | length of the body |
 //! | 4– | the body; zeros up to a multiple of 4 |
 //!
-//! A body may be longer than its reader knows; what is behind is passed over. One that is shorter is malformed.
+//! A body may be longer than its reader knows, which ignores the rest. A shorter one is malformed.
 
 use super::compact::Reader;
 
-/// Kinds of items that hello, who-has and announce have. One namespace, so that a kind means the same in all of them.
+/// Kinds of items in hello, who-has and announce. They share one namespace, so that a kind has one meaning.
 pub(super) mod kind {
     /// Identity and epoch of the sender.
     pub(in crate::distribution) const UNIT: u16 = 1;
-    /// The manager that the sender belongs to, or looks for.
+    /// The manager that the sender belongs to, or searches for.
     pub(in crate::distribution) const WANTED: u16 = 2;
-    /// What a session needs of this link.
+    /// The session's parameters of this link.
     pub(in crate::distribution) const LINK: u16 = 3;
-    /// What the sender takes.
+    /// The sender's limits.
     pub(in crate::distribution) const LIMITS: u16 = 4;
     /// A search.
     pub(in crate::distribution) const SEARCH: u16 = 5;
-    /// Nodes that stay silent.
+    /// Connected nodes, which need not answer.
     pub(in crate::distribution) const KNOWN: u16 = 6;
     /// An answer.
     pub(in crate::distribution) const ANSWER: u16 = 7;
@@ -31,41 +30,41 @@ pub(super) mod kind {
     pub(in crate::distribution) const CLAIM: u16 = 8;
     /// The highest claim of the reader's identity that the sender has obeyed.
     pub(in crate::distribution) const OBEYED: u16 = 9;
-    /// The sender stands by: it answers nobody and takes no links.
+    /// The sender stands by: it answers nobody and accepts no links.
     pub(in crate::distribution) const STANDBY: u16 = 10;
 }
 
-/// Every item begins at a multiple of this, counted from the first one.
+/// Every item begins at a multiple of this, relative to the first.
 pub(crate) const ALIGNMENT: usize = 4;
-/// Kind and length.
+/// Length of kind and length.
 const HEADER_BYTES: usize = 4;
-/// Set in the kind of an item that must not be passed over.
+/// Set in the kind of an item that a reader must not skip.
 const MUST_UNDERSTAND: u16 = 1 << 15;
-/// The kind of an item that means nothing.
+/// The kind of padding.
 const ROOM: u16 = 0;
 
 /// One item.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Item<'b> {
-    /// The kind, with the bit of an item that must be understood.
+    /// The kind, including the bit for items that must be understood.
     pub kind: u16,
-    /// What it says.
+    /// The content.
     pub body: &'b [u8],
 }
 
-/// The bytes are no list of items.
+/// The bytes are not a list of items.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Malformed;
 
 impl<'b> Item<'b> {
-    /// Reads fields from the front of the body; what a later version has put behind them is passed over.
+    /// Reads fields from the front of the body, and ignores the rest, which is of a later version.
     pub(crate) fn read<T>(&self, read: impl FnOnce(&mut Reader<'b>) -> T) -> Result<T, Malformed> {
         let mut reader = Reader::new(self.body);
         let value = read(&mut reader);
         if reader.is_sound() { Ok(value) } else { Err(Malformed) }
     }
 
-    /// What an item of an unknown kind means: it is counted in `skipped`, unless it must be understood.
+    /// Skips an item of an unknown kind and counts it in `skipped`; an error if it must be understood.
     pub(crate) fn skip(&self, skipped: &mut u16) -> Result<(), Malformed> {
         if self.kind & MUST_UNDERSTAND != 0 {
             return Err(Malformed);
@@ -75,7 +74,7 @@ impl<'b> Item<'b> {
     }
 }
 
-/// The items of a list, one after the other. After an error nothing follows.
+/// Iterates over a list of items. Ends after an error.
 #[derive(Clone, Debug)]
 pub struct Items<'b> {
     rest: &'b [u8],
@@ -87,7 +86,7 @@ impl<'b> Items<'b> {
         Self { rest: bytes }
     }
 
-    /// The bytes of the items that follow.
+    /// The bytes of the remaining items.
     pub(crate) const fn rest(&self) -> &'b [u8] {
         self.rest
     }
@@ -119,7 +118,7 @@ fn split(bytes: &[u8]) -> Option<(Item<'_>, &[u8])> {
     Some((Item { kind: u16::from_le_bytes([k0, k1]), body: padded.get(..length)? }, rest))
 }
 
-/// Room that means nothing, so that the `length` bytes in `out` become `whole`, both multiples of four; the length with it.
+/// Pads the `length` bytes in `out` to `whole`, both multiples of four; returns the new length.
 pub(crate) fn fill(length: usize, whole: usize, out: &mut [u8]) -> Option<usize> {
     let Some(room) = whole.checked_sub(length).filter(|room| *room >= HEADER_BYTES) else { return Some(length) };
     let (header, zeros) = out.get_mut(length..whole)?.split_first_chunk_mut::<HEADER_BYTES>()?;

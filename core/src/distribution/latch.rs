@@ -1,26 +1,26 @@
-//! A latch: what was stopped stays stopped until a reset that was asked for later.
+//! A latch: after a stop no order begins until a reset that was requested later (docs/concepts.md, "Stop and reset").
 
 use core::sync::atomic::{AtomicU16, AtomicU32, Ordering};
 
 use crate::distribution::message::Latch;
 use crate::time::Instant;
 
-/// The word of a latch, of one actuator or of a whole unit. Each write is one store: there is no compare-and-swap on the
-/// smallest boards, and a stop may interrupt a reset.
+/// The latch of one actuator or of a whole unit. Each write is a single store: the smallest boards have no compare-and-swap, and
+/// a stop may interrupt a reset.
 #[derive(Debug, Default)]
 pub struct LatchWord {
-    /// When it was inhibited last, as [`odd_millis`]; 0 when it never was. Written by a stop alone.
+    /// Time of the last stop, as [`odd_millis`]; 0 before the first. Written only by a stop.
     inhibited: AtomicU32,
-    /// What `inhibited` was when it was reset last. Where the two differ, it is latched.
+    /// The value of `inhibited` at the last reset. If the two differ, the latch is set.
     cleared: AtomicU32,
-    /// The ID number of the unit that inhibited it; 0 for this one.
+    /// The ID number of the unit that stopped it; 0 for the vehicle itself.
     inhibitor: AtomicU32,
-    /// Why.
+    /// The reason.
     reason: AtomicU16,
 }
 
 impl LatchWord {
-    /// One that nothing has stopped.
+    /// A latch that is not set.
     pub const fn new() -> Self {
         Self {
             inhibited: AtomicU32::new(0),
@@ -30,7 +30,7 @@ impl LatchWord {
         }
     }
 
-    /// Who stops it, and why, unless it is latched: the first one stays.
+    /// Records who stops and why, unless the latch is set: the first cause stays.
     pub(crate) fn note(&self, latch: Latch) {
         if !self.is_inhibited() {
             self.inhibitor.store(latch.by, Ordering::Release);
@@ -38,72 +38,72 @@ impl LatchWord {
         }
     }
 
-    /// It is latched, as of `now`.
+    /// Sets the latch, as of `now`.
     pub(crate) fn close(&self, now: Instant) {
         let at = odd_millis(now) as u32;
         let at = if at == self.cleared.load(Ordering::Acquire) { at.wrapping_add(2) } else { at };
         self.inhibited.store(at, Ordering::Release);
     }
 
-    /// Latches it. The first latch stays when there is one, but with the time of the newest.
+    /// Sets the latch. If it is set already, keeps its cause but takes the new time.
     pub fn inhibit(&self, now: Instant, latch: Latch) {
         self.note(latch);
         self.close(now);
     }
 
-    /// Opens it, if it was inhibited before `made`: an earlier wish does not undo a later stop, nor one made within 3 ms of it.
+    /// Clears the latch if it was set before `made`: an earlier request does not undo a later stop, nor one within 3 ms of it.
     pub fn reset(&self, now: Instant, made: Instant) {
-        // A stop that interrupts this is not undone: it writes another time.
+        // If a stop interrupts this, it stays in effect: it stores another time.
         let inhibited = self.inhibited.load(Ordering::Acquire);
         if is_behind(now, made, inhibited) {
             self.cleared.store(inhibited, Ordering::Release);
         }
     }
 
-    /// Takes the latch of another one along, unless it was reset from just that stop.
+    /// Copies another latch if it is set, unless this one was reset after that very stop.
     pub(crate) fn inherit(&self, from: &Self) {
         let at = from.inhibited.load(Ordering::Acquire);
         let Some(latch) = from.latch().filter(|_| !self.is_inhibited()) else { return };
-        // What is not latched was cleared of the last stop that it has seen, so this differs from that.
+        // This latch is not set, so `inhibited` is the last stop that was reset here. Another time is another stop.
         if at != self.inhibited.load(Ordering::Acquire) {
             self.note(latch);
             self.inhibited.store(at, Ordering::Release);
         }
     }
 
-    /// Whether what was `made` then was made after the last stop, reset or not.
+    /// Whether something was made after the last stop, reset or not.
     pub(crate) fn is_behind_stop(&self, now: Instant, made: Instant) -> bool {
         let inhibited = self.inhibited.load(Ordering::Acquire);
         inhibited == 0 || is_behind(now, made, inhibited)
     }
 
-    /// What latches it.
+    /// The cause, if the latch is set.
     pub fn latch(&self) -> Option<Latch> {
         self.is_inhibited()
             .then(|| Latch { by: self.inhibitor.load(Ordering::Acquire), reason: self.reason.load(Ordering::Acquire) })
     }
 
-    /// Whether it is latched.
+    /// Whether the latch is set.
     pub fn is_inhibited(&self) -> bool {
         self.changes() != 0
     }
 
-    /// Differs when the latch does; 0 where there is none.
+    /// Differs whenever the latch does; 0 if it is not set.
     pub(crate) fn changes(&self) -> u32 {
         self.inhibited.load(Ordering::Acquire) ^ self.cleared.load(Ordering::Acquire)
     }
 }
 
-/// Whether what was `made` then is later than a stop, of which the time is one of [`odd_millis`].
+/// Whether something was made later than a stop at this [`odd_millis`] time.
 fn is_behind(now: Instant, made: Instant, stop: u32) -> bool {
-    // As long as the word's 49 days, after which a wish may have to be made twice; its age is seconds.
+    // Valid within the 49 days after which the word wraps; then a request may have to be repeated once. Its age is seconds.
     let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(stop);
     let age = now.since(made).as_millis();
-    // The moment is rounded down by up to 2 ms; at the clock's beginning it is rounded up.
+    // `odd_millis` rounds down by up to 2 ms, but up at the start of the clock.
     stop != 0 && since != u32::MAX && age.saturating_add(2) < u64::from(since)
 }
 
-/// A time in milliseconds, rounded down to an odd number, which is never the 0 of "none".
+/// A time in milliseconds, rounded down to an odd number, so that it is never 0, which means "none".
 pub(crate) const fn odd_millis(time: Instant) -> u64 {
     let millis = time.as_micros() / 1_000;
     if millis & 1 == 0 { millis.saturating_sub(1) | 1 } else { millis }

@@ -1,4 +1,4 @@
-//! DISTRIBUTION (paper, section 2): the IDL, the encoding of messages, discovery and the table of nodes.
+//! Distribution (paper, section 2): the IDL, the encoding of messages, discovery and the table of nodes.
 //!
 //! | modules | paper's name | are |
 //! |---|---|---|
@@ -6,10 +6,10 @@
 //! | [`function`], [`function_list`], [`text`] | `Function`, `Function_list` | signatures, lists of functions, and a signature's text |
 //! | [`block`], [`message`], [`items`], [`hello`], [`datagram`] | | what travels, byte by byte: `docs/wire.md`, sections 1, 3, 7, 9 and 10 |
 //! | [`connection_handler`] | `Connection_handler` | discovery, admission, and the table of nodes |
-//! | [`claim`], [`latch`], [`presence`] | | which manager commands, what is stopped, and that only one unit of an identity runs |
+//! | [`claim`], [`latch`], [`presence`] | | which manager commands, what is stopped, and that an identity runs only once |
 //!
-//! A block of parameters has the layout in which it travels, so that a received message is read in place and nothing is
-//! copied. Numbers in items are varints as in [postcard](https://postcard.jamesmunns.com/wire-format).
+//! A block of parameters has the same layout in memory and on the wire, so a received message is read in place without copying.
+//! Numbers in items are varints as in [postcard](https://postcard.jamesmunns.com/wire-format).
 
 mod attributes;
 pub mod authenticator;

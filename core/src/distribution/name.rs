@@ -1,4 +1,4 @@
-//! Which names functions, variables and nodes may have, and how what a peer says is shown.
+//! Valid names of functions, variables and nodes, and safe display of a peer's texts.
 
 use core::fmt::{self, Write};
 
@@ -16,8 +16,8 @@ pub(crate) fn check_name(name: &str) -> Result<(), Error> {
     Ok(())
 }
 
-/// Whether a character acts on a terminal or on the reading of a line instead of being seen: control characters (C0, DEL and
-/// C1), marks of direction (bidi), ends of lines and paragraphs, and characters without width, tags included.
+/// Whether a character affects the terminal or the layout instead of being visible: control characters (C0, DEL, C1), bidi marks,
+/// line and paragraph separators, and zero-width characters including tags.
 pub const fn is_hidden(character: char) -> bool {
     matches!(character,
         '\0'..='\u{1F}' | '\u{7F}'..='\u{9F}' | '\u{AD}' | '\u{061C}' | '\u{200B}'..='\u{200F}'
@@ -25,7 +25,7 @@ pub const fn is_hidden(character: char) -> bool {
         | '\u{E0000}'..='\u{E007F}')
 }
 
-/// A text of a peer, with each [hidden](is_hidden) character as `\u{…}`: for terminals and logs.
+/// A peer's text for terminals and logs, with each [hidden](is_hidden) character as `\u{…}`.
 #[derive(Clone, Copy, Debug)]
 pub struct Shown<'t>(pub &'t str);
 

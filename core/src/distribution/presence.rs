@@ -1,7 +1,7 @@
-//! Duplicate detection before a manager starts: whether a live unit already has its identity.
+//! Duplicate detection before a manager starts: does a live unit already have its identity?
 //!
-//! The question is a [`WhoHas`] for the unit itself, with a nonce of its own, and only holders of this identity's keys
-//! can answer it. If two units ask at once, the one with the greater epoch answers, so that only one of them starts.
+//! The question is a [`WhoHas`] for the unit itself, with a fresh nonce; only holders of this identity's keys can answer it. If
+//! two units ask at the same time, the one with the greater epoch answers, so that only one of them starts.
 
 use super::authenticator::Authenticator;
 use super::datagram::{Announce, Datagram, SEARCH_BYTES, WhoHas};
@@ -10,9 +10,9 @@ use super::identity::{Epoch, Fleet, Identity};
 use crate::host::endpoint::Endpoint;
 use crate::time::Duration;
 
-/// How long a manager waits for an answer before it starts. A unit that is alive answers at once.
+/// How long a manager waits for an answer before it starts. A live unit answers at once.
 pub const PRESENCE_WAIT: Duration = Duration::from_millis(300);
-/// Pause between two questions: one that is lost must not start a second manager.
+/// Interval between questions, repeated so that a lost datagram does not start a second manager.
 pub const PRESENCE_PAUSE: Duration = Duration::from_millis(90);
 
 /// A search for the unit's own identity. See the [module](self).
@@ -25,30 +25,30 @@ pub struct Presence {
     sequence: u32,
 }
 
-/// What a datagram means to a unit that asks.
+/// What a datagram means for a unit that asks.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Heard<'o, E> {
-    /// Nothing.
+    /// It is irrelevant.
     Nothing,
-    /// Another unit asks the same and must give way: the answer, to be sent to the datagram's source.
+    /// Another unit asks the same and has to yield: send this answer to the datagram's source.
     Answer(&'o [u8]),
-    /// A live unit has this identity.
+    /// A live unit has the identity.
     Running {
         /// Where it can be dialled.
         at: E,
-        /// Its claim, if it is genuine: one that takes over claims a higher one.
+        /// Its claim, if genuine. A unit that takes over has to claim a higher one.
         claim: Option<ClaimReport>,
     },
 }
 
 impl Presence {
-    /// A question of a unit that has not started. The nonce is fresh.
+    /// For a unit that has not started. The nonce must be fresh.
     pub const fn new(identity: Identity, fleet: Fleet, epoch: Epoch, nonce: u64) -> Self {
-        // 0 stands for an announcement that answers no question.
+        // Not 0, which marks an announcement that answers no question.
         Self { identity, fleet, epoch, nonce: nonce | 1, sequence: 0 }
     }
 
-    /// The datagram to broadcast, in `out`.
+    /// Encodes the datagram to broadcast into `out`.
     pub fn question<'o>(
         &mut self,
         authenticator: &dyn Authenticator,
@@ -70,7 +70,7 @@ impl Presence {
         who_has.encode(self.fleet, authenticator, out)
     }
 
-    /// Handles a datagram that arrives while the unit waits. Only an answer to its own question shows a live unit.
+    /// Takes a datagram that arrives while the unit waits. Only an answer to its own question proves a live unit.
     pub fn hear<'o, E: Endpoint>(
         &self,
         from: E,
@@ -90,7 +90,7 @@ impl Presence {
         }
     }
 
-    /// This unit's own datagrams, replayed by another host, do not show another unit.
+    /// Excludes this unit's own datagrams, which another host may replay.
     fn is_answer(&self, announce: &Announce) -> bool {
         announce.identity == self.identity && announce.nonce == self.nonce && announce.epoch != self.epoch
     }
