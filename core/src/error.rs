@@ -502,7 +502,7 @@ pub enum Error {
         "the system does not permit this port: below 1024 it takes root or CAP_NET_BIND_SERVICE; choose another one"
     )]
     PortNotPermitted,
-    /// The unit was stopped, or is already running.
+    /// The unit has been stopped, or cannot be started (again).
     #[error("the unit does not run: it was stopped or runs already; make a new one")]
     NotRunning,
 }

@@ -364,7 +364,7 @@ impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
         self
     }
 
-    /// Replaces all options set so far.
+    /// With these options in place of those so far.
     pub const fn with(mut self, options: RequestOptions) -> Self {
         self.options = options;
         self

@@ -59,7 +59,7 @@ pub enum UnitEvent<F, N, E> {
         /// Its claim.
         claim: Claim,
     },
-    /// This unit could not store the claim of its manager in time, and obeys it only until its next start.
+    /// The claim of this manager is obeyed until this unit's next start only: it could not be stored, or not in time.
     ClaimNotKept {
         /// The manager.
         peer: Identity,

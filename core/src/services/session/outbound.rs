@@ -100,7 +100,7 @@ impl<P: Port> Calling<P> {
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
-        // Check everything before taking an id: each id that is skipped shortens the callee's window for duplicates.
+        // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
         let mut checked = self.check(wire, cx, callee, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
         let held = checked.lease.filter(|_| options.renew != Renew::Never);
