@@ -33,7 +33,7 @@ fn encode(definition: &Definition, parameters: &ParametersView) -> Vec<u8> {
     block
 }
 
-/// What an arbitrary variable holds.
+/// The value of an arbitrary variable.
 #[derive(Clone, Debug)]
 enum Content {
     Ints(Vec<i64>),
@@ -173,13 +173,13 @@ fn results_update_and_join_the_callers_parameters() {
     assert_eq!(mine.variable("other"), Ok(0.5));
     assert_eq!(mine.variable("a"), Ok(7));
     assert_eq!(mine.variable("new"), Ok(true));
-    // A shorter text takes the place of a longer one.
+    // A shorter text replaces a longer one.
     theirs.set_value("text", "ok").unwrap();
     read(results, &encode(&definition, &theirs), &mut mine).unwrap();
     assert_eq!(mine.variable("text"), Ok("ok"));
 }
 
-/// `read` must fail like this and change nothing; `check_results_fit` foresees it from the signature.
+/// `read` must fail with `error` and change nothing; `check_results_fit` predicts `foreseen` from the signature.
 #[track_caller]
 fn does_not_fit(results: &str, value: &str, mine: &ParametersView, error: Error, foreseen: Error) {
     let definition = parse(results);
@@ -190,7 +190,7 @@ fn does_not_fit(results: &str, value: &str, mine: &ParametersView, error: Error,
     let block = encode(&definition, &theirs);
     let mut changed = Box::new(Large::sized());
     changed.copy_from(mine).unwrap();
-    // As little room as `mine` has.
+    // Leave as little capacity as `mine` has.
     changed.add_bytes("filler", (changed.remaining() - mine.remaining() - 6) as u32).unwrap();
     let before = changed.clone();
     assert_eq!(read(results, &block, &mut changed), Err(error));
@@ -271,7 +271,7 @@ fn a_service_sees_its_arguments_and_its_results_to_be() {
     prepare_results(signature.results(), &mut p).unwrap();
     assert_eq!(64 - p.remaining(), signature.parameters_bytes() as usize);
     assert_eq!(p.variable("text"), Ok("hi"));
-    // It may grow to the declared maximum.
+    // It may become as long as declared.
     p.set_value("text", "123456789").unwrap();
     assert_eq!(read_arguments(signature.arguments(), &block[..8], &mut p), Err(Error::Malformed));
     assert!(p.is_empty());
@@ -298,7 +298,7 @@ fn twenty_thousand_characters_pass() {
     assert_eq!(p.variable("text"), Ok(text.as_str()));
 }
 
-/// Validates a block by reading it; what it holds must encode to the same bytes again.
+/// If a block is valid, its values must encode to the same bytes.
 fn is_canonical_or_refused(definition: &Definition, block: &[u8]) -> Result<bool, TestCaseError> {
     let mut found = Box::new(Large::sized());
     let arguments = definition.signature().arguments();
@@ -328,7 +328,7 @@ proptest! {
         read(arguments, &block, &mut fresh).unwrap();
         prop_assert_eq!(&fresh, &p);
 
-        // Into variables that hold something else already.
+        // Into variables with other values.
         let mut emptied = Box::new(Large::sized());
         prepare_results(arguments, &mut emptied).unwrap();
         check_results_fit(arguments, &emptied).unwrap();

@@ -99,7 +99,7 @@ fn a_signature_is_bounded() {
     let names: Vec<String> = (0..16).map(|index| format!("{index:0>32}")).collect();
     let variables: Vec<_> = names.iter().map(|name| (name.as_str(), Type::Bool, 1)).collect();
     assert_eq!(definition_of("f", &variables, &variables), Err(Error::Full(Limit::SignatureBytes)));
-    // 1 + name + 1 + variables of 38 bytes + 1, and a last result that fills it, with a name of its own.
+    // 1 + name + 1 + variables of 38 bytes each + 1, and a last result that fills the rest, whose name differs.
     let fitting = (SIGNATURE_BYTES - 4 - 7) / 38;
     let (arguments, results) = (&variables[..fitting.min(15)], &variables[..fitting.saturating_sub(15)]);
     let name = "a".repeat(SIGNATURE_BYTES - 4 - 38 * fitting - 6);
@@ -161,7 +161,7 @@ proptest! {
     }
 }
 
-/// A unit without the feature passes them over all the same.
+/// A unit without the feature skips them, too.
 #[test]
 fn what_follows_the_results_is_sections_whose_numbers_rise() {
     let plain = [1, b'f', 0, 0];

@@ -139,7 +139,7 @@ fn news_of_a_slot_or_name_replaces_the_old() {
     list.insert(Slot(1), Generation(0), usual(), parse("g()").as_bytes()).unwrap();
     list.insert(Slot(0), Generation(1), usual(), parse("f(x: int)").as_bytes()).unwrap();
     assert_eq!(list.named("f").map(|function| (function.slot, function.generation)), Some((Slot(0), Generation(1))));
-    // The peer moved a function; its removal from the old slot is still to come.
+    // The peer has moved a function; its removal from the old slot follows.
     list.insert(Slot(2), Generation(0), usual(), parse("g()").as_bytes()).unwrap();
     assert_eq!(list.find("g"), Some(Slot(2)));
     assert!(!list.remove(Slot(1)));

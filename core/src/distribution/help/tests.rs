@@ -39,7 +39,7 @@ fn a_signature_without_room_stays_as_it_was() {
     assert_eq!(full.help(&"a".repeat(HELP_BYTES)), Err(Error::Full(Limit::SignatureBytes)));
 }
 
-/// Rather all functions without help than one of them skipped.
+/// All help is dropped rather than one function skipped.
 #[test]
 fn help_keeps_no_function_away() {
     let named = |name: &str| Definition::parse(&format!("{name}(height: float)")).unwrap().help("Lifts.").unwrap();
@@ -53,7 +53,7 @@ fn help_keeps_no_function_away() {
         assert_eq!(shown, wanted);
     }
     assert_eq!((list.named("c").unwrap().signature.arguments().count(), list.skipped()), (1, 0));
-    // One that does not grow, as on a board, has no use for it.
+    // A list of fixed size, as on a board, stores no help.
     let mut fixed = TheirFunctionList::<Boxed>::new([Entry::empty()].into(), std::vec![0; 4 * length].into());
     fixed.insert(Slot(0), Generation(0), Attributes::default(), named("a").as_bytes()).unwrap();
     assert_eq!(fixed.named("a").unwrap().signature.help(), "");
@@ -68,7 +68,7 @@ fn what_arrives_in_another_form_is_refused_or_read() {
     // A unit without a name, and a line of a later version.
     assert_eq!(with(&[3, 1, 2, 1, 1, 0, 0, 0, b'm']), Ok(0));
     assert_eq!(with(&[3, 1, 2, 1, 9, 0, 0, 0, b'm']), Ok(0));
-    // What stands behind it is not kept, so that a line that is added stands in it.
+    // Sections of later versions are dropped, so that help can be added behind the rest.
     let later =
         Signature::decode(&[plain.as_bytes(), &[4, 1, 0, 1, 1, 0, 0, 0, b'x']].concat()).unwrap().to_definition();
     assert_eq!(later.help("Lifts.").unwrap().signature().help(), "Lifts.");

@@ -6,7 +6,7 @@ use super::*;
 use proptest::prelude::*;
 
 const MS: Duration = Duration::from_millis(1);
-/// Flags that a callee may pass over, and which this version does not know.
+/// Unknown flags that a callee may ignore.
 const SKIPPABLE: u8 = 0x08;
 const REPORT: Report = Report { received: 0x0102_0304, hears: true, holds: false };
 
@@ -121,7 +121,7 @@ fn progress_details_and_cancellation_survive() {
     assert_eq!(FailureDetails::of(&other), None, "of another error what follows is passed over");
 }
 
-/// Flag 2 is one that a callee which does not know it passes over, and the answer says it in what had been a 0.
+/// Flag 2 is ignored by callees that do not know it; their answer has 0 where others report it.
 #[test]
 fn an_operators_origin_is_told_both_ways() {
     let header = RequestHeader {

@@ -87,7 +87,7 @@ fn what_is_no_type_is_pointed_at() {
     assert_eq!(mistake("f(a: {b: {c: {d: int[..1]}[..2]}})"), at(2, Expected::ShallowerType));
     assert_eq!(mistake("f(a: string[..8])"), at(12, Expected::Size));
     assert_eq!(mistake("f(a: list[8])"), at(5, Expected::Type));
-    // An element without bytes could be as often there as a peer likes.
+    // A peer could claim any number of elements that take no bytes.
     assert!(Definition::parse("f(a: int[0][..8])").is_err());
     assert!(Definition::parse("f(a: {b: bool[0]}[..8])").is_err());
     let long = format!("f(a: {{{}}})", (0..90).map(|n| format!("field{n:03}: int")).collect::<Vec<_>>().join(", "));
@@ -201,7 +201,7 @@ fn what_does_not_fit_leaves_the_old_value() {
     assert_eq!(order.set_record("nodes", |_| Ok(())), Err(Error::WrongType { index }));
     assert_eq!(order.set_list("none", |_| Ok(())), Err(Error::UnknownVariable));
     assert_eq!(order.set_value("nodes", [1, 2]), Err(Error::WrongType { index }));
-    // An element that was refused, and an error that was passed over, leave a list of the others.
+    // If a closure ignores the error of one element, the list has the others.
     let kept = order.set_list("nodes", |nodes| {
         let _ = nodes.push_record(|next| next.set("x", 1.0));
         nodes.push_record(|next| node(next, "only", &[]))
@@ -216,13 +216,13 @@ fn a_small_arena_says_that_it_is_full() {
     small.lay_out(definition.signature()).unwrap();
     let full = Err(Error::Full(Limit::ParametersBytes));
     assert_eq!(small.set_list("a", |list| list.push("12345678901234567890")), full);
-    // Of a text that is shorter than declared only what it takes has to be there.
+    // A text that is shorter than declared needs capacity for its actual length only.
     assert_eq!(small.set_list("a", |list| list.push("12345678")), Ok(()));
     assert_eq!(small.set_list("a", |list| list.push("1234567890123456789012345678901234567890")), full);
     assert_eq!(small.to_string(), r#"a: ["12345678"]"#);
 }
 
-/// `nodes` with one of its words changed.
+/// Checks `nodes` with one of its words changed.
 fn changed(word: usize, value: u64) -> Result<(), Error> {
     let definition = definition(ORDER);
     let mut bytes = encoded(&definition, &order());
@@ -310,7 +310,7 @@ enum Data {
     Bools(Vec<bool>),
     Text(u32, String),
     Bytes(u32, Vec<u8>),
-    /// The first one is no element and only says what the elements are.
+    /// The first entry is not an element; it determines the type of elements.
     List(u32, Vec<Data>),
     Record(Vec<Data>),
 }
@@ -377,7 +377,7 @@ impl Data {
     }
 }
 
-/// Of one type, `count` values.
+/// `count` values of the same type.
 fn same(data: &Data, count: usize, seed: i64) -> Vec<Data> {
     let varied = |index: usize| match data {
         Data::Ints(ints) => Data::Ints(ints.iter().map(|int| int ^ (seed + index as i64)).collect()),
@@ -426,7 +426,7 @@ proptest! {
         prop_assert!(definition.as_bytes().len() <= SIGNATURE_BYTES);
 
         let mut parameters = Box::new(Parameters::<65_536>::sized());
-        // What lay there before must not show up as padding.
+        // Earlier contents of the arena must not show up as padding.
         parameters.lay_out(crate::distribution::function::Definition::parse("g(a: bytes[60000])").unwrap().signature()).unwrap();
         parameters.set_value("a", &*vec![noise as u8 | 1; 60_000]).unwrap();
         parameters.lay_out(definition.signature()).unwrap();
@@ -454,7 +454,8 @@ proptest! {
         }
         prop_assert_eq!(encoded(&definition, &read), bytes.clone());
 
-        // What is cut off or has a word more is malformed, and no changed bit is read as something that is not written again.
+        // A block that is cut off or too long is malformed. A changed bit is either refused or read as a value that encodes to
+        // it.
         prop_assert_eq!(block::check(specs, &bytes[..bytes.len() - 8]), Err(Error::Malformed));
         let mut changed = bytes;
         let at = noise as usize % (changed.len() * 8);

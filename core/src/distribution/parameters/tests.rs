@@ -179,7 +179,7 @@ fn a_box_of_any_size_is_a_view() {
     assert_eq!(format!("{large:?}"), r#"{"text": string[2000]}"#);
 }
 
-/// What a variable should hold.
+/// The expected value of a variable.
 #[derive(Clone, Debug, PartialEq)]
 enum Content {
     Ints(Vec<i64>),
@@ -231,7 +231,7 @@ impl Content {
         }
     }
 
-    /// Whether a variable that holds `self` can be set to `other`, keeping its declared size.
+    /// The value after setting a variable with value `self` to `other`; `None` if that fails.
     fn accepts(&self, other: &Self) -> Option<Self> {
         match (self, other) {
             (Self::Ints(a), Self::Ints(b)) => (a.len() == b.len()).then(|| other.clone()),
@@ -241,7 +241,7 @@ impl Content {
             (Self::Bytes(max, _), Self::Bytes(_, b)) => {
                 (b.len() <= *max as usize).then(|| Self::Bytes(*max, b.clone()))
             }
-            // Bytes are integers as well.
+            // Bytes are also integers.
             (Self::Ints(a), Self::Bytes(_, b)) => {
                 (a.len() == b.len()).then(|| Self::Ints(b.iter().map(|&byte| byte.into()).collect()))
             }

@@ -64,7 +64,7 @@ fn limits_are_named_at_the_variable_that_exceeds_them() {
     };
     assert!(parse(&list(VARIABLES, 2)).is_ok());
     fails(&list(VARIABLES + 1, 2), 2 + VARIABLES * 9, Expected::FewerVariables);
-    // Of the results, which are the same variables, one no longer fits.
+    // The results are the same variables; one of them no longer fits.
     let (long, each) = (list(16, 32), NAME_BYTES + 6);
     let both = format!("{long} -> {}", &long[1..]);
     let fitting = (SIGNATURE_BYTES - 4) / each;

@@ -158,7 +158,7 @@ fn a_mismatch_names_function_variable_and_both_types() {
     );
     assert!(check("f() -> (b: int[2])", "f() -> (b: int[3])").is_some());
     assert!(check("f() -> (b: string[8])", "f() -> (b: string[9])").is_some(), "it would not fit");
-    // More than needed, and other lengths of text.
+    // More than needed, and other lengths of text, are compatible.
     assert_eq!(check("f(a: int, more: int)", "f(a: int)"), None);
     assert_eq!(check("f() -> (b: int)", "f() -> (more: int, b: int)"), None);
     assert_eq!(check("f(a: string[9])", "f(a: string[8])"), None);

@@ -110,7 +110,7 @@ fn a_request_that_is_given_up_before_it_arrives_is_passed_over_and_those_before_
         [note(3), note(499), note(500), note(500), note(501)],
         [Seen::Never, Seen::Never, Seen::Before, Seen::Before, Seen::Never,]
     );
-    // Those that never come give way to others, which are kept out all the same.
+    // Ids that never arrive are forgotten for newer ones, but stay excluded.
     (600..620).for_each(|id| calls.give_up(Priority::Low, id));
     for id in 600..620 {
         assert_eq!(calls.note(Priority::Low, id), Seen::Before, "{id}");
@@ -280,13 +280,13 @@ fn the_last_buffers_are_left_to_answers_and_to_what_is_received() {
     assert_eq!((calls.held(), pool.free()), (0, LEFT_BY_WAITING));
 }
 
-/// A call that was made at `sent` and may take until `deadline`, both in milliseconds.
+/// A call that was made at `sent` with this deadline, both in milliseconds.
 fn timed(id: u32, sent: u64, deadline: u64) -> CallHead {
     let at = |millis: u64| Instant::from_micros(millis * 1_000);
     CallHead { sent_at: at(sent), deadline: at(deadline), keeps_order: false, ..head(id, Priority::Normal) }
 }
 
-/// The ids of calls in the order in which they begin, each with its block; `now` in milliseconds.
+/// The ids of calls in the order in which they begin; `now` in milliseconds.
 fn begun(waiting: &[CallHead], now: u64) -> Vec<u32> {
     let (mut calls, mut pool) = (calls(4), pool(3, 4_000));
     for head in waiting {
@@ -305,7 +305,7 @@ fn begun(waiting: &[CallHead], now: u64) -> Vec<u32> {
 fn the_earliest_deadline_begins_and_of_equal_time_outs_the_first() {
     let waiting = [timed(1, 10, 1_000), timed(2, 11, 500), timed(3, 12, 2_000), timed(4, 13, 502), timed(5, 14, 1_004)];
     assert_eq!(begun(&waiting, 20), [2, 4, 1, 5, 3]);
-    // What is known of when they were made changes a little with each keep-alive.
+    // The estimate of when calls were made changes a little with each keep-alive.
     assert_eq!(begun(&[timed(1, 12, 112), timed(2, 10, 110), timed(3, 11, 111)], 20), [1, 2, 3]);
 }
 
@@ -314,7 +314,7 @@ fn what_has_waited_half_its_time_out_is_next() {
     let waiting = [timed(1, 0, 10_000), timed(2, 4_999, 5_009), timed(3, 4_999, 5_019)];
     assert_eq!(begun(&waiting, 4_999), [2, 3, 1]);
     assert_eq!(begun(&waiting, 5_000), [1, 2, 3]);
-    // What was given up goes out of the way.
+    // A call that was given up is removed first.
     assert_eq!(begun(&[timed(1, 4_998, 10_000), timed(2, 4_999, 0)], 4_999), [2, 1]);
 }
 

@@ -7,7 +7,7 @@ const fn at(micros: u64) -> Instant {
 
 const START: Instant = Instant::START;
 
-/// 500 ms and a ramp of 300 ms, from 1 s on.
+/// A lease of 500 ms from 1 s on, with a ramp of 300 ms.
 fn on_a_ramp() -> (Lease, Order) {
     let lease = Lease::new();
     lease.set_ramp(Duration::from_millis(300));
@@ -33,7 +33,7 @@ fn an_order_that_has_ended_slows_down_for_the_length_of_its_ramp() {
     assert!(lease.begin(at(1_700_000), at(3_000_000)).is_none(), "the ramp comes first");
     let next = lease.begin(at(1_802_000), at(3_000_000)).unwrap();
     assert_eq!(stages(&lease, &[1_803]), [Stage::Live]);
-    // Released before its time.
+    // Released before its end.
     assert!(lease.end(at(2_000_000), next, LeaseEnd::Expired));
     assert_eq!(stages(&lease, &[2_000, 2_298, 2_299]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
 }
@@ -47,7 +47,7 @@ fn a_stop_begins_the_ramp_once() {
     assert_eq!(stages(&lease, &[1_101, 1_398, 1_399]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
     assert!(lease.end(at(1_350_000), order, LeaseEnd::Stopped));
     assert_eq!(stages(&lease, &[1_398, 1_399]), [Stage::Stopping, Stage::Dead]);
-    // Nothing moved when it was stopped again.
+    // Nothing was moving at the second stop.
     lease.inhibit(at(2_000_000), latch);
     assert_eq!(stages(&lease, &[2_001]), [Stage::Dead]);
 }
@@ -74,7 +74,7 @@ fn what_goes_with_its_service_slows_down_like_what_has_ended() {
     assert!(lease.begin(at(1_300_000), at(3_000_000)).is_none(), "the ramp comes first");
     let next = lease.begin(at(1_400_000), at(3_000_000)).unwrap();
     assert!(lease.finish(at(1_500_000), next));
-    // What had ended before keeps its end.
+    // An order that has ended keeps its end.
     assert!(!lease.clear(at(1_600_000)) && stages(&lease, &[1_601]) == [Stage::Dead]);
     assert_eq!(lease.state().last.unwrap().end, Some(LeaseEnd::Finished));
 }
@@ -134,7 +134,7 @@ fn a_lease_survives_the_wrap_of_its_clock() {
 fn an_interrupt_that_inhibits_between_two_stores_of_a_new_order_leaves_it_dead() {
     let lease = Lease::new();
     lease.inhibit(START, Latch { by: 0, reason: 1 });
-    // What `begin` stores behind it.
+    // What `begin` stores after it.
     lease.seen_dead.store(false, Ordering::Release);
     lease.end.store(odd_millis(at(500_000)) as u32, Ordering::Release);
     assert!(!lease.is_live(at(1_000)) && !lease.lasts_beyond(at(1_000)));
@@ -192,11 +192,11 @@ fn what_is_left_of_a_lease_is_told_until_its_end() {
     assert_eq!(lease.left(at(0)), None);
 }
 
-/// What befalls a lease whose reader's clock goes on by so much in between.
+/// Steps with a lease. The number is how far the reader's clock advances in between.
 #[derive(Clone, Copy, Debug)]
 enum Step {
     Look(u64),
-    /// A renewal until so long behind a time that was read earlier.
+    /// A renewal whose end counts from a time that was read this much earlier.
     Renew(u64),
     Begin(u64),
     End,

@@ -543,7 +543,7 @@ impl<P: Port> Session<P> {
     /// Sends a ping and measures the round trip: [`Event::Answered`] follows, then [`round_trip`](Self::round_trip) is new.
     /// Replaces a ping that is still unanswered.
     ///
-    /// [`Error::NotConnected`] on a link that is not live, [`Error::Full`] where the stream has no room.
+    /// [`Error::NotConnected`] if the link is not live, [`Error::Full`] if the stream has no capacity.
     pub fn ping(&mut self, cx: &mut Context<'_, P>) -> Result<(), Error> {
         self.pings.ping(&mut self.wire, cx)
     }

@@ -1,4 +1,4 @@
-//! Every outcome of a hello.
+//! Every decision about a hello.
 
 use super::*;
 use crate::config::Versions;
@@ -66,7 +66,7 @@ fn the_next_node_is_refused_as_full_until_one_leaves_or_the_limit_is_raised() {
     let third = hello_of(&s_unit("c", 3));
     assert_eq!(decide(&mut node, &third), Admission::Refuse(Refusal::Full));
     assert_eq!(node.counters.value(NodeCounter::RefusedFull), 1);
-    // One that is connected comes back: it takes no further place.
+    // A connected node that returns takes no further slot.
     let again = Hello { epoch: Epoch(50), ..hello_of(&s_unit("a", 1)) };
     assert_eq!(decide(&mut node, &again), Admission::Wait);
     node.left(at(11), LinkId(9), CloseReason::Reset);
@@ -87,21 +87,20 @@ fn a_table_that_is_full_of_connected_nodes_refuses_as_full() {
 
 #[test]
 fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
-    // Both have found and dialled each other, as with fixed addresses; here `small` and `large` see the hellos in each
-    // order that can happen.
+    // Both have found and dialled each other, as with fixed addresses. `small` and `large` get the hellos in each possible order.
     let (small, large) = (m_unit("small", 1), m_unit("large", 2));
     let by_small_address = address(1, 40_000);
     for small_first in [true, false] {
         let mut of_small = node(small.clone());
         let mut of_large = node(large.clone());
-        // Link 0 is the one that `small` dials, link 1 the one that `large` dials.
+        // `small` dials link 0, `large` dials link 1.
         let hear = |node: &mut Node<InMemory>, peer: &NodeConfig<SocketAddr>| {
             node.answered(at(1), address(peer.identity.id(), 7_001), &announce_of(peer, 1, 0));
         };
         hear(&mut of_small, &large);
         run(&mut of_small, at(100), &mut Outbox::default());
         of_small.dialing(Some(&large.identity), LinkId(0));
-        // `large` was told by its application to dial: as if it were the smaller one.
+        // The application of `large` asked it to dial, as if its identity were the smaller one.
         of_large.table.place_of(&small.identity, by_small_address, small.epoch).unwrap();
         let place = of_large.table.find(&small.identity).unwrap();
         of_large.table.set_state(place, NodeState::Dialing);
@@ -115,7 +114,7 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
             of_large.admit(at(101), LinkId(link), by_small_address, &hello_of(&small));
         }
         for node in [&mut of_small, &mut of_large] {
-            // It is decided whatever is answered.
+            // An answer to the challenge no longer matters.
             node.challenge_answered(at(101), LinkId(1));
             let reason = CloseReason::Refused(Refusal::AlreadyConnected);
             let decided = [notify(1, Directive::Challenge), notify(1, Directive::Close(reason))];
@@ -155,7 +154,7 @@ fn the_last_refusal_of_each_reason_and_address_is_kept() {
         node.admit(at(10), LinkId(0), address(host, 1), &foreign);
     }
     assert_eq!(node.findings().count(), 4);
-    // The fifth address takes the place of the oldest.
+    // The fifth address replaces the oldest.
     node.admit(at(11), LinkId(0), address(5, 1), &foreign);
     let mut hosts: Vec<_> = node.findings().map(|finding| finding.address.ip()).collect();
     hosts.sort();

@@ -1,4 +1,4 @@
-//! Everything that a port and a network can do to a node, in any order: what must hold after each step.
+//! Everything that a port and a network can do to a node, in any order, and what must hold after each step.
 
 use proptest::prelude::*;
 
@@ -7,7 +7,7 @@ use super::*;
 #[derive(Clone, Debug)]
 enum Step {
     Wait(u64),
-    /// To the next deadline.
+    /// Wait until the next deadline.
     Next,
     WhoHas {
         who: u8,
@@ -61,12 +61,12 @@ fn who_is(who: u8, epoch: u64, port: u16) -> NodeConfig<SocketAddr> {
     NodeConfig { epoch: Epoch(epoch), tcp_port: port, ..config }
 }
 
-/// A port that forgets nothing but is told nonsense.
+/// A correct port in a hostile network.
 struct Port {
     node: Node<InMemory>,
     now: Instant,
     outbox: Outbox,
-    /// Links that are open: taken, waiting or being dialled.
+    /// Open links: admitted, waiting or being dialled.
     open: std::collections::BTreeSet<u16>,
 }
 
@@ -91,7 +91,7 @@ impl Port {
                         self.node.dialing(identity.as_ref(), LinkId(link));
                         self.open.insert(link);
                     }
-                    // The port says nothing at all.
+                    // The port does not report anything.
                     (_, Some(_)) => {}
                 }
             }
@@ -150,7 +150,7 @@ impl Port {
         }
     }
 
-    /// A hello on a link that is new, or on one that was dialled.
+    /// A hello arrives on a new link, or on one that was dialled.
     fn admit(&mut self, who: u8, epoch: u64, link: u16) {
         let dialled = link + 6;
         let opening = self.node.node_of(LinkId(dialled)).is_some_and(|known| known.state() == NodeState::Dialing);

@@ -1,4 +1,4 @@
-//! A thousand s_units and their manager on one network of datagrams; links open at once.
+//! A thousand s_units and their manager on one network of datagrams. Links open without delay.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -16,7 +16,7 @@ struct Fleet1000 {
     /// When each unit is switched on.
     on: Vec<Instant>,
     flying: BinaryHeap<Reverse<Flight>>,
-    /// (when, unit): looked at again, however often.
+    /// (when, unit): when to poll each unit; may have duplicates.
     timers: BinaryHeap<Reverse<(Instant, usize)>>,
     random: Random,
     order: u64,
@@ -127,7 +127,7 @@ impl Fleet1000 {
         self.joined_at[index] = Some(now);
     }
 
-    /// Most links that were opened within 10 ms.
+    /// The most links opened within any 10 ms.
     fn busiest(&self) -> usize {
         let mut times: Vec<_> = self.joined_at.iter().flatten().copied().collect();
         times.sort();
@@ -176,7 +176,7 @@ fn a_fleet_that_waits_for_its_manager_joins_within_two_seconds_and_twenty_broadc
         let start = at(60_000);
         let mut fleet = Fleet1000::new(seed, start, Instant::START, 0, Duration::from_millis(1));
         fleet.run_until(start);
-        // Five pauses double from a quarter of a second, then one search comes each 8 to 16 s: for all units together.
+        // Five pauses double from 250 ms on, then there is one search every 8 to 16 s: for all units together.
         assert!(fleet.broadcasts <= 40, "{} broadcasts in the first minute, seed {seed}", fleet.broadcasts);
         fleet.broadcasts = 0;
         fleet.run_until(start + Duration::from_secs(5));

@@ -1,4 +1,4 @@
-//! Attackers on the network: filling tables, suppressing searches, delaying a unit.
+//! Attackers on the network: they fill tables, suppress searches, or delay a unit.
 
 use super::*;
 use crate::config::LONGEST_SEARCH;
@@ -50,7 +50,7 @@ fn strangers_that_are_being_dialled_leave_no_room_until_they_are_given_up() {
     assert_eq!((node.nodes().count(), node.counters.value(NodeCounter::TableFull)), (8, 1));
     join(&mut node, at(202), 0, &s_unit("agv", 1));
     assert_eq!(node.nodes().count(), 9, "who joins needs no place among strangers");
-    // One that does not answer is dialled more and more seldom, and gives way between two tries.
+    // A node that does not answer is dialled with growing back-off, and may be displaced between two attempts.
     let mut tries = 0;
     while !node.nodes().any(|known| known.identity.name() == "late") {
         tries += 1;
@@ -76,8 +76,8 @@ fn a_thousand_junk_datagrams_change_nothing_but_counters() {
     }
 }
 
-/// Broadcasts of whatever manager lead to a few questions and to nothing else: not to a dial, not to a place in the table,
-/// and they put the unit's own question off by one pause at most.
+/// Hints at any manager cause a few questions and nothing else: no dial, no entry in the table, and a delay of the unit's own
+/// search by one pause at most.
 #[test]
 fn hints_lead_to_few_questions_and_delay_nothing() {
     for a_second in [1, 4, 20, 100] {
@@ -100,14 +100,14 @@ fn hints_lead_to_few_questions_and_delay_nothing() {
             assert_eq!(node.nodes().count(), 0);
             let most = if hosts == 1 { 7 } else { 10 * hosts.min(4) as usize + 4 };
             assert!(outbox.sent.len() <= most, "{what}: {} questions", outbox.sent.len());
-            // An attacker with many addresses exhausts the budget of searches for some seconds.
+            // An attacker with many addresses uses up the budget of searches for some seconds.
             let latest = if hosts <= 2 { at(2_700) } else { at(9_000) };
             assert!(first.is_some_and(|first| first <= latest), "{what}: asks itself at {first:?}");
         }
     }
 }
 
-/// As many addresses as are asked side by side are told of again and again, and no node answers there.
+/// All addresses that are asked side by side are hinted at again and again, and no node answers there.
 #[test]
 fn addresses_that_do_not_answer_give_way_to_a_new_one() {
     let mut node = node(s_unit("agv", 1));
@@ -123,7 +123,7 @@ fn addresses_that_do_not_answer_give_way_to_a_new_one() {
     assert!(outbox.sent.iter().any(|(to, _)| *to == address(9, 7_001)), "the new one is never asked");
 }
 
-/// How many searches a unit sends within ten minutes in which `others` ask every `pause`.
+/// How many searches a unit sends within ten minutes if `others` search every `pause`.
 fn searches_among(others: &NodeConfig<SocketAddr>, pause: Duration, seed: u64) -> usize {
     let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
     let mut outbox = Outbox::default();

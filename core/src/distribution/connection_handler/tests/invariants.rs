@@ -1,4 +1,4 @@
-//! Invariants of the node, whatever a port and its peers do, checked against a plain model of its links.
+//! Invariants of the node, whatever a port and its peers do, compared with a simple model of its links.
 
 use std::collections::BTreeMap;
 

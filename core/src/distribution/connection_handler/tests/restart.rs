@@ -70,7 +70,7 @@ fn a_newcomer_that_gives_up_leaves_everything_as_it_was() {
     assert_eq!(node.node_of(LinkId(0)).map(|known| known.epoch), Some(Epoch(1)));
 }
 
-/// Otherwise the next link with its number would count as one of the node that it wanted to be.
+/// Otherwise the next link with its number would be taken for one of that node.
 #[test]
 fn the_link_of_a_refused_newcomer_is_no_nodes_link() {
     for hello in [reborn(&s_unit("agv", 1)), hello_of(&s_unit("agv", 1))] {
@@ -155,7 +155,7 @@ fn nodes_are_found_by_name_id_and_address() {
     assert_eq!((gone.state(), gone.epoch, gone.limits.is_some()), (NodeState::Away, Epoch(1), true));
 }
 
-/// The wrong vehicle is worse than none: which one is meant is never guessed, also not where one alone is connected.
+/// Calling the wrong vehicle is worse than an error: an ambiguous name is refused, even if only one of the nodes is connected.
 #[test]
 fn a_name_that_several_nodes_have_is_refused() {
     let mut node = depot();

@@ -1,4 +1,4 @@
-//! The table against a plain model of it.
+//! The table compared with a simple model.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use super::super::table::Table;
 use super::super::timetable::Task;
 use super::*;
 
-/// Nodes that there is room for at first, and when the table has grown: no more than it keeps unjoined nodes.
+/// Capacity at first and after growing. Not above the capacity for unjoined nodes.
 const CAPACITY: usize = 5;
 const GROWN: usize = 8;
 
@@ -41,14 +41,14 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-/// What the model knows of a node: joined, when it came to rest, its index, what is due when.
+/// The model of a node: whether it joined, when it left, its index, and what is due when.
 #[derive(Clone, Debug)]
 struct Entry {
     joined: bool,
     rested: usize,
     index: Option<u16>,
     due: Option<u64>,
-    /// When it was heard of, of a node that has not joined.
+    /// When it was heard of, if it has not joined.
     unjoined: Option<usize>,
 }
 
@@ -138,7 +138,7 @@ proptest! {
                     model.get_mut(&who).unwrap().due = None;
                 }
                 Step::Grow => {
-                    // Shorter ones change nothing.
+                    // Shorter slices are ignored.
                     table.grow(slice(CAPACITY - 1), slice(GROWN), slice(4));
                     table.grow(slice(GROWN), slice(GROWN), slice(4));
                     capacity = GROWN;

@@ -31,7 +31,7 @@ fn table(rows: impl Into<Vec<Row>>) -> Option<Table> {
     Some(Table(rows.into()))
 }
 
-/// A pair whose AGV offers `pos_info` and `go`, under a table.
+/// A pair whose AGV offers `pos_info` and `go`, with an access table.
 fn under(table: Option<Table>) -> Pair {
     let mut pair = Pair::live();
     pair.agv.table = table;
@@ -45,7 +45,7 @@ fn seen(pair: &Pair) -> Vec<String> {
     pair.manager.session.their_function_list().iter().map(|function| function.name().to_string()).collect()
 }
 
-/// The manager calls a function that it was not told of, as one does that guesses its slot.
+/// The manager calls a function that was not published to it, by guessing its slot.
 fn call_by_guess(pair: &mut Pair, definition: &str, slot: u16) -> Error {
     pair.manager.hear_of(definition, slot, 0);
     let (name, _) = definition.split_once('(').unwrap();
@@ -117,7 +117,7 @@ fn what_may_be_listed_is_seen_and_not_called() {
     assert!(pair.agv.ran().is_empty());
 }
 
-/// Bytes that do not fit the signature are an error of their own, which tells somebody that the function was reached.
+/// An error about arguments would reveal that the function exists.
 #[test]
 fn a_request_is_refused_before_its_arguments_are_looked_at() {
     let mut pair = under(table([row(MANAGER, &["go"], Verbs::LIST)]));
@@ -265,7 +265,7 @@ fn rows() -> impl Strategy<Value = Vec<Row>> {
 
 #[derive(Clone, Debug)]
 enum Step {
-    /// Calls a function, told of or not.
+    /// Calls a function, published or not.
     Call(usize, Priority, bool),
     Answer,
     Change(Option<Vec<Row>>),
@@ -282,7 +282,7 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-/// Written out once more: who the manager is does not change.
+/// The rules once more, without the code under test, for this one manager.
 fn allows(rows: &[Row], function: &str) -> bool {
     rows.iter().any(|row| {
         let Functions::Named(names) = &row.functions else { return false };
@@ -309,7 +309,7 @@ proptest! {
                 Step::Call(which, priority, reply) => {
                     pair.manager.hear_of(&std::format!("{}(x: int)", NAMES[which]), which as u16, 0);
                     let options = RequestOptions { priority: Some(priority), ..RequestOptions::default() };
-                    // Too many at a time are refused here already.
+                    // This end refuses calls beyond its own limit.
                     let _ = pair.manager.request_with(NAMES[which], &x(1), &options, reply);
                 }
                 Step::Answer if !pair.agv.held.is_empty() => pair.agv.answer_held(Ok(&*none())),

@@ -1,4 +1,4 @@
-//! What a test lets one end do, and asks of it.
+//! Actions and questions of tests at one end of a pair.
 
 use std::boxed::Box;
 use std::rc::Rc;
@@ -24,7 +24,7 @@ use crate::services::requests::CallId;
 use crate::storage::Buffers;
 use crate::time::Duration;
 
-/// What is called without options goes on while it is wanted, if its function has a lease.
+/// The default options of tests: a leased function stays live as long as its call is held.
 const WANTED: RequestOptions = RequestOptions::renewing(Renew::Process);
 
 impl<const WHOLE: bool> Side<WHOLE> {
@@ -61,14 +61,14 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.add(definition, lease.as_millis(), Run::Now(run))
     }
 
-    /// Adds a function that moves what the one in `other` moves.
+    /// Adds a function with the same actuator as the one in `other`.
     pub(super) fn offer_sharing(&mut self, definition: &str, lease: Duration, other: Slot) -> Slot {
         let word = self.functions.function(other).unwrap().handler.lease.clone();
         let attributes = Attributes { lease: Some(lease), ..Attributes::default() };
         self.add_with(definition, attributes, Run::Now(|_| Ok(())), word)
     }
 
-    /// Adds a function that stops or resets all, or what the one in `charge` moves. It fails for a negative `x`.
+    /// Adds a function that stops or resets all, or the actuator of the one in `charge`. It fails for a negative `x`.
     pub(super) fn offer_control(&mut self, definition: &str, attributes: Attributes, charge: Option<Slot>) -> Slot {
         let word = charge.and_then(|slot| self.functions.function(slot).unwrap().handler.lease.clone());
         self.add_with(definition, attributes, Run::Held, word)
@@ -86,7 +86,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.functions.add_function(&definition, attributes, Handler::new(run, lease)).unwrap()
     }
 
-    /// Publishes everything that it offers.
+    /// Publishes all functions that were added.
     pub(super) fn publish(&mut self) -> u32 {
         for function in self.functions.iter() {
             self.hub.hub.publications.publish_to_all(function.slot).unwrap();
@@ -98,7 +98,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.is_live_behind(slot, Duration::ZERO)
     }
 
-    /// What an interrupt is told that falls so long behind the moment at which the session began to look at something.
+    /// What a lease tells an interrupt that reads it `later` than the session's time.
     pub(super) fn is_live_behind(&self, slot: Slot, later: Duration) -> bool {
         self.functions
             .function(slot)
@@ -130,12 +130,12 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.request_with(function, parameters, &WANTED, true)
     }
 
-    /// A request that wants no reply.
+    /// A request without a reply.
     pub(super) fn notify(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
         self.request_with(function, parameters, &WANTED, false)
     }
 
-    /// Answers the oldest call that waits.
+    /// Answers the oldest call that is held.
     pub(super) fn answer_held(&mut self, result: Result<&ParametersView, Error>) {
         let call = self.held.remove(0);
         let result = result.map(|results| {
@@ -150,7 +150,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.session.close(context!(self), reason);
     }
 
-    /// What the hub tells the link because of another one.
+    /// Passes the session a directive of the hub.
     pub(super) fn direct(&mut self, directive: Directive) {
         self.session.direct(context!(self), directive);
     }
@@ -167,19 +167,19 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.session.cancel(context!(self), call);
     }
 
-    /// Whether an order of a function may go on, by its own look.
+    /// Whether an order is live, as its handler sees it.
     pub(super) fn continues(&self, call: &Incoming) -> bool {
         let lease = &self.functions.function(call.slot).unwrap().handler.lease;
         lease.as_ref().unwrap().is_live_for(call.order.unwrap(), self.now)
     }
 
-    /// The vehicle's program says that it has finished an order of a function.
+    /// The vehicle's program reports an order as finished.
     pub(super) fn end_order(&mut self, slot: Slot, order: Order) -> bool {
         let lease = self.functions.function(slot).unwrap().handler.lease.clone().unwrap();
         self.session.end_order(context!(self), &lease, order)
     }
 
-    /// The order that a call of the peer has here.
+    /// The order of a call of the peer.
     pub(super) fn order_of(&self, call: CallId) -> Order {
         let granted = self.session.granting.granted.iter().find(|granted| granted.call == call.0);
         granted.and_then(|granted| granted.order).unwrap()
@@ -190,7 +190,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.session.withdraw(context!(self), slot)
     }
 
-    /// Another table, or none.
+    /// Changes the access table.
     pub(super) fn set_table(&mut self, table: Option<Table>) -> u32 {
         self.table = table;
         self.session.access_changed(context!(self))
@@ -204,24 +204,24 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.session.set_constraints(context!(self), constraints);
     }
 
-    /// Puts another function in the place of the one of its name, and publishes nothing.
+    /// Replaces the function of the same name, without publishing it.
     pub(super) fn replace(&mut self, definition: &str) {
         let definition = Definition::parse(definition).unwrap();
         let handler = Handler::new(Run::Now(|_| Ok(())), Some(Rc::default()));
         self.functions.replace(&definition, setup::attributes(&definition, 0), handler).unwrap();
     }
 
-    /// Bytes arrive in the stream that the other end did not send.
+    /// Forged bytes arrive in the stream.
     pub(super) fn hear(&mut self, bytes: &[u8]) {
         self.inbox.extend_from_slice(bytes);
     }
 
-    /// A request arrives that the other end did not send.
+    /// A forged request arrives.
     pub(super) fn hear_request(&mut self, header: &RequestHeader, priority: Priority, block: &[u8]) {
         self.hear_message(&[&header.encode()[..], block].concat(), priority);
     }
 
-    /// A message arrives that the other end did not send.
+    /// A forged message arrives.
     pub(super) fn hear_message(&mut self, message: &[u8], priority: Priority) {
         let chunking = Chunking { chunk: 1_024, overhead: 0 };
         let mut frames = vec![0; chunking.framed_length(message.len())];
@@ -229,19 +229,19 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.hear(&frames);
     }
 
-    /// A datagram arrives that the other end did not send.
+    /// A forged datagram arrives.
     pub(super) fn hear_datagram(&mut self, nonce: u64, body: &[u8]) {
         self.work(vec![(nonce, body.to_vec())]);
     }
 
-    /// The other end is believed to have published a function.
+    /// Makes this end believe that the other has published a function.
     pub(super) fn hear_of(&mut self, definition: &str, slot: u16, generation: u16) {
         let definition = Definition::parse(definition).unwrap();
         let attributes = setup::attributes(&definition, 0);
         self.session.wire.theirs.insert(Slot(slot), Generation(generation), attributes, definition.as_bytes()).unwrap();
     }
 
-    /// Others use up the pool.
+    /// Takes all buffers, as other links may.
     pub(super) fn take_buffers(&mut self) -> Vec<Box<[u8]>> {
         core::iter::from_fn(|| self.pool.take()).collect()
     }
@@ -250,7 +250,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         buffers.into_iter().for_each(|buffer| self.pool.give(buffer));
     }
 
-    /// What became of a call, once it has ended.
+    /// The outcome of a call, once it has ended.
     pub(super) fn outcome(&self, id: CallId) -> Option<Result<&ParametersView, Error>> {
         self.happened.iter().find_map(|event| match event {
             Event::Reply(known, result) if *known == id => {
@@ -278,7 +278,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.happened.contains(wanted)
     }
 
-    /// It has been told that a lease of this call of it ended, and why.
+    /// Whether this end was notified that the lease of its call ended for this reason.
     pub(super) fn is_reported(&self, wanted: CallId, reason: LeaseEnd) -> bool {
         self.count(|event| matches!(*event, Event::LeaseEnded { call, why, .. } if (call, why) == (wanted, reason))) > 0
     }

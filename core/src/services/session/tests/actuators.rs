@@ -1,4 +1,4 @@
-//! What moves is an actuator: functions share it, one order at a time has it, a stop ends that order and lets none begin.
+//! Actuators: functions share one, one order at a time has it, and a stop ends that order and keeps others from beginning.
 
 use std::vec::Vec;
 
@@ -16,7 +16,7 @@ use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
 const LEASE: Duration = Duration::from_millis(500);
-/// Longer than what is rounded away of the time of a latch.
+/// Longer than the rounding of a latch's time.
 const MOMENT: Duration = Duration::from_millis(5);
 
 const STOP: Attributes =
@@ -41,7 +41,7 @@ fn call(pair: &mut Pair, function: &str) -> CallId {
     id
 }
 
-/// The same, for a function whose calls the test answers: what it answers.
+/// The same for a function whose calls the test answers, with this answer.
 fn control(pair: &mut Pair, function: &str, answer: Result<(), Error>) -> CallId {
     let id = call(pair, function);
     answer_held(pair, answer);
@@ -61,7 +61,7 @@ fn outcome(pair: &Pair, id: CallId) -> Result<(), Error> {
     pair.manager.outcome(id).expect("it has an outcome").map(|_| ())
 }
 
-/// What the manager was told last of what a function of the vehicle moves.
+/// The state of a function's actuator as the manager was last notified.
 fn state(pair: &Pair, slot: Slot) -> Option<ActuatorState> {
     let reported = pair.manager.happened.iter().rev();
     reported.copied().find_map(|event| match event {
@@ -88,7 +88,7 @@ fn a_newer_order_of_the_same_actuator_takes_the_place_of_the_older_one_without_t
     pair.run(Duration::from_secs(2));
     assert!(pair.agv.is_live(go) && pair.agv.is_live(dock) && pair.agv.is_live(lift), "{other:?} goes on as well");
     assert!(pair.manager.session.holds(second) && !pair.manager.session.holds(first));
-    // Its holder gives it up: the drive stands, the fork does not.
+    // The holder releases it: the drive stops, the fork does not.
     pair.manager.release(dock).unwrap();
     pair.settle();
     assert!(!pair.agv.is_live(go) && pair.agv.is_live(lift) && hooks(&pair) == 1);
@@ -149,7 +149,7 @@ fn an_operator_and_the_program_of_one_unit_hold_for_themselves() {
         assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 1, operator }));
         pair.run(Duration::from_secs(2));
         assert!(pair.agv.is_live(go) && pair.manager.session.holds(first) && hooks(&pair) == 0, "it goes on");
-        // Its own one replaces it, without a word.
+        // A call of the same holder replaces it, without a hook.
         let newer = call_of(&mut pair, operator, false, "dock");
         assert_eq!(outcome(&pair, newer), Ok(()));
         assert!(pair.manager.is_reported(first, LeaseEnd::Replaced));
@@ -160,7 +160,7 @@ fn an_operator_and_the_program_of_one_unit_hold_for_themselves() {
         assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 1, operator: !operator }));
         pair.run(Duration::from_secs(2));
         assert!(pair.agv.is_live(go) && pair.manager.session.holds(taken) && hooks(&pair) == 0);
-        // What has ended is held by none.
+        // An order that has ended holds nothing.
         pair.manager.release(go).unwrap();
         pair.settle();
         assert!(!pair.agv.is_live(go) && hooks(&pair) == 1);
@@ -186,7 +186,7 @@ fn a_stop_ends_the_order_of_an_operator_and_of_the_program_alike() {
 #[test]
 fn calls_of_an_operator_do_not_give_way_to_those_of_the_program() {
     let (mut pair, _) = vehicle();
-    // The vehicle says nothing of what it has replaced.
+    // The vehicle's notifications of replaced orders do not arrive.
     pair.manager.net.frozen = true;
     let options = |operator| RequestOptions { operator, ..RequestOptions::renewing(Renew::Process) };
     let request = |pair: &mut Pair, operator| pair.manager.request_with("go", &none(), &options(operator), false);
@@ -218,7 +218,7 @@ fn a_stop_ends_all_orders_before_its_handler_runs_and_lets_none_begin() {
     );
     let refused = call(&mut pair, "dock");
     assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 1, reason: 0 }));
-    // It lasts until a reset, whatever becomes of the link and of the stop's own handler.
+    // The latch lasts until a reset, whatever becomes of the link and of the stop's own handler.
     answer_held(&mut pair, Ok(()));
     pair.run(Duration::from_secs(60));
     let refused = call(&mut pair, "go");
@@ -268,7 +268,7 @@ fn a_reset_does_not_undo_a_stop_that_came_while_it_ran() {
     pair.run(MOMENT);
     let resetting = call(&mut pair, "free");
     pair.run(MOMENT);
-    // The vehicle's own: a bumper. The first reason stays.
+    // The vehicle stops itself, as by a bumper. The first reason stays.
     let now = pair.agv.now;
     let function = pair.agv.functions.function(go).unwrap();
     function.handler.inhibit(now, Latch { by: 0, reason: 9 });
@@ -298,7 +298,7 @@ fn a_stop_is_noticed_on_a_link_that_has_nothing_to_do() {
     let driving = call(&mut pair, "go");
     let now = pair.agv.now;
     pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
-    // A keep-alive later.
+    // One keep-alive interval later.
     pair.run(Duration::from_millis(1_001));
     assert!(pair.manager.is_reported(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
 }
@@ -306,7 +306,7 @@ fn a_stop_is_noticed_on_a_link_that_has_nothing_to_do() {
 #[test]
 fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
     let (mut pair, [go, ..]) = vehicle();
-    // The stop overtakes it: it is in another class, and the stream stands still.
+    // The stop overtakes the call: it is in another class, and the stream is stuck.
     pair.manager.net.frozen = true;
     let old = pair.manager.call("go", &none()).unwrap();
     pair.manager.call("halt", &none()).unwrap();
@@ -315,7 +315,7 @@ fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
     is_older_than_the_stop(&mut pair, go, old);
 }
 
-/// The stop is reset, and what was called before it comes.
+/// The stop is reset, and then a call that was made before the stop arrives.
 fn is_older_than_the_stop(pair: &mut Pair, go: Slot, old: CallId) {
     pair.run(MOMENT);
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
@@ -327,7 +327,7 @@ fn is_older_than_the_stop(pair: &mut Pair, go: Slot, old: CallId) {
     assert!(!pair.agv.is_live(go));
 }
 
-/// A wish that is older than a stop begins on no link, whichever one brought the stop.
+/// A call that is older than a stop begins on no link, whichever link brought the stop.
 #[test]
 fn a_call_of_another_unit_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
     let (mut pair, [go, ..]) = vehicle();
@@ -342,7 +342,7 @@ fn a_call_of_another_unit_that_was_made_before_the_stop_does_not_begin_after_the
     assert!(pair.agv.is_live(go), "{:?}", outcome(&pair, new));
 }
 
-/// A stop from an interrupt may fall between the two steps of a reset; it may come in the millisecond of the one before.
+/// A stop from an interrupt may come between the two steps of a reset, and within the same millisecond as the stop before.
 #[test]
 fn a_reset_lifts_no_stop_but_the_one_that_it_saw() {
     let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
@@ -365,13 +365,13 @@ fn what_is_finished_is_an_order_of_the_actuator_that_was_named() {
     pair.run(LEASE);
     assert!(pair.agv.is_live(go) && !pair.agv.is_live(lift));
     assert!(pair.manager.is_reported(lifts, LeaseEnd::Finished) && pair.manager.session.holds(drives));
-    // Whichever function moves it: the order is the actuator's.
+    // By any function of the actuator: the order belongs to the actuator.
     assert!(pair.agv.end_order(dock, driving));
     pair.run(LEASE);
     assert!(pair.manager.is_reported(drives, LeaseEnd::Finished) && hooks(&pair) == 0);
 }
 
-/// What was stopped was not finished, even if its program says so before anything has looked.
+/// A stopped order is not finished, even if its program reports that before the session has looked at the lease.
 #[test]
 fn what_was_stopped_is_made_safe_and_not_finished() {
     let (mut pair, [go, ..]) = vehicle();
@@ -402,7 +402,7 @@ fn nothing_comes_alive_under_a_latch() {
     assert!(!lease.is_live(now) && !lease.lasts_beyond(now) && !lease.renew(order, now + LEASE));
     assert_eq!(lease.claim(now, now + LEASE, &claim), Err(Error::Inhibited { by: 0, reason: 1 }));
     assert_eq!(lease.begin(now, now + LEASE), None);
-    // Its hook is still to run when the latch is lifted.
+    // The hook still has to run after the reset.
     lease.reset(now + MOMENT, now + MOMENT);
     assert_eq!(lease.latch(), None);
     assert_eq!(lease.claim(now + MOMENT, now + LEASE, &claim), Err(Error::Expired), "it was made before the stop");
@@ -459,7 +459,7 @@ fn what_its_caller_gave_up_is_told_as_released() {
     pair.manager.release(go).unwrap();
     pair.run(Duration::from_secs(1));
     assert_eq!((ended(&pair), hooks(&pair)), (Some(LeaseEnd::Released), 2));
-    // Its link's session hears of the release before it looks whether something else was faster.
+    // The session of its link processes the release before it checks for other stops.
     let moves = call(&mut pair, "go");
     let now = pair.agv.now;
     pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
@@ -492,7 +492,7 @@ fn the_vehicles_own_latch_is_told_within_a_keep_alive() {
     assert_eq!(state(&pair, go), Some(ActuatorState { latch: Some(latch), last: None }));
 }
 
-/// Its link's nonce is a secret where there are no keys.
+/// In plain mode the link's nonce is a secret.
 #[test]
 fn who_moves_it_is_told_to_others_but_not_by_which_link() {
     let (mut pair, [go, ..]) = vehicle();

@@ -1,4 +1,4 @@
-//! Whatever the network does: every call ends once, runs at most once, in order of its class, and nothing leaks.
+//! Whatever the network does: every call ends once, runs at most once and in order of its class, and nothing leaks.
 
 use std::collections::BTreeMap;
 use std::vec;
@@ -60,7 +60,7 @@ fn act() -> impl Strategy<Value = Act> {
     ]
 }
 
-/// Little but one-way messages, which gather, and calls that are answered behind them.
+/// Mostly one-way messages, which are gathered, and calls that are answered after them.
 fn gathering_act() -> impl Strategy<Value = Act> {
     let priority = || prop::sample::select(&[Priority::High, Priority::Normal, Priority::Low][..]);
     let request = |function, wants_reply| {
@@ -80,7 +80,7 @@ fn gathering_act() -> impl Strategy<Value = Act> {
     ]
 }
 
-/// What was requested of one end by the other.
+/// What one end has requested of the other.
 #[derive(Default)]
 struct Asked {
     calls: BTreeMap<CallId, i64>,
@@ -122,14 +122,14 @@ fn apply(pair: &mut Pair, asked: &mut [Asked; 2], act: Act, manager: bool) {
     check_nothing_stays(&pair.agv);
 }
 
-/// Bytes that the network has not refused have a time at which they go out.
+/// If bytes are queued and the network has not refused any, a deadline must send them.
 fn check_nothing_stays(side: &Side) {
     let Side { session, now, .. } = side;
     let gathers = session.is_live() && session.wire.link.queued() > 0 && !session.wants_to_write();
     assert!(!gathers || session.deadline() <= *now + GATHER, "{} bytes stay", session.wire.link.queued());
 }
 
-/// Everything comes right again, and every call that still runs is answered.
+/// The network recovers, and all running calls are answered.
 fn recover(pair: &mut Pair, asked: &mut [Asked; 2]) {
     for (index, asked) in asked.iter_mut().enumerate() {
         let side = if index == 1 { &mut pair.manager } else { &mut pair.agv };
@@ -147,7 +147,7 @@ fn recover(pair: &mut Pair, asked: &mut [Asked; 2]) {
     pair.run(Duration::from_secs(5));
 }
 
-/// The calls of `caller` against what `callee` ran.
+/// Compares the calls of `caller` with what `callee` ran.
 fn check(caller: &Side, callee: &Side, calls: &BTreeMap<CallId, i64>) {
     let mut ran: BTreeMap<i64, usize> = BTreeMap::new();
     for x in callee.started().filter_map(|started| started.x) {
@@ -198,7 +198,7 @@ fn chaos(acts: &[(Act, bool)], buffers: usize, ordered: bool) {
     }
 }
 
-/// The same without what may overtake the stream.
+/// The same without anything that may overtake the stream.
 fn in_the_stream((act, manager): (Act, bool)) -> (Act, bool) {
     let act = match act {
         Act::Request { function, priority, wants_reply, .. } => {
@@ -222,7 +222,7 @@ proptest! {
         chaos(&acts, 4, true);
     }
 
-    /// As many buffers as boards have: the gathered messages of one class take the last one.
+    /// As few buffers as on boards: gathered messages of one class take the last one.
     #[test]
     fn calls_survive_gathering_with_few_buffers(
         acts in prop::collection::vec((gathering_act(), any::<bool>()), 1..20), buffers in 2..4_usize,

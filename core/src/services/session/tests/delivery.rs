@@ -1,4 +1,4 @@
-//! At most once, in time, in order, the urgent first.
+//! Delivery: at most once, in time, in order, emergencies first.
 
 use std::vec;
 use std::vec::Vec;
@@ -170,7 +170,7 @@ fn when_no_slot_is_free_a_class_keeps_its_order_and_higher_ones_go_first() {
     assert_eq!(pair.agv.ran(), ["first", "high", "second", "third", "low"]);
 }
 
-/// The hello tells how many calls may be here at a time; where they are slow, none of them is refused.
+/// The hello advertises how many calls may be here at a time; none of those is refused, however slow they are.
 #[test]
 fn as_many_calls_as_were_told_find_a_place_however_slow_they_are() {
     let mut pair = Pair::with(&Setup { running: 2, ..Setup::default() });
@@ -204,7 +204,7 @@ fn of_the_calls_that_arrive_together_the_urgent_run_first() {
     assert_eq!(pair.agv.ran(), ["emergency", "high", "normal", "low"]);
 }
 
-/// One emergency has a place to wait: those that arrive in one read with others behind them need none.
+/// One emergency can wait. Emergencies that arrive in one read begin at once, so need no place to wait.
 #[test]
 fn emergencies_that_arrive_together_all_run() {
     let mut pair = Pair::live();
@@ -240,7 +240,7 @@ fn an_emergency_overtakes_a_long_message_between_its_chunks() {
     pair.settle();
     let began: Vec<usize> = pair.agv.started().map(|started| started.received).collect();
     assert_eq!(pair.agv.ran(), ["stop", "read"]);
-    // The rest of one chunk, the emergency itself, and what the pipe held.
+    // The rest of one chunk, the emergency itself, and the capacity of the pipe.
     assert!(began[0] - before <= 1_024 + EMERGENCY_BYTES + 200, "{} bytes", began[0] - before);
 }
 
@@ -258,7 +258,7 @@ fn a_best_effort_request_goes_in_one_datagram_or_not_at_all() {
     assert_eq!((pair.agv.ran(), pair.manager.net.writes.len()), (vec!["log"], writes));
 }
 
-/// In plain mode nothing but the address tells a datagram of the peer from one of a host that knows the link's nonce.
+/// In plain mode only the address distinguishes the peer's datagram from one of a host that knows the link's nonce.
 #[test]
 fn a_session_datagram_from_another_address_than_the_peers_is_dropped() {
     let mut pair = Pair::live();

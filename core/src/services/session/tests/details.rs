@@ -39,7 +39,7 @@ impl Side {
         self.session.cancel_but_wait(context!(self), id);
     }
 
-    /// Calls that were given up while they ran, as the port is told.
+    /// How many running calls the port was notified of as given up.
     fn cancelled(&self) -> usize {
         self.count(|event| matches!(event, Event::Cancelled(_)))
     }

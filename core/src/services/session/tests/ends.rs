@@ -1,4 +1,4 @@
-//! How a link ends, and what is left of it: nothing.
+//! How a link ends, leaving nothing behind.
 
 use std::vec::Vec;
 

@@ -1,4 +1,4 @@
-//! One-way messages that go out together.
+//! One-way messages that are written together.
 
 use super::pair::Pair;
 use super::setup::Setup;
@@ -9,7 +9,7 @@ use crate::services::session::RequestOptions;
 use crate::storage::LEFT_BY_SENDING;
 use crate::time::Duration;
 
-/// A pair that has been quiet, and whose writes are counted from here.
+/// A pair that has been idle, and whose writes are counted from here.
 fn quiet() -> Pair {
     let mut pair = Pair::live();
     pair.agv.offer("log(x: int)", |_| Ok(()));
@@ -109,7 +109,7 @@ fn what_has_gathered_when_the_link_closes_still_arrives() {
     assert_eq!(pair.agv.counter(LinkCounter::RequestsReceived), 2);
 }
 
-/// An AGV with one buffer to send from has begun a call, and gathers a message in it.
+/// An AGV with one buffer for sending has begun a call, and gathers a message in that buffer.
 fn answering_behind_gathered() -> Pair {
     let mut pair = Pair::with(&Setup { buffers: 1 + LEFT_BY_SENDING, ..Setup::default() });
     pair.agv.offer_held("ask()");
@@ -137,7 +137,7 @@ fn an_answer_sends_the_gathered_messages_that_hold_the_buffer_it_needs() {
 #[test]
 fn a_refused_message_leaves_no_gathered_one_behind() {
     let mut pair = answering_behind_gathered();
-    // Another link holds what the pool has, so that the answer is refused whatever this link gives back.
+    // Other links hold all buffers of the pool, so the answer is refused even when this link returns its own.
     let taken = pair.agv.take_buffers();
     pair.agv.net.capacity = 0;
     pair.agv.answer_held(Ok(&*none()));

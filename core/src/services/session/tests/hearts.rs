@@ -1,4 +1,4 @@
-//! What is renewed for a loop goes on only while that loop beats its heart, and while the callee answers.
+//! An order with a heart continues only while the heart beats, and while the callee answers renewals.
 
 use std::boxed::Box;
 
@@ -25,7 +25,7 @@ fn named(beats: Beats) -> RequestOptions {
     RequestOptions::renewing(Renew::Heart(beats))
 }
 
-/// A pair whose manager has called a function that lasts `LEASE`.
+/// A pair whose manager has called a function with the lease `LEASE`.
 fn moving(options: &RequestOptions) -> (Pair, Slot, CallId) {
     let mut pair = Pair::live();
     let slot = pair.agv.offer_leased("go()", LEASE);
@@ -36,7 +36,7 @@ fn moving(options: &RequestOptions) -> (Pair, Slot, CallId) {
     (pair, slot, call)
 }
 
-/// Beats once a period, `times` times.
+/// Beats `times` times, once per period.
 fn beat(pair: &mut Pair, heart: &Heart, times: u32) {
     for _ in 0..times {
         heart.beat(pair.manager.now);
@@ -151,7 +151,7 @@ fn a_heart_that_stops_releases_all_that_it_renewed() {
     assert_eq!(slots.map(|slot| pair.agv.is_live(slot)), [false, true, false]);
 }
 
-/// The way from the vehicle is cut, its renewals arrive.
+/// Nothing arrives from the vehicle; the manager's renewals arrive there.
 fn cut_from_the_vehicle(pair: &mut Pair) -> Instant {
     (pair.agv.net.frozen, pair.agv.net.datagrams) = (true, Datagrams::Lost);
     pair.manager.now

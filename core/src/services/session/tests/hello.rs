@@ -49,7 +49,7 @@ fn a_claim_that_is_fenced_is_told_to_both() {
                 obeys(pair);
             }
         });
-        // The vehicle's hello, which has been sent, did not say so: the vehicle refuses.
+        // The vehicle's hello was sent before it obeyed this claim, so the vehicle refuses.
         if !manager_refuses {
             obeys(&mut pair);
         }
@@ -74,12 +74,12 @@ fn no_hello_in_time_ends_the_link() {
 fn another_version_is_told_to_both() {
     let mut pair = Pair::connected(&Setup::default());
     let mut bytes = pair.agv.net.deliver().0;
-    // Behind length, kind and magic: the first version that the end speaks.
+    // After length, kind and magic: the first version that the end speaks.
     const FIRST: usize = 2 + 1 + 4;
     bytes[FIRST] += 1;
     pair.manager.hear(&bytes);
     pair.step();
-    // It answers with its own hello, from which the other end learns the versions that it speaks.
+    // The answer is its own hello, from which the other end learns its versions.
     let mut answer = pair.manager.net.deliver().0;
     assert_eq!(answer[2], 1, "a hello, and a refusal behind it");
     answer[FIRST] += 1;

@@ -1,4 +1,4 @@
-//! Whatever a peer sends: the link lives or ends, nothing panics, nothing is kept.
+//! Whatever a peer sends, the link lives or ends; nothing panics or leaks.
 
 use std::vec;
 use std::vec::Vec;
@@ -21,7 +21,7 @@ use crate::host::connections::{LinkCounter, Report};
 use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
 use crate::time::Duration;
 
-/// What can be said of two pairs of small numbers, so that many of them mean something to the one who hears it.
+/// Messages made of small numbers, so that many of them are valid for the receiver.
 fn message() -> impl Strategy<Value = Vec<u8>> {
     let number = prop_oneof![8 => 0..6_u32, 1 => any::<u32>()];
     let stamp = prop_oneof![4 => 5_000_000_000..5_002_000_000_u64, 4 => 10_000_000..12_000_000_u64, 1 => any::<u64>()];
@@ -55,7 +55,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
             7 => {
                 control(&publish(two, three, if flag { &block } else { KNOWN.get(one as usize).unwrap_or(&KNOWN[0]) }))
             }
-            // The last one is of a later version, and must be understood.
+            // The last is of a later version, and must be understood.
             8 => any_items(&[(0x8000, &[]), (1, &[])]),
             kind => any_items(&[(0x700, &[one]), (kind - 8, &[one, two, three]), (kind - 8, &[three, two, one])]),
         },
@@ -78,7 +78,7 @@ fn publish(slot: u32, generation: u32, signature: &[u8]) -> Control<'_> {
     }
 }
 
-/// A control message of items of these kinds, with numbers for their fields as far as they fit there.
+/// A control message of items of these kinds, with these numbers as their first fields.
 fn any_items(items: &[(u16, &[u32])]) -> Vec<u8> {
     [&[3, 0, 0, 0][..], &list(items, |writer, numbers| writer.numbers(numbers))].concat()
 }
@@ -88,7 +88,7 @@ fn control(control: &Control<'_>) -> Vec<u8> {
     control.encode(&mut out).unwrap().to_vec()
 }
 
-/// A frame, or several of a message.
+/// One frame, or several of one message.
 fn frames() -> impl Strategy<Value = Vec<u8>> {
     let chunk = prop_oneof![Just(1_024_usize), 320..1_024_usize];
     let chunked = (message(), 1..4_u8, chunk).prop_map(|(message, priority, chunk)| {
@@ -134,7 +134,7 @@ fn release(call: u32, class: u8) -> Vec<u8> {
     SessionBody::release(&Release { call, class: Priority::from_wire(class).unwrap() }).to_vec()
 }
 
-/// A pair where each end has published something of each kind and calls the other.
+/// A pair in which each end has published one thing of each kind and calls the other.
 fn busy_pair() -> Pair {
     let mut pair = Pair::live();
     for side in [&mut pair.manager, &mut pair.agv] {
@@ -228,7 +228,7 @@ fn what_a_later_version_says_beside_it_is_counted_and_passed_over() {
     pair.manager.hear_message(&any_items(&[(0x700, &[7]), one, (0x701, &[]), two]), Priority::High);
     pair.settle();
     assert_eq!(skipped(&pair), 2);
-    // A frame with 40 hex as its kind, and a session body 200.
+    // A frame of kind 0x40, and a session body of kind 200.
     pair.manager.hear(&[3, 0, 0x40, 1, 2, 2, 0, 6, 200]);
     pair.settle();
     assert_eq!(skipped(&pair), 3);

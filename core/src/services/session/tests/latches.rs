@@ -1,4 +1,4 @@
-//! A latch ends by a reset alone: it survives each change of a vehicle's list of functions.
+//! Only a reset ends a latch: it survives each change of a vehicle's list of functions.
 
 use std::rc::Rc;
 
@@ -13,7 +13,7 @@ use crate::services::lease::{Latch, Lease};
 use crate::time::Duration;
 
 const LEASE: Duration = Duration::from_millis(500);
-/// Longer than what is rounded away of the time of a latch.
+/// Longer than the rounding of a latch's time.
 const MOMENT: Duration = Duration::from_millis(5);
 const STOP: Attributes =
     Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::NORMAL };
@@ -42,7 +42,7 @@ fn call(pair: &mut Pair, function: &str) -> Result<(), Error> {
     pair.manager.outcome(id).unwrap().map(drop)
 }
 
-/// A handler of a drive of its own.
+/// A handler with its own drive.
 fn fresh() -> (Handler, Rc<Lease>) {
     let lease = Rc::<Lease>::default();
     (Handler::new(Run::Now(|_| Ok(())), Some(Rc::clone(&lease))), lease)
@@ -132,7 +132,7 @@ fn a_drive_that_was_reset_by_itself_is_not_stopped_again_by_what_comes_to_move_i
     assert_eq!((call(&mut pair, "dock"), call(&mut pair, "go")), (Ok(()), Ok(())));
 }
 
-/// A vehicle that had been stopped when it lost power, and can keep a bit, or whose program says so.
+/// A vehicle that was stopped when it lost power, and either stores one bit or has a program that says so.
 #[test]
 fn a_unit_that_starts_stopped_stops_all_that_it_adds() {
     let mut pair = Pair::live();
@@ -144,7 +144,7 @@ fn a_unit_that_starts_stopped_stops_all_that_it_adds() {
     assert_eq!((call(&mut pair, "free"), call(&mut pair, "go")), (Ok(()), Ok(())));
 }
 
-/// A stop of all also stops what the caller does not see.
+/// A stop of all also stops functions that its caller cannot see.
 #[test]
 fn a_stop_of_all_stops_what_is_shown_to_other_nodes() {
     let (mut pair, _) = vehicle();

@@ -1,4 +1,4 @@
-//! What moves goes on only while somebody wants it to.
+//! Motion continues only while its caller renews it.
 
 use proptest::prelude::*;
 
@@ -18,7 +18,7 @@ use crate::time::Duration;
 
 const LEASE: Duration = Duration::from_millis(500);
 
-/// A pair whose manager has begun `go()`, and its slot. With `renew`, it wants it to go on.
+/// A pair whose manager has called `go()`, and the function's slot. With `renew` the call is renewed.
 fn moving(renew: bool) -> (Pair, Slot) {
     let mut pair = Pair::live();
     let slot = pair.agv.offer_leased("go()", LEASE);
@@ -35,7 +35,7 @@ fn expirations(pair: &Pair) -> usize {
     pair.agv.count(|event| matches!(event, Event::LeaseExpired(_)))
 }
 
-/// The manager has been told so of its first call.
+/// Whether the manager was notified of the end of its first call.
 fn is_reported(pair: &Pair, why: LeaseEnd) -> bool {
     pair.manager.is_reported(CallId(1), why)
 }
@@ -50,7 +50,7 @@ fn a_lease_that_is_renewed_goes_on() {
     assert_eq!(expirations(&pair), 0);
 }
 
-/// A lease of 20 ms is renewed as often as it has to be; one that a peer makes shorter, no more often.
+/// A lease of 20 ms is renewed as often as needed; a shorter one, which a peer may publish, no more often than that.
 #[test]
 fn renewals_of_a_short_lease_do_not_fill_the_network() {
     for (millis, lives) in [(5, false), (20, true)] {
@@ -109,12 +109,12 @@ fn a_lease_ends_in_time_when_nothing_comes_through() {
     assert_eq!(expirations(&pair), 1);
 }
 
-/// No interrupt has looked, and the session has not been polled since.
+/// No interrupt has read the lease since its end, and the session has not been polled.
 #[test]
 fn a_renewal_that_comes_after_the_end_revives_nothing() {
     let (mut pair, slot) = moving(true);
     pair.run(LEASE);
-    // Its end is rounded down to the millisecond before; the manager has not given up yet.
+    // The end is rounded down to the previous millisecond; the manager has not timed out yet.
     pair.suspend_agv(LEASE - Duration::from_micros(500));
     assert!(!pair.agv.is_live(slot));
     assert!(is_reported(&pair, LeaseEnd::Expired));
@@ -128,7 +128,7 @@ fn what_an_interrupt_has_seen_dead_is_not_renewed() {
     (pair.manager.net.frozen, pair.manager.net.datagrams) = (true, Datagrams::Lost);
     pair.run(LEASE - Duration::from_millis(50));
     assert!(pair.agv.is_live(slot));
-    // The session looks at a renewal while the lease lasts, and is not through with it when the lease ends.
+    // The session begins to process a renewal while the lease lasts, and finishes after its end.
     assert!(!pair.agv.is_live_behind(slot, Duration::from_millis(50)));
     pair.manager.net.frozen = false;
     pair.settle();
@@ -145,7 +145,7 @@ fn what_an_interrupt_has_seen_dead_is_not_renewed() {
 #[test]
 fn an_order_does_not_take_the_place_of_a_motion_that_an_interrupt_has_seen_dead() {
     let (mut pair, slot) = moving(false);
-    // Seen while the request is on its way, so that the session gets it before it looks at the lease.
+    // The interrupt reads the lease while the request is in flight, so the session receives that before it polls.
     let early = pair.manager.call("go", &none()).unwrap();
     assert!(!pair.agv.is_live_behind(slot, LEASE));
     pair.run(Duration::from_millis(1));
@@ -156,12 +156,12 @@ fn an_order_does_not_take_the_place_of_a_motion_that_an_interrupt_has_seen_dead(
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, true));
 }
 
-/// What befalls a motion.
+/// Events in the life of a motion.
 #[derive(Clone, Copy, Debug)]
 enum Befalls {
-    /// Milliseconds go by.
+    /// Milliseconds pass.
     Time(u64),
-    /// An interrupt looks, so many milliseconds behind the session's clock.
+    /// An interrupt reads the lease, this many milliseconds later than the session's clock.
     Look(u64),
     Stream(bool),
     Datagrams(bool),
@@ -184,7 +184,7 @@ proptest! {
     #[test]
     fn motors_that_were_switched_off_come_on_by_an_order_only(story in prop::collection::vec(befalls(), 1..60)) {
         let (mut pair, slot) = moving(true);
-        // The orders that were running when it was last seen dead.
+        // The orders that were running when the lease was last seen dead.
         let mut dead_at = None;
         for step in story {
             let mut later = Duration::ZERO;
@@ -228,7 +228,7 @@ fn either_way_of_a_renewal_is_enough() {
 #[test]
 fn renewals_that_come_late_take_nothing_away() {
     let (mut pair, slot) = moving(true);
-    // The stream lags behind the datagrams, and room for one renewal is in the pipe.
+    // The stream is slower than the datagrams, and its pipe has capacity for one renewal.
     (pair.manager.net.frozen, pair.manager.net.capacity) = (true, 21);
     pair.run(Duration::from_millis(400));
     pair.manager.net.datagrams = Datagrams::Lost;
@@ -236,7 +236,7 @@ fn renewals_that_come_late_take_nothing_away() {
     pair.step();
     pair.manager.net.frozen = true;
     assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 0);
-    // The last renewal was made 25 ms ago.
+    // The newest renewal is 25 ms old.
     pair.run(LEASE - Duration::from_millis(30));
     assert!(pair.agv.is_live(slot));
     assert_eq!(expirations(&pair), 0);
@@ -308,7 +308,7 @@ fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
     pair.manager.call("work", &none()).unwrap();
-    // One command waits at the callee for its turn, another one at the caller for company: both are given up.
+    // One command is queued at the callee, another gathers at the caller: both are released.
     let reported = pair.manager.notify("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     let late = pair.manager.notify("go", &none()).unwrap();
@@ -332,7 +332,7 @@ fn an_order_that_fails_leaves_nothing_going_on() {
     pair.manager.call("go_to", &x(1)).unwrap();
     pair.settle();
     assert!(pair.agv.is_live(slot));
-    // The newest order replaces the one before it, so when it fails, the old motion is not wanted either.
+    // The newest order has replaced the one before, so if it fails, the old motion must not continue.
     let failed = pair.manager.call("go_to", &x(-1)).unwrap();
     pair.settle();
     assert!(!pair.agv.is_live(slot) && !pair.manager.session.holds(failed));
@@ -354,7 +354,7 @@ fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (0, 0));
 }
 
-/// The program has seen that the first order is done, and says so when the next one of the same function has begun.
+/// The program sees that the first order is done, but reports that only after the next one of the same function has begun.
 #[test]
 fn what_is_finished_is_the_order_that_was_named_and_not_the_newer_one() {
     let (mut pair, slot) = moving(true);

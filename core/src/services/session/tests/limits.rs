@@ -1,4 +1,4 @@
-//! The limits that each end tells the other, and keeps.
+//! The limits that the two ends advertise and enforce.
 
 use std::vec;
 
@@ -31,7 +31,7 @@ fn a_request_above_the_peers_limit_is_not_sent() {
     assert!(pair.manager.call("echo", &text(1_000)).is_ok());
 }
 
-/// Of a peer that keeps no limit: the place of an emergency would hold a little more.
+/// From a peer that ignores limits. The buffer for emergencies could hold a little more.
 #[test]
 fn an_emergency_above_its_limit_is_refused() {
     let mut pair = Pair::live();
@@ -133,7 +133,7 @@ fn the_minimum_interval_is_kept_by_the_callee() {
     pair.agv.offer("go(x: int)", |_| Ok(()));
     pair.publish();
     let ids: std::vec::Vec<_> = (0..4).map(|at| pair.manager.call("go", &x(at)).unwrap()).collect();
-    // It was told too late to hold these back.
+    // The notification of the interval comes too late for these.
     let interval = Duration::from_millis(10);
     pair.agv.set_constraints(Constraints { minimum_interval: interval, ..*pair.agv.session.constraints() });
     pair.settle();
@@ -165,7 +165,7 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     pair.agv.offer_held("work()");
     pair.publish();
     let others = pair.agv.take_buffers();
-    // Of three in one read the last one can be run out of it.
+    // Of three calls in one read, the last could run directly from the read buffer.
     let reported = pair.manager.notify("work", &none()).unwrap();
     let second = pair.manager.call("work", &none()).unwrap();
     let last = pair.manager.call("work", &none()).unwrap();
@@ -179,7 +179,7 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
 }
 
-/// The buffer that it came in is given back, so that as many are left as without it.
+/// The buffer that the call arrived in is returned to the pool, so as many are left as without the call.
 #[test]
 fn a_long_call_finds_one_buffer_more_to_wait_in() {
     for (more, outcome) in [(0, Err(Error::Busy)), (1, Ok(()))] {
@@ -198,7 +198,7 @@ fn a_long_call_finds_one_buffer_more_to_wait_in() {
     }
 }
 
-/// The bytes that refusals may use are few, and none of them are those of an emergency.
+/// Refusals may use only a few bytes, none of which are reserved for emergencies.
 #[test]
 fn refusals_without_a_buffer_are_bounded_and_leave_room_for_an_emergency() {
     let mut pair = Pair::live();

@@ -1,4 +1,4 @@
-//! The core needs no IP: two units find each other and talk over serial lines, which have numbers for addresses.
+//! The core does not need IP: two units find each other and communicate over serial lines, with numbers as addresses.
 
 use core::fmt;
 use std::vec;
@@ -24,7 +24,7 @@ use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};
 
 const FLEET: Fleet = Fleet(1);
-/// The ports of streams and of datagrams.
+/// The ports for streams and datagrams.
 const STREAM: u8 = 1;
 const DATAGRAMS: u8 = 2;
 
@@ -70,7 +70,7 @@ impl Port for Serial {
     type Endpoint = Line;
 }
 
-/// What is on its way; a datagram without a receiver is a broadcast.
+/// Bytes and datagrams in flight; a datagram without a receiver is a broadcast.
 #[derive(Default)]
 struct Wire {
     stream: Vec<u8>,
@@ -152,7 +152,7 @@ impl End {
         self.with(now, |session, cx| session.connected(cx));
     }
 
-    /// Where it dials, if it does.
+    /// The address to dial, if any.
     fn poll(&mut self, now: Instant) -> Option<Line> {
         while self.with(now, |session, cx| session.poll(cx).is_some()) == Some(true) {}
         let Command::Dial { to, identity } = self.hub.node.poll(now, &mut self.wire, &Plain)? else { return None };

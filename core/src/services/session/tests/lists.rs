@@ -1,4 +1,4 @@
-//! What a peer sees of one's functions.
+//! What a peer sees of a unit's functions.
 
 use super::super::Event;
 use super::pair::Pair;
@@ -31,7 +31,7 @@ fn what_is_not_published_cannot_be_called() {
     pair.agv.offer("secret()", |_| Ok(()));
     pair.settle();
     assert_eq!(pair.manager.call("secret", &none()), Err(Error::UnknownFunction));
-    // Nor by somebody who guesses its slot.
+    // Nor can a peer that guesses its slot call it.
     pair.manager.hear_of("secret()", 1, 0);
     let id = pair.manager.call("secret", &none()).unwrap();
     pair.settle();
@@ -63,7 +63,7 @@ fn a_call_that_crosses_a_withdrawal_is_stale() {
     assert!(pair.agv.ran().is_empty());
 }
 
-/// It ran, so it is not stale: asking again would run it twice.
+/// It has run, so the error is not that it is stale: a retry would run it twice.
 #[test]
 fn a_function_that_is_replaced_while_it_runs_has_lost_its_results() {
     let mut pair = Pair::live();
@@ -106,7 +106,7 @@ fn functions_beyond_the_readers_room_are_skipped_and_told() {
     assert_eq!(pair.manager.counter(LinkCounter::FunctionsSkipped), 2);
 }
 
-/// `follow(x: int[..8])`, as a unit that has lists publishes it.
+/// `follow(x: int[..8])`, as published by a unit that has lists.
 const FOLLOW: &[u8] = b"\x06follow\x01\x05\x01\x08\0\0\0x\0\x01\0\0\0\0";
 
 #[test]
@@ -128,7 +128,7 @@ fn a_function_with_lists_is_skipped_by_a_unit_without_them() {
     assert!(pair.block_request("pos_info", &mut *none()).is_ok(), "the others can be called");
 }
 
-/// One that is too long would end the link.
+/// A message with one that is too long would end the link.
 #[cfg(feature = "nested")]
 #[test]
 fn a_signature_that_the_reader_has_no_buffer_for_is_skipped() {

@@ -1,4 +1,4 @@
-//! When a silent peer is given up, and when not.
+//! When a silent peer is lost, and when not.
 
 use super::super::Event;
 use super::super::outbound::{Delivery, RequestOptions};
@@ -16,7 +16,7 @@ fn stream_only() -> Pair {
     Pair::with(&Setup { datagrams: false, ..Setup::default() })
 }
 
-/// How long after the last sign of life both ends give up, in milliseconds.
+/// The time from the last sign of life until both ends end the link, in milliseconds.
 fn silence(mut pair: Pair) -> u64 {
     pair.run(Duration::from_secs(10));
     for side in [&mut pair.manager, &mut pair.agv] {
@@ -43,7 +43,7 @@ fn a_silent_peer_is_given_up_within_three_keep_alives() {
 fn a_silent_peer_is_given_up_as_soon_where_only_the_stream_passes() {
     let millis = silence(stream_only());
     assert!((2_500..=3_600).contains(&millis), "{millis} ms");
-    // The same where datagrams have ceased to pass.
+    // The same if datagrams no longer pass.
     let mut pair = Pair::live();
     pair.run(Duration::from_secs(10));
     lose_datagrams(&mut pair);
@@ -56,7 +56,7 @@ fn lose_datagrams(pair: &mut Pair) {
     pair.agv.net.datagrams = Datagrams::Lost;
 }
 
-/// What each end knows of the datagrams of the other one, and that one of its own.
+/// For each end: whether it receives the peer's datagrams, and whether its own arrive there.
 fn datagrams(pair: &Pair) -> [(Option<bool>, bool); 2] {
     [&pair.manager, &pair.agv].map(|side| (side.session.hears_datagrams(), side.session.is_heard()))
 }
@@ -72,7 +72,7 @@ fn a_link_does_without_datagrams_that_cease_to_pass() {
     for side in [&mut pair.manager, &mut pair.agv] {
         assert!(side.session.is_live());
         assert_eq!(side.counter(LinkCounter::DatagramsMissing), 1);
-        // Of the three that were missed when datagrams ceased. Later ones come in the stream.
+        // The three that were missed when datagrams stopped. Later ones come in the stream.
         assert!(side.counter(LinkCounter::KeepAlivesMissed) <= 4);
         side.net.datagrams = Datagrams::Pass;
     }
@@ -86,7 +86,7 @@ fn each_end_knows_which_direction_of_datagrams_is_blocked() {
     pair.agv.net.datagrams = Datagrams::Lost;
     pair.run(Duration::from_secs(6));
     assert_eq!(datagrams(&pair), [(Some(false), true), (Some(true), false)]);
-    // From the start, and where none is sent at all.
+    // From the start, and if none are sent at all.
     let mut pair = Pair::connected(&Setup::default());
     pair.agv.net.datagrams = Datagrams::Lost;
     pair.run(Duration::from_secs(6));
@@ -114,8 +114,8 @@ fn a_best_effort_call_arrives_where_datagrams_do_not_pass() {
     }
 }
 
-/// The stream of an end, or of both, goes nowhere from now on, and all else passes. When both ends have given it up, in milliseconds,
-/// and why.
+/// From now on the stream of one or both ends delivers nothing; everything else passes. Returns after how many milliseconds both
+/// ends have ended the link, and why.
 fn stream_dead(pair: &mut Pair, manager: bool, agv: bool) -> (u64, CloseReason) {
     (pair.manager.net.frozen, pair.agv.net.frozen) = (manager, agv);
     let dead = |side: &Side| {
@@ -183,7 +183,7 @@ fn dead_streams_are_found_with_any_keep_alive() {
     }
 }
 
-/// A few bytes a second get through, of a message that takes minutes.
+/// A few bytes a second arrive, of a message that takes minutes.
 #[test]
 fn a_stream_that_creeps_is_alive() {
     let mut pair = Pair::live();
@@ -201,7 +201,7 @@ fn a_stream_that_creeps_is_alive() {
     }
 }
 
-/// It leaves what comes in its stream where it is, and says so.
+/// It leaves bytes in its stream unread, and reports that.
 #[test]
 fn a_peer_that_holds_reading_back_is_slow_and_not_dead() {
     for datagrams in [true, false] {

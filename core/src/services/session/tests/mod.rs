@@ -45,7 +45,7 @@ use std::string::String;
 use crate::distribution::parameters::ParametersView;
 use side::Arguments;
 
-/// Parameters that `build` has filled.
+/// Parameters filled by `build`.
 fn parameters(build: impl FnOnce(&mut ParametersView)) -> Arguments {
     let mut parameters: Arguments = Box::default();
     build(&mut *parameters);
@@ -57,7 +57,7 @@ fn none() -> Arguments {
     parameters(|_| ())
 }
 
-/// One integer called `x`.
+/// One integer named `x`.
 fn x(value: i64) -> Arguments {
     parameters(|parameters| {
         parameters.add_int("x", 1).unwrap();
@@ -65,7 +65,7 @@ fn x(value: i64) -> Arguments {
     })
 }
 
-/// One text of `length` characters called `text`, in room for 20,000.
+/// One text named `text` of `length` characters, with capacity for 20,000.
 fn text(length: usize) -> Arguments {
     let content: String = (0..length).map(|at| char::from(b'a' + (at % 23) as u8)).collect();
     parameters(|parameters| {

@@ -1,4 +1,4 @@
-//! The network between the two ends of a pair, as far as one of them writes to it.
+//! The network between two ends, as one of them writes to it.
 
 use core::net::SocketAddr;
 use std::vec::Vec;
@@ -11,7 +11,7 @@ use crate::host::mailman::{LinkId, Mailman};
 /// The UDP port of both ends.
 pub(super) const DATAGRAM_PORT: u16 = 21_970;
 
-/// What becomes of datagrams.
+/// What happens to datagrams.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Datagrams {
     Pass,
@@ -22,10 +22,10 @@ pub(super) enum Datagrams {
 pub(super) struct Net {
     /// Most bytes in the pipe at a time.
     pub(super) capacity: usize,
-    /// Bytes stay in the pipe.
+    /// The pipe delivers nothing.
     pub(super) frozen: bool,
     pub(super) datagrams: Datagrams,
-    /// Lengths of what was written, call by call.
+    /// Length of each write.
     pub(super) writes: Vec<usize>,
     pipe: Vec<u8>,
     queue: Vec<(u64, Vec<u8>)>,
@@ -43,7 +43,7 @@ impl Net {
         self.pipe.len() < self.capacity
     }
 
-    /// Takes out what arrives at the other end: bytes of the stream, and datagrams as (nonce, body).
+    /// Takes what arrives at the other end: bytes of the stream, and datagrams as (nonce, body).
     pub(super) fn deliver(&mut self) -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
         let bytes = if self.frozen { Vec::new() } else { core::mem::take(&mut self.pipe) };
         (bytes, core::mem::take(&mut self.queue))

@@ -25,7 +25,7 @@ fn millis(millis: u64) -> Duration {
     Duration::from_millis(millis)
 }
 
-/// A pair whose vehicle offers `go()`, answered by the test.
+/// A pair whose vehicle offers `go()`; the test answers it.
 fn vehicle() -> (Pair, Slot) {
     let mut pair = Pair::live();
     let slot = pair.agv.offer_held_lease("go()", LEASE);
@@ -33,13 +33,13 @@ fn vehicle() -> (Pair, Slot) {
     (pair, slot)
 }
 
-/// Calls `go()`; in classes of their own, two calls run side by side.
+/// Calls `go()`. Two calls in different classes run side by side.
 fn go(pair: &mut Pair, class: Priority, renew: Renew) -> CallId {
     let options = RequestOptions { renew, priority: Some(class), timeout: Some(TIMEOUT), ..RequestOptions::default() };
     pair.manager.request_with("go", &none(), &options, true).unwrap()
 }
 
-/// The same, begun; what its handler was given.
+/// The same, once it has begun; returns what its handler got.
 fn started(pair: &mut Pair, class: Priority) -> (CallId, Incoming) {
     let id = go(pair, class, Renew::Process);
     pair.settle();
@@ -137,7 +137,7 @@ fn answered_calls_of_several_functions_are_released_at_once_however_often_one_of
         id
     };
     let calls: Vec<CallId> = (0..LEASES).map(|at| call(&mut pair, at)).collect();
-    // Of one function the newest: the peer has replaced those before it.
+    // The newest of one function, since the peer has replaced those before it.
     let newest = [1; 6].map(|at| call(&mut pair, at))[5];
     for (at, id) in [(0, calls[0]), (1, newest), (2, calls[2]), (3, calls[3])] {
         assert!(pair.agv.is_live(slots[at]), "go_{at}");
@@ -156,7 +156,7 @@ fn a_newer_call_replaces_an_older_one_for_ever_and_without_the_hook() {
     assert!(is_reported(&pair, first, LeaseEnd::Replaced));
     assert!(!pair.manager.session.holds(first) && pair.manager.session.holds(second));
     assert!(!pair.agv.continues(&old) && pair.agv.continues(&new));
-    // The end of the first is no matter of the second.
+    // The end of the first order does not affect the second.
     pair.manager.cancel(first);
     pair.settle();
     assert!(pair.agv.continues(&new) && pair.agv.is_live(slot));
@@ -227,7 +227,7 @@ fn release_without_room(renew: Renew) {
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
-    // The stream is stuck and full to the brim; no datagram passes.
+    // The stream is stuck and full; no datagram arrives.
     (pair.manager.net.frozen, pair.manager.net.capacity, pair.manager.net.datagrams) = (true, 0, Datagrams::Lost);
     for _ in 0..1_000 {
         pair.manager.direct(Directive::Challenge);
@@ -284,7 +284,7 @@ fn in_a_full_table_the_oldest_call_of_the_function_gives_way() {
     assert_eq!(pair.agv.ran().len(), 0);
 }
 
-/// The table of renewed calls is full, and the newer call of a function is still on its way when the older one is dropped.
+/// The table of renewed calls is full. The older call of a function is dropped while the newer one is in flight.
 #[test]
 fn what_gives_way_in_a_full_table_is_released_at_once_when_its_caller_drops_it() {
     let (mut pair, slot) = vehicle();
@@ -312,7 +312,7 @@ fn what_gives_way_in_a_full_table_is_released_at_once_when_its_caller_drops_it()
     assert!(pair.agv.is_live(slot), "the newer one begins");
 }
 
-/// A renewal that the manager made so long ago, as it arrives at the vehicle.
+/// A renewal of this age arrives at the vehicle.
 fn renewal_arrives(pair: &mut Pair, call: CallId, class: Priority, age: Duration) {
     let stamp = (pair.agv.now - age).as_micros();
     let renewal = Renewal { call: call.0, class, stamp, since: Duration::ZERO, age: Duration::ZERO };
@@ -345,7 +345,7 @@ fn a_renewal_counts_from_when_it_was_made_and_not_from_its_arrival() {
     pair.agv.answer_held(Ok(&*none()));
     pair.run(millis(400));
     renewal_arrives(&mut pair, call, Priority::Normal, millis(300));
-    // Made 100 ms after the call, it lasts until 600 ms after that.
+    // The renewal was made 100 ms after the call, so the order lasts until 600 ms after the call.
     pair.run(millis(190));
     assert!(pair.agv.is_live(slot));
     pair.run(millis(10));
@@ -367,7 +367,7 @@ fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
     assert_eq!(expirations(&pair), 0, "the hook of the function that is there now runs");
 }
 
-/// Its hook has run with its removal, which is the port's affair.
+/// The port has run the hook when it removed the function.
 #[test]
 fn who_holds_a_lease_of_a_function_that_is_removed_is_told_at_once() {
     let (mut pair, slot) = vehicle();
@@ -383,7 +383,7 @@ fn who_holds_a_lease_of_a_function_that_is_removed_is_told_at_once() {
     assert!(!pair.manager.session.holds(call), "it is renewed no more");
 }
 
-/// The motors' word refuses the new call; where there is none, the unit's own look at the lease does.
+/// If motors read a lease, it refuses the new call; otherwise the unit's own check does.
 #[test]
 fn a_new_call_never_takes_the_place_of_a_dead_lease_before_its_hook_has_run() {
     for has_word in [true, false] {
@@ -395,7 +395,7 @@ fn a_new_call_never_takes_the_place_of_a_dead_lease_before_its_hook_has_run() {
         pair.manager.request_with("go", &none(), &options, false).unwrap();
         pair.run(LEASE - millis(10));
         let early = pair.manager.request_with("go", &none(), &options, false).unwrap();
-        // The request arrives at a vehicle that has not been polled since the lease ended.
+        // The request arrives at a vehicle that was not polled since the lease ended.
         let (stream, _) = pair.manager.net.deliver();
         pair.manager.flush_gathered();
         let (more, _) = pair.manager.net.deliver();

@@ -1,5 +1,4 @@
-//! Calls that move one actuator never overtake each other, whatever their classes and whichever way they go: the one that
-//! was made last counts.
+//! Calls for one actuator never overtake each other, whatever their classes and in stream or datagram: the one made last counts.
 
 use super::super::{Delivery, RequestOptions};
 use super::none;
@@ -39,7 +38,7 @@ fn a_call_of_a_lower_class_does_not_replace_one_that_was_made_later() {
     for (at, low) in classes.into_iter().enumerate() {
         for high in classes.into_iter().skip(at + 1) {
             let (mut pair, [go, ..]) = vehicle();
-            // In one read, so that the one of the higher class begins first.
+            // In one read, so that the one in the higher class begins first.
             let (first, second) = (in_class(&mut pair, "go", low), in_class(&mut pair, "dock", high));
             let other = in_class(&mut pair, "lift", low);
             pair.settle();
@@ -65,7 +64,7 @@ fn a_call_in_a_stream_that_was_held_up_does_not_replace_a_later_datagram_however
         pair.settle();
         assert!(pair.agv.is_live(go));
         if ends {
-            // Another unit has had it since.
+            // Another unit has had the actuator since.
             let order = pair.agv.order_of(second);
             assert!(pair.agv.end_order(go, order));
             let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
@@ -113,7 +112,7 @@ fn a_call_that_was_made_before_it_could_be_sent_keeps_its_place() {
     assert!(pair.agv.is_live(go));
 }
 
-/// What never began replaces nothing.
+/// A call that never began replaces nothing.
 #[test]
 fn a_later_call_that_is_refused_does_not_keep_an_earlier_one_out() {
     let (mut pair, [go, ..]) = vehicle();

@@ -1,4 +1,4 @@
-//! Two sessions joined by pipes in memory, on a clock that jumps to whatever is due next.
+//! Two sessions joined by pipes in memory, on a clock that jumps to the next deadline.
 
 use std::vec::Vec;
 
@@ -13,7 +13,7 @@ use crate::time::{Duration, Instant};
 /// A manager and an AGV on one network.
 pub(super) type Pair = PairOf<true>;
 
-/// The same, whose units can do everything or only serve. Every buffer must have come back when it is dropped.
+/// The same, for units that have everything or only serve. When it is dropped, all buffers must be back in the pools.
 pub(super) struct PairOf<const WHOLE: bool> {
     pub(super) manager: Side<WHOLE>,
     pub(super) agv: Side<WHOLE>,
@@ -21,12 +21,12 @@ pub(super) struct PairOf<const WHOLE: bool> {
 }
 
 impl<const WHOLE: bool> PairOf<WHOLE> {
-    /// Two ends whose connection is open, and nothing sent yet.
+    /// Two ends whose connection is open; nothing has been sent.
     pub(super) fn connected(setup: &Setup) -> Self {
         Self::prepared(setup, |_| ())
     }
 
-    /// The same after something was done to the two ends.
+    /// The same, with `prepare` applied before the connection opens.
     pub(super) fn prepared(setup: &Setup, prepare: impl FnOnce(&mut Self)) -> Self {
         let mut pair =
             Self { manager: Side::new(setup, false, 1), agv: Side::new(setup, true, 2), elapsed: Duration::ZERO };
@@ -36,7 +36,7 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         pair
     }
 
-    /// Two ends that have accepted each other.
+    /// Two ends that have admitted each other.
     pub(super) fn with(setup: &Setup) -> Self {
         let mut pair = Self::connected(setup);
         pair.settle();
@@ -44,7 +44,7 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         pair
     }
 
-    /// The same with the usual constraints, where datagrams pass.
+    /// The same with the default setup.
     pub(super) fn live() -> Self {
         Self::with(&Setup::default())
     }
@@ -57,13 +57,13 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         pair
     }
 
-    /// Publishes all that the AGV offers, and lets the manager read it.
+    /// Publishes all functions of the AGV, and lets the manager process the list.
     pub(super) fn publish(&mut self) {
         self.agv.publish();
         self.settle();
     }
 
-    /// Carries and handles everything that can be handled at this time.
+    /// Delivers and processes everything that can be at this time.
     pub(super) fn settle(&mut self) {
         for _ in 0..100_000 {
             if !self.step() {
@@ -73,7 +73,7 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         panic!("the two ends never come to rest");
     }
 
-    /// Carries once what is in the pipes, and lets both ends work; whether anything moved.
+    /// Delivers once what is in the pipes, and lets both ends work; returns whether anything moved.
     pub(super) fn step(&mut self) -> bool {
         let (to_agv, datagrams_to_agv) = self.manager.net.deliver();
         let (to_manager, datagrams_to_manager) = self.agv.net.deliver();
@@ -91,7 +91,7 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         moved
     }
 
-    /// Lets time pass, from one deadline to the next.
+    /// Lets time pass, deadline by deadline.
     pub(super) fn run(&mut self, span: Duration) {
         let end = self.elapsed + span;
         self.settle();
@@ -107,14 +107,14 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         self.jump(end - self.elapsed);
     }
 
-    /// Lets time pass at once, as on a host that was suspended.
+    /// Lets time pass in one step, as on a host that was suspended.
     pub(super) fn jump(&mut self, span: Duration) {
         self.set_elapsed(self.elapsed + span);
         self.settle();
     }
 
-    /// Lets time pass for the manager alone, as while the AGV's host is suspended. What was sent meanwhile is what the AGV sees
-    /// first.
+    /// Lets time pass for the manager only, as while the AGV's host is suspended. The AGV gets what was sent meanwhile
+    /// afterwards.
     pub(super) fn suspend_agv(&mut self, span: Duration) {
         let end = self.elapsed + span;
         let base = Instant::START + self.manager.base;
@@ -145,7 +145,7 @@ impl<const WHOLE: bool> PairOf<WHOLE> {
         parameters.copy_from(results)
     }
 
-    /// The network below fails.
+    /// The connection fails.
     pub(super) fn cut(&mut self) {
         for side in [&mut self.manager, &mut self.agv] {
             side.session.disconnected(CloseReason::Reset);

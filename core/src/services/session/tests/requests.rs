@@ -49,7 +49,7 @@ fn a_link_counts_what_becomes_of_its_messages() {
     assert_eq!(counted.map(|counter| count(&pair, counter)), [[1, 0]; 3]);
 }
 
-/// What is behind them may be other bytes by then.
+/// The bytes may be overwritten then.
 #[test]
 fn results_are_shown_until_the_session_receives_again_or_ends() {
     for ends in [false, true] {
@@ -144,7 +144,7 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
         since: Duration::ZERO,
         number: 1,
     };
-    // Too short, too long, a text that is no UTF-8.
+    // Too short, too long, and a text that is not UTF-8.
     let no_text = [&[0; 8][..], &[3, 0, 0, 0, 0, 0, 0, 0], &[0xFF, 0xFE, 0xFD, 0, 0, 0, 0, 0]].concat();
     for (id, block) in [(7, &[0; 8][..]), (8, &[0; 64][..]), (9, &no_text)] {
         pair.agv.hear_request(&RequestHeader { id, ..header }, Priority::Normal, block);

@@ -1,4 +1,4 @@
-//! Which of the calls that wait begins next, and which is refused where no more can wait.
+//! Which waiting call begins next, and which is refused when no more can wait.
 
 use std::vec::Vec;
 
@@ -33,7 +33,7 @@ fn call(pair: &mut Pair, function: &str, seconds: u64) -> CallId {
     id
 }
 
-/// How calls of these functions with these time-outs in seconds end, of which two can wait while one runs.
+/// The outcomes of calls of these functions with these time-outs in seconds; two can wait while one runs.
 fn outcomes(scheduling: Scheduling, calls: &[(&str, u64)]) -> (Vec<Result<(), Error>>, u64) {
     let mut pair = busy(scheduling);
     let ids: Vec<_> = calls.iter().map(|(function, seconds)| call(&mut pair, function, *seconds)).collect();

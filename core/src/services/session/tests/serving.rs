@@ -1,4 +1,4 @@
-//! Units whose port says that they call nothing and have no use for what else a port may leave out.
+//! Units whose port leaves out calling and everything else that is optional.
 
 use super::super::Event;
 use super::pair::PairOf;

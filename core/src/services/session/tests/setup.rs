@@ -1,4 +1,4 @@
-//! What a pair is made of: constraints, storage, hellos, handlers.
+//! The parts of a pair: constraints, storage, hellos, handlers.
 
 use core::cell::Cell;
 use std::rc::Rc;
@@ -22,18 +22,18 @@ use crate::services::slots_for;
 use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};
 
-/// What may differ between pairs.
+/// The parameters of a pair.
 pub(super) struct Setup {
     pub(super) manager: Constraints,
     pub(super) agv: Constraints,
-    /// The ends tell each other where datagrams go.
+    /// The ends announce UDP ports to each other.
     pub(super) datagrams: bool,
     /// Buffers of each end's pool, and their size.
     pub(super) buffers: usize,
     pub(super) buffer_size: usize,
-    /// Functions of the other end that are kept.
+    /// Capacity for functions of the other end.
     pub(super) their_functions: usize,
-    /// Calls of the other end that run at the same time.
+    /// How many calls of the other end run side by side.
     pub(super) running: usize,
 }
 
@@ -55,9 +55,9 @@ impl Default for Setup {
 pub(super) struct Handler {
     pub(super) run: Run,
     pub(super) lease: Option<Rc<Lease>>,
-    /// It has a word that motors read. Without one, the unit alone knows of the lease.
+    /// Whether the lease is one that motors can read. Otherwise only the unit knows of it.
     pub(super) has_word: Cell<bool>,
-    /// Of a stream.
+    /// The values of a stream.
     #[cfg(feature = "streams")]
     pub(super) values: Option<super::streams::Values>,
 }
@@ -67,7 +67,7 @@ pub(super) struct Handler {
 pub(super) enum Run {
     /// At once.
     Now(fn(&mut ParametersView) -> Result<(), Error>),
-    /// When the test says so.
+    /// When the test answers it.
     Held,
 }
 
@@ -94,7 +94,7 @@ impl Service for Handler {
     }
 }
 
-/// Of a function with this definition: `stop` and `emergency` are emergency services.
+/// The attributes of a function with this definition: `stop` and `emergency` are emergency services.
 pub(super) fn attributes(definition: &Definition, lease_millis: u64) -> Attributes {
     let lease = (lease_millis > 0).then(|| Duration::from_millis(lease_millis));
     let is_emergency = ["stop", "emergency"].contains(&definition.signature().name());
@@ -115,7 +115,7 @@ pub(super) fn hub<const WHOLE: bool>(
 ) -> Hub<Tested<WHOLE>> {
     let target = if agv { Target::Manager(Manager::new(manager, 1).unwrap()) } else { Target::Everybody };
     let identity = if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit(manager, 1) }.unwrap();
-    // What decides whether a peer is taken is the hub's, and what its hello says of limits the link's.
+    // The hub decides about admission, the link about the limits in a hello.
     let constraints = Constraints { maximum_nodes: Constraints::M_UNIT.maximum_nodes, ..constraints };
     let config = NodeConfig {
         identity,

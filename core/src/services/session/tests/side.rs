@@ -30,15 +30,15 @@ pub(super) type Arguments = Box<Parameters<24_576>>;
 pub(super) struct Started {
     pub(super) function: String,
     pub(super) priority: Priority,
-    /// Bytes of the stream that had arrived by then.
+    /// Bytes of the stream received by then.
     pub(super) received: usize,
-    /// Events that had happened by then.
+    /// Number of events by then.
     pub(super) happened: usize,
     /// The argument `x`, if there is one.
     pub(super) x: Option<i64>,
 }
 
-/// A table that a test owns.
+/// An access table that a test owns.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Table(pub(super) Vec<Rule<&'static str, Vec<&'static str>>>);
 
@@ -48,7 +48,7 @@ impl Access for Table {
     }
 }
 
-/// The port of these tests: of units that can do everything, or that only serve.
+/// The port of these tests: for units that have everything, or that only serve.
 pub(super) enum Tested<const WHOLE: bool = true> {}
 
 impl<const WHOLE: bool> Port for Tested<WHOLE> {
@@ -60,7 +60,7 @@ impl<const WHOLE: bool> Port for Tested<WHOLE> {
     const TAKES_DATAGRAM_REQUESTS: bool = WHOLE;
 }
 
-/// A hub that can be kept from deciding.
+/// A hub whose decisions a test can hold up.
 pub(super) struct Lobby<const WHOLE: bool = true> {
     pub(super) hub: Hub<Tested<WHOLE>>,
     pub(super) waits: bool,
@@ -82,7 +82,7 @@ pub(super) struct Side<const WHOLE: bool = true> {
     pub(super) session: Session<Tested<WHOLE>>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) pool: Pool<Boxed>,
-    /// Who may do what here.
+    /// The access table.
     pub(super) table: Option<Table>,
     pub(super) net: Net,
     pub(super) happened: Vec<Event>,
@@ -92,16 +92,16 @@ pub(super) struct Side<const WHOLE: bool = true> {
     pub(super) held: Vec<Incoming>,
     pub(super) hub: Lobby<WHOLE>,
     pub(super) inbox: Vec<u8>,
-    /// What comes stays in the inbox.
+    /// Received bytes are left in the inbox.
     pub(super) holds_back: bool,
     pub(super) received: usize,
-    /// Where the results of calls go.
+    /// The results of calls.
     pub(super) results: BTreeMap<CallId, Arguments>,
-    /// Answers that could not be kept yet.
+    /// Answers that could not be queued yet.
     unanswered: Vec<(Incoming, Result<Arguments, Error>)>,
     pub(super) buffers: usize,
     pub(super) base: Duration,
-    /// Why calls have failed, and what they have told.
+    /// Details of failed calls, and progress.
     #[cfg(feature = "details")]
     pub(super) failures: Vec<crate::distribution::failure::Failure>,
     #[cfg(feature = "details")]
@@ -111,7 +111,7 @@ pub(super) struct Side<const WHOLE: bool = true> {
     pub(super) samples: Vec<(i64, Duration)>,
 }
 
-/// The context of a side, whose parts are borrowed one by one.
+/// The context of a side. A macro, since its parts are borrowed separately.
 macro_rules! context {
     ($side:expr) => {
         &mut Context {
@@ -130,7 +130,7 @@ pub(super) use context;
 impl<const WHOLE: bool> Side<WHOLE> {
     pub(super) fn new(setup: &Setup, agv: bool, address: u8) -> Self {
         let constraints = if agv { setup.agv } else { setup.manager };
-        // The clocks of the two ends have nothing in common.
+        // The clocks of the two ends are unrelated.
         let base = Duration::from_secs(if agv { 5_000 } else { 10 });
         let now = Instant::START + base;
         let config = SessionConfig {
@@ -167,7 +167,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         }
     }
 
-    /// Does what a port does when anything has arrived or is due; whether there was anything.
+    /// Does what a port does when bytes have arrived or something is due; returns whether there was anything.
     pub(super) fn work(&mut self, datagrams: Vec<(u64, Vec<u8>)>) -> bool {
         let mut worked = !datagrams.is_empty();
         let from = SocketAddr::new(self.session.address().ip(), DATAGRAM_PORT);
@@ -194,7 +194,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         worked
     }
 
-    /// A datagram arrives from an address, which may be another one than the peer's.
+    /// A datagram arrives from an address that may not be the peer's.
     pub(super) fn hear_datagram_from(&mut self, from: SocketAddr, nonce: u64, mut body: Vec<u8>) {
         let event = self.session.datagram(context!(self), from, nonce, &mut body);
         self.note(event, &mut Arguments::default());

@@ -1,5 +1,5 @@
-//! What an emergency call, a release and the end of a hold can wait for inside the core, each full, hung or slow: see
-//! "What a stop waits for" in `docs/notes/what-a-stop-waits-for.md`. None of them is held up by it.
+//! What an emergency call, a release and the end of a hold could wait for inside the core, each full, hung or slow (see "What a
+//! stop waits for" in `docs/notes/what-a-stop-waits-for.md`). None of them waits.
 
 use std::vec::Vec;
 
@@ -25,8 +25,8 @@ const LEASE: Duration = Duration::from_millis(500);
 const STOP: Attributes =
     Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::NORMAL };
 
-/// A vehicle whose `go()` moves the drive and `lift()` the fork, both on their way; `halt()` stops all, `halt_fork()` the
-/// fork. `work()` is never answered.
+/// A vehicle whose `go()` moves the drive and `lift()` the fork, both moving; `halt()` stops all, `halt_fork()` the fork.
+/// `work()` is never answered.
 fn vehicle(setup: &Setup) -> (Pair, [Slot; 2]) {
     let mut pair = Pair::with(setup);
     let go = pair.agv.offer_leased("go()", LEASE);
@@ -47,7 +47,7 @@ fn stop(pair: &mut Pair, function: &str) -> Result<CallId, Error> {
     pair.manager.request_with(function, &none(), &RequestOptions::new(), true)
 }
 
-/// As many calls as there is room for.
+/// Makes as many calls as fit.
 fn fill(pair: &mut Pair) -> usize {
     let calls = core::iter::from_fn(|| pair.manager.call("work", &none()).ok()).take(1_000).count();
     assert_eq!(pair.manager.call("work", &none()), Err(Error::Full(Limit::Calls)));
@@ -87,7 +87,7 @@ fn several_stops_leave_when_the_callers_table_is_full_and_no_other_call_takes_th
     assert!(pair.manager.request_with("halt", &none(), &RequestOptions::new(), false).is_ok(), "one-way needs none");
     pair.settle();
     assert!(!pair.agv.is_live(go));
-    // The vehicle runs two of one service at a time, and one waits: the others have stopped all the same.
+    // The vehicle runs two calls of one service at a time, and one waits: the others have stopped motion all the same.
     let outcomes: Vec<_> = halts.iter().map(|id| pair.manager.outcome(*id).map(|outcome| outcome.map(drop))).collect();
     assert_eq!(outcomes.iter().filter(|outcome| **outcome == Some(Err(Error::Busy))).count(), EMERGENCY_CALLS - 2);
 }
@@ -97,7 +97,7 @@ fn a_stop_leaves_beside_a_stream_that_takes_nothing_and_so_do_those_behind_it() 
     let (mut pair, [go, lift]) = vehicle(&Setup::default());
     pair.manager.net.capacity = 0;
     let others = pair.manager.take_buffers();
-    // Far more than the link's own bytes hold.
+    // Far more than fit the link's own buffer.
     for at in 0..40 {
         let asked = pair.manager.request_with("halt_fork", &none(), &RequestOptions::new(), false);
         assert!(asked.is_ok(), "stop {at}: {asked:?}");
@@ -134,7 +134,7 @@ fn a_stop_is_done_where_its_callees_places_are_full() {
     }
 }
 
-/// Both wait for the hooks of what they stop.
+/// Both wait for the hooks of the orders that they end.
 #[test]
 fn stops_of_several_services_that_arrive_at_once_all_run() {
     let (mut pair, _) = vehicle(&Setup::default());
@@ -238,7 +238,7 @@ fn a_release_arrives_with_every_table_full_and_a_stream_that_takes_nothing() {
     pair.manager.give_buffers(others);
 }
 
-/// The datagrams of all of these are lost, and the stream takes nothing for a while.
+/// All of their datagrams are lost, and for a while the stream accepts nothing.
 #[test]
 fn releases_that_wait_for_the_stream_are_all_sent() {
     let (mut pair, slots) = vehicle(&Setup { datagrams: false, ..Setup::default() });

@@ -1,4 +1,4 @@
-//! Streams between two ends: newest wins, ages, pace, limits, and that nothing of it is in the way of a call.
+//! Streams between two ends: the newest value wins, ages, pace, limits, and that samples delay no call.
 
 use core::cell::RefCell;
 use std::rc::Rc;
@@ -126,7 +126,7 @@ fn a_late_subscriber_gets_the_last_value_with_its_age() {
     assert!(age >= Duration::from_secs(4_000) && age <= Duration::from_secs(4_001), "{age:?}");
 }
 
-/// What is held up in the network is never taken for new.
+/// A delayed value is never taken for a new one.
 #[test]
 fn an_age_counts_the_time_on_the_way() {
     let (mut pair, pose) = pair();
@@ -141,7 +141,7 @@ fn an_age_counts_the_time_on_the_way() {
     assert!(age >= ms(700) && age < ms(710), "{age:?}");
 }
 
-/// What waits for room is the newest when it leaves, and its age counts from when it was made.
+/// A sample that waited for capacity has the newest value when it is sent; its age counts from when the value was made.
 #[test]
 fn the_newest_value_wins() {
     let (mut pair, pose) = pair();
@@ -155,7 +155,7 @@ fn the_newest_value_wins() {
     }
     (pair.agv.net.capacity, pair.agv.net.frozen) = (1 << 20, false);
     pair.run(ms(10));
-    // The one that waited in the queue, and the newest.
+    // The value that was in the queue, and the newest.
     assert_eq!(pair.manager.values(), [1, 20]);
     assert!(pair.manager.samples[0].1 >= ms(200));
     assert_eq!(pair.agv.counter(LinkCounter::SamplesReplaced), 18);
@@ -175,7 +175,7 @@ fn a_stream_keeps_the_pace_that_was_asked_for() {
         pair.manager.samples.len() - before
     };
     assert!((20..=21).contains(&count(&mut pair, 200)));
-    // No faster than the publisher lets anyone have it; one that goes on has had the newest value.
+    // No faster than the publisher's own interval. The changed subscription has had the newest value already.
     pair.manager.subscribe("pose", MS).unwrap();
     pair.run(MS);
     assert!((49..=51).contains(&count(&mut pair, 200)));
@@ -201,7 +201,7 @@ fn subscriptions_are_limited_and_refused_with_the_reason() {
     assert_eq!(pair.manager.call("pose", &none()), Err(Error::UnknownFunction), "it is no function");
 }
 
-/// The bytes that a peer gets in a second have a limit: more values do not come, and the newest does.
+/// The bytes per second for a peer are limited: intermediate values are skipped, the newest arrives.
 #[test]
 fn bytes_a_second_are_limited() {
     let agv = Constraints { stream_bytes: 2_400, ..Setup::default().agv };
@@ -213,7 +213,7 @@ fn bytes_a_second_are_limited() {
         pair.run(MS);
     }
     pair.run(ms(10));
-    // A sample of an int has 24 bytes.
+    // A sample of one int has 24 bytes.
     assert!((99..=102).contains(&pair.manager.samples.len()), "{}", pair.manager.samples.len());
     assert_eq!(pair.manager.values().last(), Some(&999));
 }
@@ -236,7 +236,7 @@ fn the_access_table_is_kept_while_a_subscription_goes_on() {
         pair.agv.put(pose, value);
         pair.run(MS);
     }
-    // Two at once, and two a second.
+    // A burst of two, and two a second.
     assert!((3..=4).contains(&pair.manager.samples.len()), "{:?}", pair.manager.values());
     pair.agv.table = rule(Verbs::LIST, None);
     pair.run(ms(1_000));
@@ -247,7 +247,7 @@ fn the_access_table_is_kept_while_a_subscription_goes_on() {
     assert_eq!(pair.manager.answers().last(), Some(&Err(Error::NotAllowed)));
 }
 
-/// An answer that is made while a sample waits goes first, and one sample waits at most.
+/// An answer that is made while a sample waits is sent first, and at most one sample waits.
 #[test]
 fn a_call_goes_before_a_sample() {
     let (mut pair, _) = pair();
@@ -277,7 +277,7 @@ fn a_call_goes_before_a_sample() {
     }
     assert!(pair.manager.outcome(call).is_some_and(|outcome| outcome.is_ok()), "the call waits for the sample");
     assert_eq!(pair.manager.values(), []);
-    // What the long one has cost of the bytes a second.
+    // The time that the long value took from the limit of bytes per second.
     pair.run(ms(500));
     assert_eq!(pair.manager.values(), [0, 1]);
 }
@@ -299,7 +299,7 @@ fn a_stream_that_is_replaced_ends_its_subscription() {
     pair.agv.put_all(pose, &two);
     pair.run(MS);
     assert_eq!((pair.manager.values(), pair.agv.session.subscriptions()), (vec![], 0));
-    // As a port does with each change of the list.
+    // As a port does at each change of the list.
     pair.manager.subscribe("pose", Duration::ZERO).unwrap();
     pair.run(MS);
     assert_eq!(pair.manager.values(), [0]);
