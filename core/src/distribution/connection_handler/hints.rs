@@ -86,7 +86,7 @@ impl<E: Endpoint> Hints<E> {
         Some((hint.from, hint.who.clone()))
     }
 
-    /// The node has joined: later hints at it start without back-off.
+    /// The node is there: later hints at it begin from the start.
     pub(super) fn forget(&mut self, who: &Identity) {
         self.list.retain(|hint| hint.who != *who);
     }

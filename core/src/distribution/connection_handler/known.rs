@@ -28,7 +28,7 @@ pub struct Known<E> {
     /// The highest claim with which it has answered while it was away, and the address.
     pub(super) offered: Option<(Claim, E)>,
     pub(super) state: NodeState,
-    /// This unit opened its link.
+    /// Its link was opened from here.
     pub(super) dialed: bool,
     /// The link to it that is being opened.
     pub(super) dialing: Option<LinkId>,

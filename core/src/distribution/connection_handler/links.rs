@@ -90,12 +90,12 @@ impl<P: Port> Node<P> {
         let is_followed = reason == CloseReason::PeerRestarted
             && self.table.node(place).is_some_and(|known| known.listens.is_some() && self.dials(&known.identity));
         if is_followed {
-            // Another boot of the node has been found: dial that one.
+            // Another boot of it has been found, and is where this one is dialled.
             self.table.schedule(place, now, Task::Dial);
         }
         match self.config.target {
             _ if is_followed => {}
-            // A node that was stopped in an orderly way announces itself when it is back.
+            // One that was stopped in an orderly way says so itself when it is back.
             Target::Everybody if matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere) => {}
             Target::Everybody | Target::Fixed(..) => self.retry(now, place),
             Target::Manager(_) => {}

@@ -107,7 +107,7 @@ fn hints_lead_to_few_questions_and_delay_nothing() {
     }
 }
 
-/// All addresses that are asked side by side are hinted at again and again, and no node answers there.
+/// As many addresses as are asked side by side are told of again and again, and no node answers there.
 #[test]
 fn addresses_that_do_not_answer_give_way_to_a_new_one() {
     let mut node = node(s_unit("agv", 1));
