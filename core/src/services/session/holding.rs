@@ -27,7 +27,7 @@ const BEATS_PER_LEASE: u64 = 2;
 /// Least interval between renewals, as for a lease of 20 ms. A peer may publish a shorter lease, whose renewals would flood the
 /// network: it ends before it is renewed.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(5);
-/// When a release is retried that the stream had no capacity for, unless the stream becomes writable earlier.
+/// How soon a release that the stream had no capacity for is retried, unless the stream becomes writable earlier.
 const RETRY: Duration = Duration::from_millis(20);
 
 /// Releases of whole functions that are not in the stream yet: the function, and the newest call that is released.
