@@ -1,4 +1,4 @@
-//! Help and units, as a trait and its structs tell them.
+//! Help and units of a trait and its structs.
 
 use cara_core::distribution::function::Definition;
 use cara_core::typed::{Mismatch, TypedCall, stream_of};

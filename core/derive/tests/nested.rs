@@ -121,7 +121,7 @@ fn the_fullest_order_has_room_and_no_more_is_needed() {
         ..order()
     };
     full.with_parameters(|_| ()).unwrap();
-    // Set anew, when each list has become as long as it can be.
+    // Again, with each list at its greatest length.
     const BYTES: usize = parameters_bytes(&[], Order::SPECS);
     let mut tight = Parameters::<BYTES>::sized();
     full.to_parameters(&mut tight).unwrap();
@@ -136,7 +136,7 @@ fn what_is_too_long_or_of_another_shape_is_an_error() {
     let mut kind = order();
     kind.nodes[0].actions[0].kind = "x".repeat(17);
     assert!(matches!(kind.to_parameters(&mut parameters), Err(Error::WrongSize { expected: 16, found: 17, .. })));
-    // A peer's variables of the same names, which are made otherwise.
+    // Variables of a peer with the same names and other types.
     let of = |text: &str| {
         let mut made = Parameters::<4096>::sized();
         order().to_parameters(&mut made).unwrap();
@@ -151,7 +151,7 @@ fn what_is_too_long_or_of_another_shape_is_an_error() {
         start: Place,
     }
     assert_eq!(Start::from_parameters(&of("f(start: {x: float, y-m: float, side: int})")), {
-        // Its side is 0, which is `Left`.
+        // The peer's 0 is `Left`.
         Ok(Start { start: Place { x: 0.0, y: 0.0, side: Side::Left } })
     });
     assert_eq!(Start::from_parameters(&of("f(start: {x: float, y-m: float})")), Err(Error::UnknownVariable));
@@ -204,7 +204,7 @@ fn a_mismatch_tells_the_way_to_the_difference() {
         assert_eq!(check(ours, theirs), reported(way), "{ours} and {theirs}");
     }
     assert_eq!(check("f(a: int[..3]) -> (b: int[..3])", "f(a: int[..2]) -> (b: int[..2])"), None);
-    // A longer way ends at the last name that has room, also where a shorter one is behind it.
+    // A path that is too long ends at the last name that fits, even if a later one is shorter.
     let long = |kind: &str| format!("f({0}: {{a: {{b{0}: {{c: {kind}}}}}[..2]}})", "n".repeat(31));
     let way = format!("argument {}.a[] is bool there and int here", "n".repeat(31));
     assert_eq!(check(&long("int"), &long("bool")), reported(&way));

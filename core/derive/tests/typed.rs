@@ -1,4 +1,4 @@
-//! What the macros make, with a list of functions and a peer that stand side by side.
+//! What the macros generate, with a function list and a peer side by side.
 
 use core::cell::RefCell;
 use core::future::Future;
@@ -162,7 +162,7 @@ impl Agv for Vehicle {
     }
 }
 
-/// For any port, whose orders are of a type of its own.
+/// For any port: the type of orders differs between ports.
 #[interface]
 trait Winch {
     type Order;
@@ -179,7 +179,7 @@ impl Winch for Vehicle {
     }
 }
 
-/// What a call tells here, and what it is told.
+/// The call as a service sees it, and what the service reports.
 struct Report(Identity, Option<Ended>, RefCell<Parameters>, RefCell<Option<Failure>>);
 
 impl AnyCall for Report {
@@ -226,16 +226,16 @@ struct Listed {
     run: Run,
 }
 
-/// A unit with its list, which is its own peer.
+/// A unit and its list; it is its own peer.
 #[derive(Default)]
 struct Unit {
     listed: RefCell<Vec<Listed>>,
-    /// Published in place of the list's own.
+    /// Published instead of the list's own signature.
     other: Option<Definition>,
     vehicle: RefCell<Vehicle>,
     ended: Option<Ended>,
     sent: RefCell<Vec<RequestOptions>>,
-    /// What the newest call has told, and why it has failed.
+    /// The progress of the newest call, and why it failed.
     reported: RefCell<Parameters>,
     failure: RefCell<Option<Failure>>,
 }
@@ -285,7 +285,7 @@ impl ReaderFunctions<Vehicle> for Unit {
 }
 
 impl Unit {
-    /// Looks at what is published, as a port does, and calls.
+    /// Compares with what is published, as a port does, and calls.
     #[expect(clippy::result_large_err, reason = "it is the port's error")]
     fn ask(
         &self,
@@ -303,7 +303,7 @@ impl Unit {
         outcome.map_err(|error| CallError::new(error, self.failure.take().map(Detail::Service)))
     }
 
-    /// Through blocks, as between two units.
+    /// Calls through encoded blocks, as between two units.
     fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error> {
         self.sent.borrow_mut().push(*options);
         let listed = self.listed.borrow();
@@ -464,7 +464,7 @@ fn progress_and_failures_are_typed() {
     assert_eq!((&failed.error, failed.text()), (&error, "the way is blocked"));
     assert_eq!(failed.values(), Some(Blocked { at: [3, 4], by: "a pallet".to_owned() }));
     assert_eq!(failed.to_string(), "the way is blocked (code 7)");
-    // Longer than it is declared: the rest is told.
+    // The value is longer than declared: the rest is sent without it.
     let failed = dock(9);
     assert_eq!((failed.values(), failed.text()), (None, "the way is blocked"));
     assert_eq!(reported, [Left { left: 2.5 }; 2]);
@@ -552,7 +552,7 @@ fn what_does_not_fit_the_rust_type_is_refused() {
     call.set_value("gear", -1).unwrap();
     assert_eq!(unit.block("say", &mut call, &usual), Ok(()));
     assert_eq!(call.variable("gear"), Ok(0));
-    // Too long for what is declared: nothing is sent.
+    // Longer than declared: nothing is sent.
     let long = AgvClient::at(&unit).say(&"x".repeat(65), &[], 0, Gear::Reverse).wait();
     assert_eq!(long, Err(Error::WrongSize { index: 0, expected: 64, found: 65 }.into()));
 }

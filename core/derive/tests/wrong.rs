@@ -1,7 +1,7 @@
-//! Wrong use is told in words, at the place that is wrong. `TRYBUILD=overwrite` writes what is told now.
+//! Wrong use is reported in words, at the place of the mistake. `TRYBUILD=overwrite` accepts the present messages.
 //!
-//! All cases are one call of cargo, and use the core alone: nothing else is built for them. Most errors are the macros' own; the
-//! few that rustc words may read otherwise with another compiler.
+//! All cases are one call of cargo and use the core only. Most errors are the macros' own; the few of rustc may read differently
+//! with another compiler.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +12,7 @@ fn wrong_use_is_a_readable_error() {
     trybuild::TestCases::new().compile_fail("tests/wrong/*.rs");
 }
 
-/// The cases above are built with the features of this crate's tests: a core without lists takes a package of its own.
+/// The cases above are built with the features of this crate's tests; a core without lists needs its own package.
 #[test]
 fn lists_that_the_core_is_built_without_are_a_readable_error() {
     const SOURCE: &str = "

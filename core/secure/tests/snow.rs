@@ -1,4 +1,4 @@
-//! Another implementation of Noise understands this one, in both roles.
+//! Another implementation of Noise interoperates with this one, in both roles.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing)]
 
 use cara_core::host::secure::Seal;
@@ -20,7 +20,7 @@ fn seal(channel: &mut Channel, text: &[u8]) -> Vec<u8> {
     frame
 }
 
-/// Frames go both ways, past the point where keys change.
+/// Frames in both directions, past a rekey.
 fn talk(mut channel: Channel, theirs: snow::HandshakeState) {
     let mut theirs = theirs.into_transport_mode().unwrap();
     let mut buffer = [0; 128];
@@ -55,7 +55,7 @@ fn snow_begins() {
     talk(agreed.channel, theirs);
 }
 
-/// The handshake that rekeys a live link covers the hash of the one before, which is Noise's.
+/// The handshake that rekeys a live link covers the previous handshake hash as Noise defines it.
 #[test]
 fn snow_takes_part_in_a_renewal_in_both_roles() {
     let first = prologue(b"hello of one", b"hello of the other");
@@ -86,7 +86,7 @@ fn snow_takes_part_in_a_renewal_in_both_roles() {
     talk(agreed.channel, theirs);
 }
 
-/// Both ends change keys after the same frame, as snow does when it is told to.
+/// Both ends rekey after the same frame; snow does so when asked.
 #[test]
 fn keys_change_after_a_million_frames() {
     let prologue = prologue(b"", b"");

@@ -58,7 +58,7 @@ fn another_key_or_prologue_fails_at_the_first_message() {
     }
 }
 
-/// Each end's message goes back to itself: a reflected one is no answer.
+/// Each end gets its own message back: a reflected message is no answer.
 #[test]
 fn a_reflected_message_is_no_answer() {
     let prologue = prologue(b"a", b"b");
@@ -66,7 +66,7 @@ fn a_reflected_message_is_no_answer() {
     assert!(initiator.finish(&message).is_err());
 }
 
-/// A replayed first message is answered, and then nothing opens: its sender cannot go on.
+/// A replayed first message is answered, but its sender can then open and seal nothing.
 #[test]
 fn a_recorded_handshake_leads_to_no_channel() {
     let prologue = prologue(b"a", b"b");
@@ -77,7 +77,7 @@ fn a_recorded_handshake_leads_to_no_channel() {
     assert_eq!(later.channel.open(&mut recorded.clone()), Err(CloseReason::Protocol));
 }
 
-/// Points of small order would make the same secret with every key.
+/// Points of small order would give the same secret with every key.
 #[test]
 fn points_of_small_order_are_refused() {
     let prologue = prologue(b"a", b"b");
