@@ -1,6 +1,6 @@
-//! A standby: an m_unit that waits until no manager of its identity is there, and then commands in its place. Meanwhile it answers
-//! nobody, takes no links and opens none. It starts because answers are missing. So only a proven answer keeps it waiting, and a
-//! question counts only if it was sent, the sockets were read, and this unit did not pause.
+//! A standby: an m_unit that commands once no manager of its identity is left (docs/concepts.md, "Two managers of one identity").
+//! Until then it answers nobody and neither accepts nor opens links. It starts because answers are missing: so only a proven
+//! answer keeps it waiting, and a question counts only if it was sent, the sockets were then read, and this unit did not pause.
 
 use super::claims::{ClaimEvent, LOOK, PERIOD, QUESTIONS, Questions, Stage};
 use super::search::{Search, fresh};
@@ -15,17 +15,17 @@ use crate::host::mailman::Mailman;
 use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
-/// An answer that has not come so long after the last question does not come. What is alive answers at once.
+/// How long an answer to the last question may take. Live units answer at once.
 const LISTENING: Duration = PRESENCE_WAIT;
-/// The question on which a start depends is asked so long after the time for it: answers are a little late, and clocks differ.
+/// Delay of the question on which a start depends, since answers are a little late and clocks differ.
 const MARGIN: Duration = Duration::from_millis(20);
 
-/// Of the port, about a standby.
+/// For ports, about a standby.
 impl<P: Port> Node<P> {
-    /// This m_unit stands by from here on, until a [`ClaimEvent::Lead`]. One that has stepped down has ended all of its links before,
-    /// or does so at once. It has to have keys: in plain mode anybody could keep it waiting, or answer for its vehicles.
+    /// This m_unit stands by from now on, until a [`ClaimEvent::Lead`]. If it has stepped down, it ends all its links first. It
+    /// needs keys: in plain mode anybody could keep it waiting, or answer for its vehicles.
     pub fn stand_by(&mut self, now: Instant) {
-        // Standbys of one identity do not ask at the same time, and so do not start at the same time.
+        // A random delay keeps standbys of one identity from asking, and starting, at the same time.
         let next = now + self.random.jitter(self.standby_period());
         self.claims.stand_by(now, next);
     }
@@ -54,12 +54,12 @@ impl<P: Port> Node<P> {
 }
 
 impl<P: Port> Node<P> {
-    /// From one question to the next.
+    /// Interval between questions.
     fn standby_period(&self) -> Duration {
         self.config.constraints.keep_alive.min(PERIOD).max(LISTENING)
     }
 
-    /// What an announce means to a standby. Only an answer to its last question counts.
+    /// Processes an announce as a standby: only an answer to its last question counts.
     pub(super) fn standby_answered(&mut self, now: Instant, announce: &Announce, authenticator: &dyn Authenticator) {
         if announce.nonce == 0 || announce.nonce != self.claims.questions.nonce {
             return self.counters.count(NodeCounter::Unasked);
@@ -76,7 +76,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// Somebody heard the manager of this claim so long ago.
+    /// Somebody last heard the manager with this claim this long ago.
     fn heard_of_manager(&mut self, now: Instant, claim: Claim, silent: Duration) {
         self.claims.meet_rival(now, claim, silent);
         if silent < self.silence() && self.claims.stage == Stage::Starts {
@@ -85,7 +85,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// How long the manager must be unheard before a start.
+    /// For how long nobody may have heard the manager before a start.
     fn silence(&self) -> Duration {
         self.config.constraints.keep_alive.times(MISSED_KEEP_ALIVES.into())
     }
@@ -100,14 +100,14 @@ impl<P: Port> Node<P> {
         let claims = &mut self.claims;
         let questions = &mut claims.questions;
         if core::mem::replace(&mut questions.polled, now) + PERIOD < now {
-            // What came meanwhile may not be read yet.
+            // Answers that arrived during the pause may not have been read yet.
             (questions.unanswered, questions.asked, claims.event) = (0, None, None);
             claims.stage = Stage::StandsBy;
         }
         if now < questions.next {
             return;
         }
-        // The answers to the last question would have said otherwise.
+        // If the manager had been heard since, the answers to this question would have said so.
         let listened = |asked| now >= asked + LISTENING && asked >= silent;
         let is_alone = questions.unanswered >= QUESTIONS && questions.asked.is_some_and(listened);
         if is_alone && claims.stage == Stage::StandsBy {
@@ -122,7 +122,7 @@ impl<P: Port> Node<P> {
             self.next_question(now).min(now + LOOK).min(listened.unwrap_or(Instant::FAR_FUTURE));
     }
 
-    /// One period after the last. After an unanswered one it is the end of the manager's silence, if that is near.
+    /// One interval after the last question; after an unanswered one, at the end of the manager's silence, if that is near.
     fn next_question(&self, now: Instant) -> Instant {
         let Questions { asked: Some(asked), unanswered, .. } = self.claims.questions else { return now };
         let (due, silent) = (asked + self.standby_period(), self.silent_from() + MARGIN);
@@ -130,12 +130,12 @@ impl<P: Port> Node<P> {
         if unanswered > 0 && is_soon { silent.max(asked + LISTENING) } else { due }
     }
 
-    /// Since when, as far as was said, nobody has heard the manager for as long as it takes.
+    /// From when on nobody has heard the manager for long enough, as far as was reported.
     fn silent_from(&self) -> Instant {
         self.claims.rival.map_or(Instant::START, |rival| rival.silent_from(self.silence()))
     }
 
-    /// Asks for this unit's own identity, and all vehicles as well once the manager has not answered.
+    /// Asks for this unit's own identity; once that is unanswered, also all vehicles.
     fn ask_as_standby(
         &mut self,
         now: Instant,

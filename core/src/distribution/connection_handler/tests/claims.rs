@@ -1,4 +1,4 @@
-//! Claims: which of two managers of one identity commands, and that no peer's word ends more than its own link.
+//! Claims: which of two managers of one identity commands; and that nothing a peer says ends more than its own link.
 
 use std::vec;
 
@@ -7,7 +7,7 @@ use crate::distribution::authenticator::{Authenticator, CODE_BYTES};
 use crate::distribution::claim::{Claim, TaggedClaim};
 use crate::distribution::hello::ClaimReport;
 
-/// The code that only holders of a key make; everybody here has it but for tags, which a test makes by hand.
+/// A code that only holders of a key can make. All units here have the key; tags are made by hand.
 const GENUINE: [u8; CODE_BYTES] = [7; CODE_BYTES];
 
 pub(super) struct Keyed;
@@ -55,7 +55,7 @@ fn of_claim(claim: Claim) -> Hello {
     Hello { claim: report(claim, ClaimReport::NEVER), ..hello_of(&m_unit(MANAGER, MANAGER_ID)) }
 }
 
-/// A vehicle that has obeyed this claim in an earlier life.
+/// A vehicle that has obeyed this claim in an earlier boot.
 fn vehicle(obeyed: Claim) -> Node<InMemory> {
     let mut node = node(s_unit("agv", 1));
     let depot = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
@@ -85,7 +85,7 @@ fn agv(id: u32, obeyed: Option<ClaimReport>) -> Hello {
     Hello { obeyed, ..hello_of(&s_unit("agv", id)) }
 }
 
-/// Polls as a port does until `end`; what the port is to do about claims, and how often the node asked for itself.
+/// Polls as a port does until `end`; returns the claim events, and how often the node asked for its own identity.
 fn watch(node: &mut Node<InMemory>, from: Instant, end: Instant) -> (Vec<ClaimEvent>, usize) {
     let (mut events, mut outbox, mut now) = (Vec::new(), Outbox::default(), from);
     while now <= end {
@@ -124,7 +124,7 @@ fn a_vehicle_obeys_the_highest_claim_and_refuses_lower_ones() {
     }
 }
 
-/// It is stored before the first moving call under it, and not at joining.
+/// It is stored before the first moving call under it, not when the manager joins.
 #[test]
 fn a_claim_is_stored_before_the_first_moving_call() {
     let manager = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
@@ -148,10 +148,10 @@ fn a_claim_is_stored_before_the_first_moving_call() {
     let mut late = joined();
     assert!(!late.may_move(at(3_999), &manager) && late.may_move(at(4_000), &manager));
     assert_eq!((late.take_claim_event(), late.counters.value(NodeCounter::ClaimsNotKept)), (unkept, 1));
-    // One that was stored in an earlier life needs no more, and a unit that stores nothing waits for nothing.
+    // A claim stored in an earlier boot need not be stored again, and a unit that stores none does not wait.
     let mut kept = vehicle(claim(5));
     assert_eq!(admit(&mut kept, 0, &of_claim(claim(5))), Admission::Accept);
-    // Its port looks meanwhile whether the pair key is another one: now, and when the peer has proven itself anew.
+    // Its port checks whether the pair key has changed: now, and whenever the peer has authenticated itself again.
     let keep = || Some(ClaimEvent::Keep(manager.clone(), tagged(claim(5))));
     assert!(kept.may_move(at(2_000), &manager));
     assert_eq!((kept.take_claim_event(), kept.take_claim_event()), (keep(), None));
@@ -163,7 +163,7 @@ fn a_claim_is_stored_before_the_first_moving_call() {
     assert!(forgetful.may_move(at(2_000), &manager));
 }
 
-/// With the key of one vehicle, or by accident: whatever claim it says it has obeyed, the manager loses that vehicle only.
+/// With a vehicle's key, or by mistake: whatever claim it says it has obeyed, the manager loses only that vehicle.
 #[test]
 fn a_fence_costs_a_manager_that_vehicle_and_nothing_else() {
     for obeyed in [forged(claim(100)), forged(claim(u64::MAX)), report(claim(6), 0), report(claim(5).raised(5), 100)] {
@@ -194,25 +194,25 @@ fn a_claim_without_a_genuine_tag_is_never_raised_above() {
 
 #[test]
 fn a_manager_raises_its_claim_when_nobody_has_heard_the_other_one() {
-    // The other one was heard just now, and of that nobody says anything any more.
+    // The other manager was heard just now, and nobody reports anything of it later.
     let mut node = managed(5);
     assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 0))), FENCED);
     assert_eq!(watch(&mut node, at(1_000), at(20_000)).0, vec![]);
-    // A vehicle says that it was not heard for 3 s: the vehicles are asked once more, for a second.
+    // A vehicle reports that it was not heard for 3 s: the vehicles are asked once more, for a second.
     assert_eq!(admit_at(&mut node, at(20_000), 0, &agv(2, report(claim(7), 19_000))), FENCED);
     let (events, asked) = watch(&mut node, at(20_001), at(23_000));
     assert_eq!(events, vec![ClaimEvent::Raise(claim(7))]);
     assert!(asked >= 2);
     node.set_claim(tagged(claim(7).raised(1)));
     assert_eq!(admit_at(&mut node, at(23_100), 0, &agv(2, report(claim(7), 0))), Admission::Accept);
-    // Again within 30 s it does not, and from then on after twice as long each time.
+    // Not again within 30 s, and then after twice as long each time.
     assert_eq!(admit_at(&mut node, at(23_200), 1, &agv(3, report(claim(9), 60_000))), FENCED);
     assert_eq!(watch(&mut node, at(23_200), at(50_000)).0, vec![]);
     assert_eq!(watch(&mut node, at(50_100), at(56_000)).0, vec![ClaimEvent::Raise(claim(9))]);
     assert_eq!(watch(&mut node, at(56_100), at(110_000)).0, vec![], "storing failed, and a minute is not over");
 }
 
-/// Vehicles that have it tell that it lives, each time that they hear this one's search.
+/// Its vehicles report that it lives, whenever they hear this manager's search.
 #[test]
 fn a_manager_that_is_heard_by_a_vehicle_is_not_raised_above() {
     let mut node = managed(5);
@@ -240,7 +240,7 @@ fn a_pause_of_its_own_or_sockets_that_are_not_empty_start_the_count_again() {
     }
 }
 
-/// The question of a running manager to another one of its identity.
+/// The question of a running manager for its own identity.
 fn question(node: &mut Node<InMemory>, now: Instant) -> WhoHas {
     let mut outbox = Outbox::default();
     while node.poll(now, &mut outbox, &Keyed).is_some() {}
@@ -291,7 +291,7 @@ fn an_answer_starts_the_count_again() {
     for now in (1_000..60_000).step_by(100) {
         while node.poll(at(now), &mut outbox, &Keyed).is_some() {}
         for bytes in core::mem::take(&mut outbox.broadcasts) {
-            // It lives, and does not say its claim.
+            // The other manager lives, but does not report its claim.
             let Ok(Datagram::WhoHas(who_has)) = Datagram::decode(&bytes, FLEET, &Keyed) else { continue };
             hear(&mut node, at(now), &answer(who_has.nonce, None));
         }
@@ -314,7 +314,7 @@ fn a_manager_that_takes_over_raises_until_it_was_the_highest_once() {
     assert_eq!(watch(&mut node, at(1_400), at(3_000)).0, vec![], "as any other manager");
 }
 
-/// An s_unit that is connected asks another boot of its manager, and gives way to a higher claim only.
+/// A connected s_unit asks another boot of its manager, and yields to a higher claim only.
 #[test]
 fn a_connected_vehicle_gives_way_to_a_higher_claim_that_is_proven() {
     for (heard, gives_way) in [(None, false), (report(claim(5), 0), false), (report(claim(6), 0), true)] {
@@ -349,7 +349,7 @@ fn a_connected_vehicle_gives_way_to_a_higher_claim_that_is_proven() {
     }
 }
 
-/// A door that a manager dials: the newcomer waits until the present link is silent, or is told that it drives.
+/// A door that a manager dials: the newcomer waits until the present link is silent, or is refused because the door moves.
 #[test]
 fn a_newcomer_with_a_higher_claim_waits_or_is_told_that_the_vehicle_drives() {
     let joined = || {

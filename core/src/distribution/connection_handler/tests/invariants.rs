@@ -11,13 +11,13 @@ const MAXIMUM: u16 = 3;
 
 #[derive(Clone, Copy, Debug)]
 enum Step {
-    /// A peer of this number and life says hello on a new link.
+    /// A new link with a hello of this peer and boot.
     Hello { peer: u8, life: u64 },
     /// The n-th open link ends.
     End(prop::sample::Index),
-    /// The n-th open link answers a challenge, whether it was asked or not.
+    /// The n-th open link answers a challenge, whether it was challenged or not.
     Answer(prop::sample::Index),
-    /// A peer that this unit dials is heard.
+    /// A peer that this unit dials answers.
     Heard(u8),
     /// Time passes.
     Wait(u64),
@@ -46,7 +46,7 @@ enum Open {
     Joined,
 }
 
-/// A port: which links are open, whose they are, and how far they are.
+/// A port: its open links, whose they are, and their states.
 struct Port {
     node: Node<InMemory>,
     now: Instant,

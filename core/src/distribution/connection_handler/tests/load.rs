@@ -1,4 +1,4 @@
-//! What discovery costs a network, and how long it takes: the figures of `docs/performance.md`.
+//! The load of discovery on a network, and how long it takes: the figures of `docs/performance.md`.
 //! Print them with `cargo test -p cara-core --lib connection_handler::tests::load -- --nocapture --test-threads 1`.
 
 use std::println;
@@ -20,7 +20,7 @@ struct Worst {
     answers: usize,
     broadcasts: usize,
     busiest: usize,
-    /// The same in ten seconds.
+    /// Most broadcasts within ten seconds.
     in_ten: usize,
     unicasts: usize,
     dials: usize,
@@ -112,7 +112,7 @@ fn units_and_manager_are_switched_on_at_random() {
                 network.add_fleet(MANAGER, size, manager_on, at(0), Duration::from_millis(spread));
                 measure(&mut worst, network, at(0), at(0), 90);
             }
-            // A fleet that comes within two seconds is one fleet; one that comes within half a minute is many.
+            // Units that start within two seconds hold back for each other; those that start within half a minute, in groups.
             worst.assert_within(Duration::from_millis(spread + 5_000), broadcasts, &std::format!("{size}"));
             worst.assert_calm(&std::format!("{size} within {spread} ms"));
         }
@@ -151,7 +151,7 @@ fn one_s_unit_comes_to_a_running_manager() {
         (total, longest, broadcasts) = (total + took, longest.max(took), broadcasts.max(network.broadcasts.len()));
     }
     println!("\nOne s_unit, 200 seeds: {} ms on average, {longest} ms at most", total / 200);
-    // Longer than its own 400 ms only if the manager, alone until then, asks a fleet of a thousand just before.
+    // Longer than its own 400 ms only if the manager has just asked for a fleet of a thousand.
     assert!(longest <= 1_500 && broadcasts <= 1, "{longest} ms, {broadcasts} broadcasts");
 }
 

@@ -1,4 +1,4 @@
-//! Nodes without a network: a mailman that keeps what it is given, and hellos made by hand.
+//! Nodes without a network: a mailman that keeps datagrams, and hellos made by hand.
 #![allow(
     clippy::indexing_slicing,
     clippy::unwrap_used,
@@ -209,12 +209,12 @@ pub(super) fn run(node: &mut Node<InMemory>, end: Instant, outbox: &mut Outbox) 
     panic!("the node never rests");
 }
 
-/// What is to be done at once.
+/// The commands that are due now.
 pub(super) fn due(node: &mut Node<InMemory>, now: Instant) -> Vec<Command<SocketAddr>> {
     core::iter::from_fn(|| node.poll(now, &mut Outbox::default(), &Plain)).collect()
 }
 
-/// What a link is told.
+/// A directive to a link.
 pub(super) fn notify(link: u16, directive: Directive) -> Command<SocketAddr> {
     Command::Notify(LinkId(link), directive)
 }

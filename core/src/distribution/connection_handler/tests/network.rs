@@ -1,11 +1,11 @@
-//! Any number of units on one network of datagrams that are late or lost; links open after one round trip.
+//! Any number of units on one network that delays and loses datagrams; links open after one round trip.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use super::*;
 
-/// What happens to a unit. Ordered only so that it can lie in a heap.
+/// An event of a unit. Ordered only to be kept in a heap.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Happening {
     On,
@@ -37,7 +37,7 @@ pub(super) struct Unit {
     config: NodeConfig<SocketAddr>,
     pub(super) node: Option<Node<InMemory>>,
     nodes: usize,
-    /// Rises each time that it is switched on.
+    /// Increases each time that it is switched on.
     life: u64,
     /// When its last link was opened, and whether it is open.
     pub(super) joined: Option<Instant>,
@@ -51,7 +51,7 @@ pub(super) struct Network {
     pub(super) now: Instant,
     pub(super) loss_percent: u64,
     pub(super) latency: Duration,
-    /// How long s_units take to notice that their manager is gone, at random.
+    /// How long s_units take to notice that their manager has gone; random.
     pub(super) notice: Duration,
     pub(super) broadcasts: Vec<(Instant, Sort)>,
     pub(super) unicasts: usize,
@@ -218,7 +218,7 @@ impl Network {
         }
     }
 
-    /// The hello of `from` reaches `to`, and the other way round.
+    /// Exchanges the hellos of `from` and `to`.
     fn connect(&mut self, from: usize, to: usize, life: u64) {
         let (now, link) = (self.now, LinkId(from as u16));
         if self.units[from].life != life || self.units[from].node.is_none() {
@@ -245,7 +245,7 @@ impl Network {
         self.work(from);
     }
 
-    /// When each s_unit joined, in order; `None` where one has not.
+    /// When each s_unit joined, in order; `None` if one has not.
     pub(super) fn joins(&self) -> Option<Vec<Instant>> {
         let s_units = self.units.iter().filter(|unit| unit.config.identity.role() == Role::SUnit);
         let mut joins: Vec<_> = s_units.map(|unit| unit.joined).collect::<Option<_>>()?;
@@ -257,7 +257,7 @@ impl Network {
         self.broadcasts.iter().filter(|(_, other)| *other == sort).count()
     }
 
-    /// Most events of a sorted list within `window`.
+    /// The most events of a sorted list within `window`.
     pub(super) fn busiest(times: &[Instant], window: Duration) -> usize {
         let mut first = 0;
         let mut most = 0;

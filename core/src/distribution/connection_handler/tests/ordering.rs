@@ -66,7 +66,7 @@ fn any_order_of_six_datagrams_ends_in_the_same_state() {
     assert!(dialled.contains(&7_030) && dialled.contains(&7_040), "the newest answer of each: {dialled:?}");
 }
 
-/// Only a unit that lives answers a question with a fresh nonce: another life that does is news, however small its epoch.
+/// Only a live unit answers a question with a fresh nonce: so another boot that does is newer, however small its epoch.
 #[test]
 fn another_life_that_answers_is_news_at_once() {
     let mut node = depot();
