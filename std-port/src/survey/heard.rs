@@ -18,9 +18,13 @@ use crate::sys::interfaces::Interface;
 pub enum Standing {
     /// Nothing: plain mode, in which every host can speak as any unit.
     Plain,
-    /// The fleet's code is right, made with the key of this generation. A unit's name is no more than what another one of
-    /// the fleet may have said.
-    Proven(u32),
+    /// The fleet's code is right. A unit's name is no more than what another one of the fleet may have said.
+    Proven {
+        /// The generation of the key with which it was made.
+        generation: u32,
+        /// Equal for keys that are known to be of one root: a root, or a unit's file, has both.
+        root: u32,
+    },
     /// Secured, and made with none of the keys that the survey has of that fleet.
     OtherKeys,
     /// Secured, and the survey has no keys of that fleet, or the datagram carries no code for the fleet.

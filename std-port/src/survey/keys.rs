@@ -24,6 +24,8 @@ const REFUSED: usize = 8;
 #[derive(Debug, Default)]
 pub struct SurveyKeys {
     keys: Vec<Known>,
+    /// Sources of keys so far.
+    sources: u32,
     refused: Vec<KeyError>,
 }
 
@@ -32,6 +34,8 @@ struct Known {
     fleet: Fleet,
     generation: u32,
     key: DiscoveryKey,
+    /// Its source, or the last one that has a key in common with it.
+    root: u32,
     /// Units of the fleet speak with it, as far as is known here.
     in_use: bool,
 }
@@ -69,6 +73,7 @@ impl SurveyKeys {
 
     /// Adds those of a unit's ring.
     pub(crate) fn add_ring(&mut self, ring: &KeyRing) {
+        self.sources += 1;
         for (generation, key) in ring.discoveries() {
             self.add(ring.fleet(), generation, key.clone(), generation == ring.generation());
         }
@@ -77,6 +82,7 @@ impl SurveyKeys {
     /// Adds those of a fleet's root: of generations that are over as well, so that a unit that was left behind is known.
     pub(crate) fn add_root(&mut self, root: &FleetKeys) {
         let (fleet, used) = (root.members().fleet(), root.members().generation());
+        self.sources += 1;
         let newest = root.members().generations().max().unwrap_or(used);
         for generation in newest.saturating_sub(OLD).max(1)..=newest {
             self.add(fleet, generation, root.discovery(generation), generation == used);
@@ -104,7 +110,7 @@ impl SurveyKeys {
             return Standing::Unchecked;
         };
         let made = self.of(fleet).find(|known| known.key.is_code(&[signed], code));
-        made.map_or(Standing::OtherKeys, |known| Standing::Proven(known.generation))
+        made.map_or(Standing::OtherKeys, |known| Standing::Proven { generation: known.generation, root: known.root })
     }
 
     /// What signs a question to a fleet, for each key that its units may speak with.
@@ -120,9 +126,14 @@ impl SurveyKeys {
         let same = |known: &&mut Known| known.fleet == fleet && known.key.expose() == key.expose();
         let full = self.keys.len() >= KEYS;
         match self.keys.iter_mut().find(same) {
-            Some(known) => known.in_use |= in_use,
+            Some(known) => {
+                known.in_use |= in_use;
+                let merged = known.root;
+                let of_it = self.keys.iter_mut().filter(|known| known.root == merged);
+                of_it.for_each(|known| known.root = self.sources);
+            }
             None if full => {}
-            None => self.keys.push(Known { fleet, generation, key, in_use }),
+            None => self.keys.push(Known { fleet, generation, key, root: self.sources, in_use }),
         }
     }
 
@@ -166,6 +177,10 @@ mod tests {
         keys
     }
 
+    fn proven(generation: u32, root: u32) -> Standing {
+        Standing::Proven { generation, root }
+    }
+
     fn signed(key: &DiscoveryKey) -> Vec<u8> {
         let mut datagram = b"a datagram".to_vec();
         let code: [u8; CODE_BYTES] = key.code(&[&datagram]);
@@ -182,8 +197,8 @@ mod tests {
         let mut keys = SurveyKeys::default();
         assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery())), Standing::Unchecked);
         keys.add_ring(&ring);
-        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery())), Standing::Proven(1));
-        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery_in(2).unwrap())), Standing::Proven(2));
+        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery())), proven(1, 1));
+        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery_in(2).unwrap())), proven(2, 1));
         let other = fleet(7).ring(&depot()).unwrap();
         assert_eq!(keys.standing(Fleet(7), &signed(other.discovery())), Standing::OtherKeys);
         assert_eq!(keys.standing(Fleet(8), &signed(ring.discovery())), Standing::Unchecked);
@@ -195,8 +210,26 @@ mod tests {
         ours.add_ring(&root.ring(&depot()).unwrap());
         assert_eq!(ours.standing(Fleet(7), &signed(old.discovery())), Standing::OtherKeys);
         ours.add_root(&root);
-        assert_eq!(ours.standing(Fleet(7), &signed(old.discovery())), Standing::Proven(1));
+        assert_eq!(ours.standing(Fleet(7), &signed(old.discovery())), proven(1, 2));
         assert_eq!(ours.signers(Fleet(7)).count(), 1, "nobody is asked with a key that is over");
+    }
+
+    #[test]
+    fn keys_are_of_one_root_if_one_source_has_both() {
+        let (mut root, other) = (fleet(7), fleet(7).ring(&depot()).unwrap());
+        let old = root.ring(&depot()).unwrap();
+        root.rotate().unwrap();
+        root.switch().unwrap();
+        let both = root.ring(&depot()).unwrap();
+        root.finish().unwrap();
+        let new = root.ring(&depot()).unwrap();
+        let mut keys = SurveyKeys::default();
+        [&old, &new, &other].iter().for_each(|ring| keys.add_ring(ring));
+        let standings =
+            |keys: &SurveyKeys| [&old, &new, &other].map(|ring| keys.standing(Fleet(7), &signed(ring.discovery())));
+        assert_eq!(standings(&keys), [proven(1, 1), proven(2, 2), proven(1, 3)]);
+        keys.add_ring(&both);
+        assert_eq!(standings(&keys), [proven(1, 4), proven(2, 4), proven(1, 3)]);
     }
 
     #[test]

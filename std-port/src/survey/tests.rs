@@ -164,7 +164,10 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     let answer = survey.heard().iter().find(|heard| heard.to_us > 0);
     let answer = answer.unwrap_or_else(|| panic!("no answer: {survey:?}; {:?}", manager.counters()));
     assert_eq!((answer.identity.as_ref(), answer.mode), (Some(&boss), Mode::Secured));
-    assert_eq!((answer.standing, answer.room), (Standing::Proven(1), Some(Constraints::M_UNIT.maximum_nodes)));
+    assert_eq!(
+        (answer.standing, answer.room),
+        (Standing::Proven { generation: 1, root: 1 }, Some(Constraints::M_UNIT.maximum_nodes))
+    );
     assert_eq!(answer.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
     // The manager records no refusal of a survey.
     assert!(manager.findings().is_empty(), "{:?}", manager.findings());
@@ -196,6 +199,7 @@ fn what_is_signed_otherwise_is_another_ones() {
     sender.send_to(&bytes(fleet, &search("agv", 3)), to).unwrap();
     listen_until(&mut survey, |survey| survey.heard().len() == 4);
     let standings: Vec<_> = survey.heard().iter().map(|heard| heard.standing).collect();
-    assert_eq!(standings, [Standing::Proven(1), Standing::OtherKeys, Standing::Unchecked, Standing::Plain]);
+    let proven = Standing::Proven { generation: 1, root: 1 };
+    assert_eq!(standings, [proven, Standing::OtherKeys, Standing::Unchecked, Standing::Plain]);
     assert!(survey.heard().iter().all(|heard| heard.identity.is_some()), "names travel in clear");
 }

@@ -60,12 +60,15 @@ pub(crate) fn wrong_keys(seen: &Evidence, about: &str, heard: &Heard) -> Finding
          generation that is over, or somebody speaks in its name",
         heard.source
     );
-    let advice = format!(
+    Finding::error(Id::WrongKeys, found, of_one_root(fleet)).about(about)
+}
+
+fn of_one_root(fleet: u32) -> String {
+    format!(
         "if it was revoked, or does not belong here, do nothing: it stays out. `cara keys show --fleet {fleet}`, where the fleet's \
          root is, tells who belongs to it. Only one that does gets the file that lies beside the root; if there are two roots, one \
          of them has to go"
-    );
-    Finding::error(Id::WrongKeys, found, advice).about(about)
+    )
 }
 
 /// As `cara keys` takes a node.
@@ -117,16 +120,22 @@ pub(crate) fn mode_mismatch(seen: &Evidence, about: &str, heard: &Heard, manager
     Finding::error(Id::ModeMismatch, found, format!("{advice}; plain mode is for private networks")).about(about)
 }
 
-/// A node that speaks with a generation of keys that its manager does not take.
+/// A node that speaks with a key that its manager does not take: of a generation that is over, or of another root.
 pub(crate) fn generations(seen: &Evidence, node: &str, heard: &Heard) -> Option<Finding> {
-    let Standing::Proven(theirs) = heard.standing else { return None };
+    let Standing::Proven { generation: theirs, root } = heard.standing else { return None };
     let manager = heard.wanted.as_ref()?;
     let here = seen.running.iter().find(|unit| unit.name() == text_of(manager) && unit.unit.fleet == seen.fleet.0);
+    let spoken = generation_of(seen, manager);
     let taken = match here {
         Some(unit) => unit.unit.keys.as_ref()?.generations.clone(),
-        None => vec![generation_of(seen, manager)?],
+        None => vec![spoken?.0],
     };
-    if taken.contains(&theirs) {
+    let is_taken = taken.contains(&theirs);
+    if spoken.is_some_and(|(_, other)| other != root) {
+        // One root has one key of each generation. Two generations may be of one root, with no file here that shows it.
+        return Some(two_roots(seen, node, heard, manager).certain(is_taken || here.is_some()));
+    }
+    if is_taken {
         return None;
     }
     let numbers: Vec<String> = taken.iter().map(u32::to_string).collect();
@@ -144,12 +153,23 @@ pub(crate) fn generations(seen: &Evidence, node: &str, heard: &Heard) -> Option<
     Some(Finding::error(Id::KeyGenerations, found, advice).about(node).certain(here.is_some()))
 }
 
-/// The generation with which a manager elsewhere speaks.
-fn generation_of(seen: &Evidence, manager: &Manager) -> Option<u32> {
+/// The generation with which a manager was heard to speak, and its root.
+fn generation_of(seen: &Evidence, manager: &Manager) -> Option<(u32, u32)> {
     match seen.manager(manager)?.standing {
-        Standing::Proven(generation) => Some(generation),
+        Standing::Proven { generation, root } => Some((generation, root)),
         _ => None,
     }
+}
+
+/// Both have keys of the fleet that are here as well, and no root or file here has those of both.
+fn two_roots(seen: &Evidence, node: &str, heard: &Heard, manager: &Manager) -> Finding {
+    let (manager, fleet) = (text_of(manager), seen.fleet.0);
+    let found = format!(
+        "{node} at {} and {manager} speak with different keys of fleet {fleet}, and no file here has both: they are of two roots, or \
+         one of them is of a generation that is over",
+        heard.source
+    );
+    Finding::error(Id::WrongKeys, found, of_one_root(fleet)).about(node)
 }
 
 /// All of this kind that is strange on the network.
@@ -205,6 +225,10 @@ mod tests {
         Heard { mode: Mode::Plain, standing: Standing::Plain, ..heard }
     }
 
+    fn proven(generation: u32, root: u32) -> Standing {
+        Standing::Proven { generation, root }
+    }
+
     fn of(standing: Standing) -> Heard {
         Heard { standing, ..searching("agv", 7, "boss") }
     }
@@ -233,7 +257,7 @@ mod tests {
         let mut seen = evidence();
         seen.heard = vec![of(Standing::OtherKeys)];
         assert_eq!((ids(&seen), all_ids(&seen)), (vec![Id::WrongKeys], vec![Id::WrongKeys]));
-        seen.heard = vec![of(Standing::Proven(1)), Heard { standing: Standing::OtherKeys, ..answering("boss", 3) }];
+        seen.heard = vec![of(proven(1, 1)), Heard { standing: Standing::OtherKeys, ..answering("boss", 3) }];
         let reported = node::check(&seen, &Which("agv".into()));
         assert_eq!((reported.len(), reported[0].id, reported[0].about.as_deref()), (1, Id::WrongKeys, Some("boss/1")));
     }
@@ -241,7 +265,7 @@ mod tests {
     #[test]
     fn generations_are_compared_with_those_that_the_manager_takes() {
         let mut seen = evidence();
-        seen.heard = vec![of(Standing::Proven(1)), Heard { standing: Standing::Proven(2), ..answering("boss", 3) }];
+        seen.heard = vec![of(proven(1, 1)), Heard { standing: proven(2, 1), ..answering("boss", 3) }];
         assert_eq!(ids(&seen), [Id::KeyGenerations]);
         assert!(all_ids(&seen).is_empty(), "it may take both");
         let mut unit = running("boss", 1);
@@ -250,6 +274,27 @@ mod tests {
         assert_eq!(ids(&seen), [Id::NotJoining]);
         seen.running[0].unit.keys = Some(KeysInfo { file: None, generations: vec![2, 3] });
         assert_eq!((ids(&seen), all_ids(&seen)), (vec![Id::KeyGenerations], vec![Id::KeyGenerations]));
+    }
+
+    #[test]
+    fn keys_of_another_root_are_none_of_another_generation() {
+        let mut seen = evidence();
+        let first = |seen: &Evidence| node::check(seen, &Which("agv".into())).remove(0);
+        for generation in [1, 2] {
+            seen.heard = vec![of(proven(1, 1)), Heard { standing: proven(generation, 2), ..answering("boss", 3) }];
+            let found = first(&seen);
+            // Of one generation there are two keys: two roots. Else a file with both may be elsewhere.
+            assert_eq!((found.id, found.certain), (Id::WrongKeys, generation == 1), "{found:?}");
+            assert!(found.advice.contains("do nothing"), "{found:?}");
+            assert_eq!(all_ids(&seen).contains(&Id::WrongKeys), generation == 1);
+        }
+        let mut unit = running("boss", 1);
+        unit.unit.keys = Some(KeysInfo { file: None, generations: vec![2, 1] });
+        seen.running = vec![unit];
+        assert_eq!((ids(&seen), all_ids(&seen)), (vec![Id::WrongKeys], vec![Id::WrongKeys]));
+        // Not heard, it says which generations it takes, and no more.
+        seen.heard.truncate(1);
+        assert_eq!(ids(&seen), [Id::NotJoining]);
     }
 
     #[test]

@@ -191,7 +191,7 @@ fn a_survey_tells_whose_datagrams_are_proven() {
     // The manager answered the survey's question.
     assert!(boss["answers"].as_u64() > Some(0) && boss["generation"] == 1, "{reported}");
     assert_eq!(reported["keys_of"], serde_json::json!([modes.stage.fleet]));
-    modes.scan(modes.keys.path(), &[]).says("secured, proven").says("secured, other keys").says("do not meet");
+    modes.scan(modes.keys.path(), &[]).says("secured, of the fleet").says("secured, other keys").says("do not meet");
 }
 
 #[test]

@@ -1,9 +1,10 @@
 //! Modes and keys that keep a node and its manager apart.
 
-use std::fs::{Permissions, set_permissions};
+use std::fs::{Permissions, copy, read_to_string, set_permissions, write};
 use std::os::unix::fs::PermissionsExt;
 
 use cara_std::control::Control;
+use cara_std::keys::Store;
 use cara_std::{Builder, CommunicationSystem, Identity, MUnit};
 
 use crate::support::{Clinic, draw, private_directory, until};
@@ -63,7 +64,7 @@ fn keys_of_another_root_are_told_of_the_node_and_of_its_manager() {
     let clinic = Clinic::new();
     let others = draw(clinic.fleet);
     let ours = manager(&clinic, |boss| boss);
-    let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(others.ring(&agv()).unwrap()));
+    let vehicle = clinic.started(clinic.unit("agv", 7, "boss").keys(others.ring(&agv()).unwrap()));
     for reported in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
         reported.is(&["wrong-keys"], 4);
         assert!(reported.found(0).starts_with("agv/7 at "), "{reported:?}");
@@ -71,6 +72,21 @@ fn keys_of_another_root_are_told_of_the_node_and_of_its_manager() {
         assert!(advice.contains(&format!("`cara keys show --fleet {}`", clinic.fleet)), "{reported:?}");
         assert!(advice.contains("do nothing") && !advice.contains("derive"), "it may have been revoked: {reported:?}");
     }
+    // Its file is here as well, of a root that has changed its keys: two roots are not two generations of one.
+    vehicle.stop();
+    let mut others = others;
+    others.rotate().unwrap();
+    others.switch().unwrap();
+    others.finish().unwrap();
+    let theirs = others.ring(&agv()).unwrap();
+    let folder = private_directory();
+    let store = Store::create(folder.path(), others).unwrap();
+    store.save().unwrap();
+    copy(store.file_of(&agv()), clinic.key_file_of(&agv())).unwrap();
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(theirs));
+    let reported = clinic.doctor(&["agv"]);
+    reported.is(&["wrong-keys"], 4);
+    assert!(reported.found(0).contains("different keys of fleet"), "{reported:?}");
     ours.stop();
     let clinic = Clinic::new();
     // Its socket is another one's, as of a manager of another host.
@@ -129,6 +145,12 @@ fn a_key_file_that_others_can_read_is_told_with_the_command() {
     let reported = clinic.doctor(&["--listen", "3s"]);
     reported.is(&["key-file-refused"], 4);
     assert!(reported.found(0).contains("chmod 600"), "{reported:?}");
+    // Copied in text mode, or opened by an editor of Windows.
+    set_permissions(&file, Permissions::from_mode(0o600)).unwrap();
+    write(&file, read_to_string(&file).unwrap().replace('\n', "\r\n")).unwrap();
+    let reported = clinic.doctor(&["--listen", "0s"]);
+    reported.is(&["key-file-refused"], 4);
+    assert!(reported.found(0).contains("the lines end with CR LF"), "{reported:?}");
     // With this key file only, and no other node: the file explains why nothing is heard.
     let clinic = Clinic::new();
     set_permissions(clinic.key_file("boss"), Permissions::from_mode(0o644)).unwrap();

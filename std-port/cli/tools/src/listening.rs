@@ -56,7 +56,7 @@ pub fn how_to_get_keys(fleet: Fleet) -> String {
 pub const fn shown_standing(standing: Standing) -> (&'static str, Option<u32>) {
     match standing {
         Standing::Plain => ("none", None),
-        Standing::Proven(generation) => ("fleet", Some(generation)),
+        Standing::Proven { generation, .. } => ("fleet", Some(generation)),
         Standing::OtherKeys => ("other_keys", None),
         Standing::Unchecked => ("unchecked", None),
     }

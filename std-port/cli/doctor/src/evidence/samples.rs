@@ -70,7 +70,7 @@ fn heard(identity: Identity, wanted: Option<Manager>) -> Heard {
     Heard {
         source: SocketAddr::new("10.0.0.9".parse().unwrap(), 5000),
         mode: Mode::Secured,
-        standing: Standing::Proven(1),
+        standing: Standing::Proven { generation: 1, root: 1 },
         versions: VERSIONS,
         fleet: FLEET,
         identity: Some(identity),

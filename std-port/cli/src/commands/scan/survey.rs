@@ -98,7 +98,7 @@ fn table(heard: &[&Heard]) -> Rows {
         let identity = heard.identity.as_ref();
         let (style, mode) = match heard.standing {
             Standing::Plain => (PLAIN, "plain"),
-            Standing::Proven(_) => (PLAIN, "secured, proven"),
+            Standing::Proven { .. } => (PLAIN, "secured, of the fleet"),
             Standing::OtherKeys => (BAD, "secured, other keys"),
             Standing::Unchecked => (FAINT, "secured, not checked"),
         };
