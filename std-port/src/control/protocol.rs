@@ -578,8 +578,9 @@ impl LinkInfo {
     }
 }
 
-/// A stream in order brings something more often: it is probed every 4 s.
-pub const QUIET_STREAM_MS: u64 = 6_000;
+/// A stream in order brings something more often: a unit looks every 4 s whether it has written, and probes if not, so that up to
+/// 8 s are without a byte.
+pub const QUIET_STREAM_MS: u64 = 9_000;
 
 /// In which directions a link's datagrams pass, as either end has told.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
