@@ -152,11 +152,15 @@ fn a_name_of_several_nodes_is_refused() {
 #[test]
 fn of_two_managers_with_one_name_is_told_first() {
     let clinic = Clinic::new();
-    let _first = clinic.manager("boss", 64);
+    let first = clinic.manager("boss", 64);
+    let _agv = clinic.started(clinic.unit("agv-8", 8, "boss"));
+    until("a vehicle has come", || first.number_of_s_units() == 1);
     let second = clinic.search("boss", 1, 1).of_m_unit();
     while_running(
         || second.send(),
         || {
+            // Also beside a vehicle that has joined one of them.
+            clinic.doctor(&["agv-8"]).is(&["duplicate"], 4);
             clinic.doctor(&["boss"]).is(&["duplicate"], 4);
             assert_eq!(clinic.doctor(&["agv", "--listen", "4s"]).ids()[0], "duplicate");
             clinic.doctor(&["--listen", "3s"]).is(&["duplicate"], 4);

@@ -121,18 +121,47 @@ pub(crate) fn full(manager: &str, limit: Option<u16>) -> Finding {
 }
 
 /// A connection to an m_unit that did not open, though it shows itself.
-pub(crate) fn tcp_blocked(manager: &str, dial: &Dial) -> Option<Finding> {
+pub(crate) fn tcp_blocked(seen: &Evidence, manager: &str, dial: &Dial) -> Option<Finding> {
     let trouble = dial.outcome?.trouble()?;
     let (port, host) = (dial.to.port(), dial.to.ip());
     let found = format!("{manager} shows itself, and a connection to its TCP port {port} at {host} {trouble}");
-    let advice = match dial.outcome {
-        Some(Outcome::Refused) => format!(
-            "let TCP port {port} in in the firewall of {host}, which rejects it (`nft list ruleset`); if there is none, \
-             restart the manager"
+    let way = match seen.running.iter().any(|unit| unit.name() == manager) {
+        true => format!("let TCP port {port} in in the firewall of this host (`nft list ruleset`, `iptables -S`)"),
+        false => format!(
+            "let TCP port {port} in in the firewall of {host}, out in that of this host, and through what is between \
+             (`nft list ruleset`, `iptables -S`)"
         ),
-        _ => format!("let TCP port {port} in in the firewall of {host} (`nft list ruleset`, `iptables -S INPUT`)"),
+    };
+    let advice = match dial.outcome {
+        Some(Outcome::Refused) => {
+            format!("{way}; if nothing rejects it, look whether {manager} still runs, and at its log")
+        }
+        _ => way,
     };
     Some(Finding::error(Id::TcpBlocked, found, advice).about(manager).certain(true))
+}
+
+/// A node and its manager of which one was heard over loopback alone, and the other one from other hosts alone.
+pub(crate) fn loopback_apart(seen: &Evidence, node: &str, manager: &str) -> Option<Finding> {
+    let sources = |name: &str| -> Vec<SocketAddr> {
+        let of_it = seen.ours().filter(|(_, identity)| identity.to_string() == name);
+        of_it.map(|(heard, _)| heard.source).collect()
+    };
+    let is_local = |sources: &[SocketAddr]| sources.iter().all(|source| source.ip().is_loopback());
+    let is_far = |sources: &[SocketAddr]| !sources.iter().any(|source| source.ip().is_loopback());
+    let (of_node, of_manager) = (sources(node), sources(manager));
+    let (local, far, at) = match (of_node.first()?, of_manager.first()?) {
+        (_, at) if is_local(&of_node) && is_far(&of_manager) => (node, manager, at),
+        (at, _) if is_far(&of_node) && is_local(&of_manager) => (manager, node, at),
+        _ => return None,
+    };
+    let found =
+        format!("{local} is heard over loopback alone, and {far} at {at} and not over loopback: they do not meet");
+    let advice = format!(
+        "start {local} without CARA_INTERFACES, `--loopback` and `interfaces = \"lo\"`; if it has none of these, look for what \
+         this host's firewall keeps in (`nft list ruleset`)"
+    );
+    Some(Finding::error(Id::LoopbackOnly, found, advice).about(local))
 }
 
 /// The dial of what a manager tells of itself.
@@ -145,8 +174,8 @@ pub(crate) fn dial_of<'e>(seen: &'e Evidence, heard: &Heard) -> Option<&'e Dial>
 pub(crate) fn one_way(seen: &Evidence, at: SocketAddr) -> Finding {
     let found = format!("the node at {at} answers when it is asked alone, and does not when all are asked");
     let advice = format!(
-        "look for what keeps broadcasts to UDP port {} from it: a firewall there, a router between two networks, an access \
-         point that drops broadcasts; or tell s_units their manager's address",
+        "look for what keeps broadcasts to UDP port {} from it: a firewall there, another netmask, a router between two networks, \
+         an access point that drops broadcasts; or tell s_units their manager's address",
         seen.port
     );
     Finding::error(Id::BroadcastOneWay, found, advice).about(at).certain(true)
@@ -190,7 +219,7 @@ pub(crate) fn no_manager(seen: &Evidence) -> String {
 pub(crate) fn not_heard(seen: &Evidence, manager: &str) -> String {
     format!(
         "look on its host whether {manager} runs (`cara doctor {}` there), and start it if not; if it does, let UDP port {} in there, \
-         and look for what drops broadcasts between",
+         compare the netmasks, and look for what drops broadcasts between",
         quoted(manager),
         seen.port
     )

@@ -1,11 +1,13 @@
 //! A node that is connected: in order, or with something that will take its link away.
 
-use cara_std::control::protocol::{DatagramsInfo, NodeInfo, QUIET_STREAM_MS};
+use cara_std::control::protocol::{DatagramsInfo, NodeInfo, QUIET_STREAM_MS, RefusedInfo};
 
-use super::causes::{duplicate, refusal, restarting};
+use super::causes::{duplicate, duplicate_manager, refusal, restarting};
 use super::evidence::Evidence;
 use super::finding::{Finding, Id, Severity};
 use super::running::Running;
+
+use cara_tools::name_and_id::full_name;
 
 use std::time::Duration;
 
@@ -24,8 +26,10 @@ const LOSSY: u64 = 50;
 pub(crate) fn check(seen: &Evidence, unit: &Running, node: &NodeInfo) -> Vec<Finding> {
     let name = format!("{}/{}", node.name, node.id);
     let lives = seen.lives(&name);
-    let duplicates = duplicate(&name, &lives).or_else(|| refused_duplicate(unit, &name));
-    let mut found: Vec<Finding> = duplicates.map(|finding| finding.certain(true)).into_iter().collect();
+    let duplicates = duplicate(&name, &lives).or_else(|| refused_duplicate(unit, node));
+    // A second manager may take the node over, or be the one that is meant to have it.
+    let duplicates = duplicates.into_iter().chain(duplicate_manager(seen, &unit.name()));
+    let mut found: Vec<Finding> = duplicates.map(|finding| finding.certain(true)).collect();
     found.extend(restarting(&name, &lives));
     found.extend(lossy(unit, node));
     found.extend(ways(unit, node));
@@ -47,13 +51,21 @@ fn since(node: &NodeInfo) -> String {
         .map_or(String::new(), |ms| format!(", without a break for {:.1} s", Duration::from_millis(ms).as_secs_f32()))
 }
 
-/// Another node of its name was refused a short while ago.
-fn refused_duplicate(unit: &Running, name: &str) -> Option<Finding> {
+/// Another node of its name was refused a short while ago, while it was connected.
+fn refused_duplicate(unit: &Running, node: &NodeInfo) -> Option<Finding> {
     let recent = |ago_ms: u64| ago_ms < 30_000;
+    let name = full_name(node);
     let duplicate = unit.refused.iter().find(|refused| {
-        refused.reason == "DuplicateIdentity" && recent(refused.ago_ms) && refused.node.as_deref() == Some(name)
+        let of_it = refused.node.as_ref() == Some(&name) && !came_later(node, refused);
+        refused.reason == "DuplicateIdentity" && recent(refused.ago_ms) && of_it
     });
     duplicate.and_then(|refused| refusal(&unit.name(), refused))
+}
+
+/// Whether a node has connected since it was refused.
+pub(crate) fn came_later(node: &NodeInfo, refused: &RefusedInfo) -> bool {
+    let is_it = node.connected && refused.node.as_ref() == Some(&full_name(node));
+    is_it && node.connected_ms.is_some_and(|connected| connected < refused.ago_ms)
 }
 
 /// A link on which signs of life get lost.
@@ -128,8 +140,10 @@ pub(crate) fn ways(unit: &Running, node: &NodeInfo) -> Vec<Finding> {
 #[cfg(test)]
 mod tests {
     use cara_std::control::protocol::LinkInfo;
+    use cara_std::survey::Heard;
+    use cara_std::{Claim, Epoch};
 
-    use super::super::evidence::samples::{evidence, life, node_info, running};
+    use super::super::evidence::samples::{answering, evidence, life, node_info, running};
     use super::*;
 
     fn ids(seen: &Evidence) -> Vec<Id> {
@@ -190,6 +204,11 @@ mod tests {
             let found = reported(LinkInfo { datagrams: Some(datagrams), ..link }, 0);
             assert!(found.len() == 1 && found[0].0 == Id::DatagramsBlocked && found[0].1.contains(text), "{found:?}");
         }
+        assert_eq!(
+            reported(LinkInfo { stream_ms: 8_100, ..link }, 0)[0].0,
+            Id::Connected,
+            "a probe may be due only now"
+        );
         let silent = reported(LinkInfo { stream_ms: 9_500, ..link }, 0);
         assert!(silent.len() == 1 && silent[0].0 == Id::StreamDead && silent[0].1.contains("for 9 s"), "{silent:?}");
         let died = reported(link, 2);
@@ -206,5 +225,39 @@ mod tests {
         assert_eq!(ids(&seen), [Id::Duplicate]);
         seen.connected_lives[0].last = seen.connected_lives[0].first;
         assert_eq!(ids(&seen), [Id::Restarting]);
+    }
+
+    #[test]
+    fn a_second_manager_is_told_beside_a_connected_node() {
+        let mut seen = connected();
+        let said = |epoch, term| Heard {
+            epoch: Some(Epoch(epoch)),
+            claim: Some(Claim { term, claimant: 0 }),
+            last: Duration::from_secs(3),
+            ..answering("boss", 1)
+        };
+        seen.heard = vec![said(1, 4), Heard { first: Duration::from_secs(4), ..said(2, 4) }];
+        assert_eq!(ids(&seen), [Id::Connected], "it has started again");
+        seen.heard = vec![said(1, 4), said(2, 5)];
+        assert_eq!(ids(&seen), [Id::Fenced]);
+        seen.heard[1] = said(2, 4);
+        assert_eq!(ids(&seen), [Id::Duplicate]);
+    }
+
+    #[test]
+    fn a_refusal_before_the_node_joined_is_over() {
+        let mut seen = connected();
+        let refused = |ago_ms| RefusedInfo {
+            address: "10.0.0.2:5".into(),
+            node: Some("agv/7".into()),
+            reason: "DuplicateIdentity".into(),
+            text: "text".into(),
+            ago_ms,
+        };
+        seen.running[0].nodes[0].connected_ms = Some(20_000);
+        for (ago_ms, expected) in [(19_000, Id::Duplicate), (21_000, Id::Connected)] {
+            seen.running[0].refused = vec![refused(ago_ms)];
+            assert_eq!(ids(&seen), [expected], "{ago_ms}");
+        }
     }
 }

@@ -15,6 +15,8 @@ use super::running::Running;
 const ENOUGH: u32 = 2;
 /// Descriptors that a unit needs beside those of its nodes: pending links, sockets, files.
 const OTHER_DESCRIPTORS: u64 = 96;
+/// Descriptors that a unit keeps for its operators: with no more than these left it drops new connections.
+const KEPT_DESCRIPTORS: u64 = 20;
 
 /// The port of broadcasts could not be opened.
 pub(crate) fn port_in_use(port: u16, holders: &[Holder]) -> Finding {
@@ -32,7 +34,10 @@ pub(crate) fn port_in_use(port: u16, holders: &[Holder]) -> Finding {
 pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
     let no_way = if seen.interfaces == Interfaces::All { no_interface(seen) } else { loopback_only(seen) };
     let mut found: Vec<Finding> = no_way.into_iter().collect();
-    let own_way: Vec<&Reach> = seen.reach.iter().filter(|reach| reach.interface.up).collect();
+    // The port of the other mode does not matter where the mode is known, or suggested by keys.
+    let any_port = seen.mode.is_none() && !seen.keys.has;
+    let matters = |reach: &&Reach| reach.interface.up && (any_port || reach.port == seen.port);
+    let own_way: Vec<&Reach> = seen.reach.iter().filter(matters).collect();
     found.extend(own_way.iter().filter_map(|reach| send_refused(reach)));
     found.extend(own_way.iter().filter_map(|reach| broadcast_lost(reach)));
     found.extend(seen.running.iter().filter_map(exhausted));
@@ -149,16 +154,18 @@ pub(crate) fn control_refused(seen: &Evidence) -> Option<Finding> {
 }
 
 /// A unit that has no descriptor left for one more node.
-fn exhausted(running: &Running) -> Option<Finding> {
+pub(crate) fn exhausted(running: &Running) -> Option<Finding> {
     let files = running.files?;
-    (files.open.saturating_add(2) >= files.limit).then(|| descriptors(running, files.open, files.limit, Finding::error))
+    (files.open.saturating_add(KEPT_DESCRIPTORS) >= files.limit)
+        .then(|| descriptors(running, files.open, files.limit, Finding::error))
 }
 
 /// A unit whose limit is below what its nodes may need.
 pub(crate) fn few_descriptors(running: &Running) -> Option<Finding> {
     let files = running.files?;
     let needed = u64::from(running.unit.constraints.maximum_nodes).saturating_add(OTHER_DESCRIPTORS);
-    (files.limit < needed).then(|| descriptors(running, files.open, files.limit, Finding::warning))
+    (files.limit < needed && exhausted(running).is_none())
+        .then(|| descriptors(running, files.open, files.limit, Finding::warning))
 }
 
 /// What is in force is not what the file says.
@@ -234,6 +241,11 @@ mod tests {
         let mut seen = evidence();
         seen.reach[0].heard = 0;
         assert_eq!(ids(&seen), [Id::BroadcastLost]);
+        seen.reach.push(Reach { port: 21_970, ..seen.reach[0].clone() });
+        assert_eq!(ids(&seen), [Id::BroadcastLost], "there are keys, and the other port is that of plain mode");
+        seen.keys.has = false;
+        assert_eq!(ids(&seen), [Id::BroadcastLost; 2]);
+        seen.reach.truncate(1);
         seen.reach[0].sent = 1;
         assert_eq!(ids(&seen), [], "one may get lost");
         seen.reach[0].sent = 0;
@@ -266,8 +278,10 @@ mod tests {
         assert_eq!(exhausted(&unit), None);
         unit.files = Some(Files { limit: 1024, open: 20 });
         assert_eq!(few_descriptors(&unit), None);
-        unit.files = Some(Files { limit: 1024, open: 1023 });
-        assert_eq!(exhausted(&unit).unwrap().id, Id::FewDescriptors);
+        unit.files = Some(Files { limit: 100, open: 79 });
+        assert_eq!((exhausted(&unit), few_descriptors(&unit).is_some()), (None, true));
+        unit.files = Some(Files { limit: 100, open: 80 });
+        assert_eq!((exhausted(&unit).unwrap().id, few_descriptors(&unit)), (Id::FewDescriptors, None));
     }
 
     #[test]

@@ -4,12 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 
 use cara_std::Role;
+use cara_std::control::protocol::RefusedInfo;
 
 use super::causes::{
     dial_of, duplicate, duplicate_managers, full, missing_manager, no_manager, one_way, other_version, refusal,
     restarting, tcp_blocked, text_of,
 };
-use super::connected::{lossy, ways};
+use super::connected::{came_later, lossy, ways};
 use super::evidence::Evidence;
 use super::finding::{Finding, Id, Severity};
 use super::host;
@@ -69,7 +70,7 @@ fn managers(seen: &Evidence) -> Vec<Finding> {
     let mut found = Vec::new();
     for (heard, identity) in seen.m_units() {
         let name = identity.to_string();
-        found.extend(dial_of(seen, heard).and_then(|dial| tcp_blocked(&name, dial)));
+        found.extend(dial_of(seen, heard).and_then(|dial| tcp_blocked(seen, &name, dial)));
         let here = seen.running.iter().any(|unit| unit.name() == name);
         if heard.room == Some(0) && !here {
             found.push(Finding { severity: Severity::Warning, ..full(&name, None) });
@@ -130,7 +131,7 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     found.extend(host::unit_refused(seen, unit));
     found.extend(secured::failed_proofs(unit));
     if unit.is_full() {
-        found.push(no_room(unit));
+        found.push(no_room(seen, unit));
     }
     // A refused version that was heard here as well is told already.
     let reported =
@@ -140,6 +141,7 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
         .iter()
         .filter(|refused| !reported(&refused.address))
         .filter(|refused| !(unit.is_full() && refused.reason == "Full"))
+        .filter(|refused| !is_over(seen, refused))
         .filter_map(|refused| refusal(&unit.name(), refused));
     found.extend(refusals.take(MOST).map(|finding| Finding { severity: Severity::Warning, ..finding }));
     let connected = unit.nodes.iter().filter(|node| node.connected);
@@ -150,10 +152,15 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     found
 }
 
+/// Whether the node that was refused has joined since, here or another unit of this host.
+fn is_over(seen: &Evidence, refused: &RefusedInfo) -> bool {
+    seen.running.iter().flat_map(|unit| &unit.nodes).any(|node| came_later(node, refused))
+}
+
 /// A unit that is full, and the nodes that it has refused for that.
-fn no_room(unit: &Running) -> Finding {
+fn no_room(seen: &Evidence, unit: &Running) -> Finding {
     let finding = full(&unit.name(), Some(unit.unit.constraints.maximum_nodes));
-    let refused = unit.refused.iter().filter(|refused| refused.reason == "Full");
+    let refused = unit.refused.iter().filter(|refused| refused.reason == "Full" && !is_over(seen, refused));
     let names: BTreeSet<&str> = refused.filter_map(|refused| refused.node.as_deref()).take(MOST).collect();
     let names: Vec<&str> = names.into_iter().collect();
     let more = if names.is_empty() { String::new() } else { format!("; it refused {}", names.join(", ")) };
@@ -263,6 +270,28 @@ mod tests {
             Id::OtherFleet,
         ];
         assert_eq!(ids(&seen), expected);
+    }
+
+    #[test]
+    fn a_refusal_of_a_node_that_has_joined_since_is_not_told() {
+        let mut seen = in_order();
+        seen.running.push(running("chief", 2));
+        let refused = |node: &str, reason: &str, ago_ms| RefusedInfo {
+            address: "10.0.0.2:5".into(),
+            node: Some(node.into()),
+            reason: reason.into(),
+            text: "text".into(),
+            ago_ms,
+        };
+        // agv/7 has been connected to the other one for a minute.
+        seen.running[1].refused = vec![refused("agv/7", "WrongManager", 70_000)];
+        assert_eq!(ids(&seen), [Id::SeveralUnits]);
+        seen.running[1].refused = vec![refused("agv/7", "WrongManager", 50_000), refused("agv/8", "NoKey", 70_000)];
+        assert_eq!(ids(&seen), [Id::WrongManager, Id::NoPairKey, Id::SeveralUnits]);
+        seen.running[1].refused = vec![refused("agv/7", "Full", 70_000), refused("agv/8", "Full", 50_000)];
+        seen.running[1].unit.connected = 64;
+        let full = check(&seen).remove(0);
+        assert!(full.found.ends_with("; it refused agv/8"), "{full:?}");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use cara_std::survey::Heard;
 use cara_std::{Identity, Manager, Role};
 
 use super::causes::{
-    deaf, dial_of, duplicate, duplicate_manager, duplicate_managers, full, missing_manager, no_manager,
+    deaf, dial_of, duplicate, duplicate_manager, duplicate_managers, full, loopback_apart, missing_manager, no_manager,
     not_heard as not_heard_there, one_way, other_fleet, other_version, refusal, restarting, tcp_blocked, text_of,
 };
 use super::connected;
@@ -19,7 +19,7 @@ use super::running::Running;
 use super::secured;
 use super::which::Which;
 use cara_tools::close_names::close;
-use cara_tools::name_and_id::quoted;
+use cara_tools::name_and_id::{full_name, quoted};
 
 /// M_units answer a survey within milliseconds: one that has not answered after this time will not.
 pub(crate) const ANSWERED: Duration = Duration::from_millis(2_500);
@@ -133,7 +133,7 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     // A node that knows its manager's address dials it, again and again, and does not search meanwhile.
     let m_units = seen.m_units();
     let dials = m_units.iter().filter_map(|(heard, identity)| Some((dial_of(seen, heard)?, identity)));
-    let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(&identity.to_string(), dial));
+    let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(seen, &identity.to_string(), dial));
     // It may still turn out to search for another manager, unless that of this host has heard it search for it.
     let searches = left(seen, which).is_some_and(|(_, node)| left::searches(node));
     found.extend(blocked.map(|finding| finding.certain(searches)));
@@ -169,10 +169,11 @@ fn keeps_here(id: Id) -> bool {
 
 fn not_heard(seen: &Evidence, which: &Which) -> Finding {
     let mut found = format!(
-        "nothing was heard from {} in {:.0} s on {}, fleet {}",
+        "nothing was heard from {} in {:.0} s on {}, UDP port {}, fleet {}",
         which.0,
         seen.listened.as_secs_f32(),
         seen.interfaces_up().join(", "),
+        seen.port,
         seen.fleet.0
     );
     let managers: Vec<_> = seen.running.iter().filter(|unit| unit.is_m_unit()).map(Running::name).collect();
@@ -190,14 +191,17 @@ fn not_heard(seen: &Evidence, which: &Which) -> Finding {
     if let Some(name) = nearest(seen, which) {
         found.push_str(&format!("; there is {name}"));
     }
-    let advice = "check that it is switched on, cabled to this network and started; that its fleet is this one; a node that \
-                  was told its manager's address is silent here, and another cable or network carries no broadcast to here";
+    let advice = "check that it is switched on, cabled to this network and started; that its fleet, UDP port and netmask are \
+                  these; a node that is connected, or was told its manager's address, is silent here (see its log), and \
+                  another cable or network carries no broadcast to here";
     Finding::error(Id::NotHeard, found, advice).about(&which.0)
 }
 
 /// `NAME/ID` of the node whose name is closest.
 fn nearest(seen: &Evidence, which: &Which) -> Option<String> {
-    let nodes = seen.running.iter().flat_map(|unit| &unit.nodes).map(|node| format!("{}/{}", node.name, node.id));
+    // A node that is waited for has the name itself.
+    let others = seen.running.iter().flat_map(|unit| &unit.nodes).filter(|node| !which.is(&node.name, node.id));
+    let nodes = others.map(full_name);
     let known: Vec<String> = seen.units().map(|(_, identity)| identity.to_string()).chain(nodes).collect();
     let wanted = which.0.rsplit_once('/').map_or(which.0.as_str(), |(name, _)| name);
     let name_of = |full: &'_ str| full.rsplit_once('/').map_or(0, |(name, _)| name.len());
@@ -259,7 +263,7 @@ fn heard_m_unit(seen: &Evidence, heard: &Heard, identity: &Identity) -> Vec<Find
     let lives = seen.lives(&name);
     let mut found: Vec<Finding> = duplicate_manager(seen, &name).into_iter().chain(restarting(&name, &lives)).collect();
     let dial = dial_of(seen, heard);
-    found.extend(dial.and_then(|dial| tcp_blocked(&name, dial)));
+    found.extend(dial.and_then(|dial| tcp_blocked(seen, &name, dial)));
     let answers = seen.ours().any(|(heard, other)| other == identity && heard.to_us > 0);
     if found.is_empty() && seen.answered_alone.contains(&heard.source) {
         found.push(one_way(seen, heard.source));
@@ -289,7 +293,12 @@ fn heard_s_unit(seen: &Evidence, which: &Which, heard: &Heard, identity: &Identi
     let restarts = restarting(&name, &lives);
     let Some(wanted) = &heard.wanted else { return restarts.into_iter().collect() };
     let mut found: Vec<Finding> = restarts.into_iter().collect();
-    found.extend(of_its_manager(seen, &name, heard, wanted));
+    let cause = of_its_manager(seen, &name, heard, wanted);
+    if cause.as_ref().is_some_and(|cause| cause.id == Id::NoManager) {
+        // A node of this host is heard over loopback, whatever keeps other hosts away.
+        found.extend(host::check(seen));
+    }
+    found.extend(cause);
     if found.is_empty() {
         found.extend(secured::generations(seen, &name, heard));
     }
@@ -320,12 +329,18 @@ fn of_its_manager(seen: &Evidence, name: &str, node: &Heard, wanted: &Manager) -
         };
         return Some(found.certain(seen.listened >= ANSWERED));
     };
-    if let Some(blocked) = dial_of(seen, heard).and_then(|dial| tcp_blocked(&manager, dial)) {
+    if let Some(apart) = loopback_apart(seen, name, &manager) {
+        return Some(apart.certain(seen.listened >= ANSWERED));
+    }
+    if let Some(blocked) = dial_of(seen, heard).and_then(|dial| tcp_blocked(seen, &manager, dial)) {
         return Some(blocked);
     }
     let limit = here.filter(|unit| unit.is_full()).map(|unit| unit.unit.constraints.maximum_nodes);
     if heard.room == Some(0) || limit.is_some() {
         return Some(full(&manager, limit).certain(true));
+    }
+    if let Some(exhausted) = here.and_then(host::exhausted) {
+        return Some(exhausted.certain(true));
     }
     seen.answered_alone.contains(&heard.source).then(|| one_way(seen, heard.source))
 }

@@ -72,6 +72,21 @@ fn on_the_managers_host_it_is_told_that_the_vehicle_is_heard() {
     });
 }
 
+/// As a manager that was started with what a trial on one host needs.
+#[test]
+fn a_manager_that_uses_loopback_alone_is_told() {
+    namespace::inside("joining::a_manager_that_uses_loopback_alone_is_told", &[], || {
+        let clinic = Clinic::on_all_interfaces();
+        let far = clinic.peer(VEHICLE, &Identity::s_unit("agv", 7).unwrap());
+        cable(&far);
+        let _manager = clinic.manager("boss", 64);
+        far.go();
+        let reported = clinic.doctor(&["agv"]);
+        reported.is(&["loopback-only"], 4);
+        assert!(reported.found(0).starts_with("boss/1 is heard over loopback alone"), "{reported:?}");
+    });
+}
+
 /// What is known is that no manager is heard; another one, started for that, would be a second one.
 #[test]
 fn a_manager_that_is_not_heard_is_not_said_to_be_stopped() {

@@ -143,6 +143,49 @@ fn a_closed_port_or_a_full_manager_is_named() {
     unit.unit.connected = 64;
     seen.running = vec![unit];
     assert_eq!(ids(&seen), [Id::Full]);
+    // It takes connections, and drops them.
+    seen.running[0].unit.connected = 27;
+    seen.running[0].files = Some(crate::running::Files { limit: 64, open: 44 });
+    assert_eq!(ids(&seen), [Id::FewDescriptors]);
+}
+
+/// Its own host's cable is out: nobody is to look after the manager first.
+#[test]
+fn a_node_of_a_host_that_is_cut_off_is_not_told_that_no_manager_runs() {
+    let mut seen = evidence();
+    seen.heard = vec![Heard { source: "127.0.0.1:5000".parse().unwrap(), ..searching("agv", 7, "boss") }];
+    assert_eq!(ids(&seen), [Id::NoManager]);
+    seen.reach[0].interface.up = false;
+    assert_eq!(ids(&seen), [Id::InterfaceDown, Id::NoManager]);
+}
+
+#[test]
+fn the_firewall_that_is_meant_is_that_of_either_host() {
+    let mut seen = both();
+    seen.dials[0].outcome = Some(Outcome::Refused);
+    let advice = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0).advice;
+    assert!(advice(&seen).contains("firewall of 10.0.0.9, out in that of this host"), "{}", advice(&seen));
+    assert!(!advice(&seen).contains("restart"), "its vehicles would stop");
+    seen.running = vec![running("boss", 1)];
+    assert!(advice(&seen).contains("in in the firewall of this host"), "{}", advice(&seen));
+}
+
+#[test]
+fn who_is_heard_over_loopback_alone_does_not_meet_another_host() {
+    let first = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0);
+    let local = |heard: Heard| Heard { source: "127.0.0.1:5000".parse().unwrap(), ..heard };
+    let mut seen = both();
+    seen.heard[0] = local(searching("agv", 7, "boss"));
+    let found = first(&seen);
+    assert_eq!((found.id, found.about.as_deref()), (Id::LoopbackOnly, Some("agv/7")));
+    assert!(found.found.contains("boss/1 at 10.0.0.9:5000 and not over loopback"), "{found:?}");
+    seen.heard[1] = local(answering("boss", 3));
+    assert_eq!(ids(&seen), [Id::NotJoining], "both are on this host");
+    seen.heard[0] = searching("agv", 7, "boss");
+    let found = first(&seen);
+    assert_eq!((found.id, found.about.as_deref()), (Id::LoopbackOnly, Some("boss/1")));
+    seen.heard.push(answering("boss", 3));
+    assert_eq!(ids(&seen), [Id::NotJoining], "it is heard from both");
 }
 
 #[test]
@@ -217,4 +260,10 @@ fn a_node_of_the_same_name_and_another_id_is_named() {
     seen.running = vec![unit];
     let found = check(&seen, &Which("agv-17/18".into())).remove(0);
     assert!(found.found.ends_with("; there is agv-17/17"), "{found:?}");
+    // It is waited for, and is no other one.
+    seen.running[0].nodes[0] = node_info("agv-17", 17, false);
+    seen.running[0].nodes[0].left_ms = None;
+    let found = check(&seen, &Which("agv-17".into())).remove(0);
+    assert!(found.found.ends_with("boss/1 waits for it, and it has not joined"), "{found:?}");
+    assert!(found.found.contains("on eth0, UDP port 21971, fleet 7"), "{found:?}");
 }
