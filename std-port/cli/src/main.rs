@@ -17,6 +17,7 @@ use std::process::ExitCode;
 
 use crate::command_line::{CommandLine, Verb};
 use cara_tools::global::Global;
+use cara_tools::interrupt;
 
 fn main() -> ExitCode {
     let CommandLine { global, verb } = match command_line::parse() {
@@ -28,6 +29,9 @@ fn main() -> ExitCode {
 }
 
 fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
+    if matches!(verb, Verb::Scan(_) | Verb::Watch(_) | Verb::Stream(_) | Verb::Doctor(_)) {
+        interrupt::end_at_signals()?;
+    }
     match verb {
         Verb::Scan(arguments) => commands::scan::run(arguments, global),
         Verb::Functions(arguments) => commands::functions::run(arguments, global),

@@ -284,6 +284,23 @@ impl Running {
         self.signal(rustix::process::Signal::INT);
     }
 
+    /// Ctrl-C once it is caught, and the exit code.
+    pub(crate) fn interrupted(mut self) -> i32 {
+        let status = format!("/proc/{}/status", self.child.id());
+        let caught = |line: &str| Some(u64::from_str_radix(line.strip_prefix("SigCgt:")?.trim(), 16).unwrap());
+        let sigint = 1 << (rustix::process::Signal::INT.as_raw() - 1);
+        until("Ctrl-C is caught", || {
+            let text = std::fs::read_to_string(&status).unwrap();
+            text.lines().find_map(caught).is_some_and(|signals| signals & sigint != 0)
+        });
+        // The first may come before it is listened to.
+        until("Ctrl-C ends it", || {
+            self.interrupt();
+            self.child.try_wait().unwrap().is_some()
+        });
+        self.end()
+    }
+
     /// Ctrl-Z, as far as one process is concerned, and not to be caught.
     pub(crate) fn freeze(&self) {
         cara_processes::freeze(&self.child).unwrap();

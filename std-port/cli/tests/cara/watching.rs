@@ -31,6 +31,15 @@ fn a_failed_asynchronous_call_is_an_event() {
     assert_eq!(watch.end(), 0);
 }
 
+/// A program that starts them learns that they did not end by themselves.
+#[test]
+fn what_looks_until_ctrl_c_ends_with_its_exit_code() {
+    let stage = Stage::with(&[]);
+    for arguments in [&["watch"][..], &["scan", "--survey", "--listen", "1min"], &["doctor", "--listen", "1min"]] {
+        assert_eq!(Running::start(stage.command(arguments)).interrupted(), 130, "{arguments:?}");
+    }
+}
+
 #[test]
 fn a_watch_ends_when_it_is_told_to() {
     let stage = Stage::with(&[]);
