@@ -93,6 +93,28 @@ fn the_older_copy_is_replaced() {
     assert!(second.contains(r#""address":270528512"#) && second.contains(r#""generation":2"#), "{second}");
     let third = next("3.bin", "1.bin", "2.bin");
     assert!(third.contains(r#""address":270524416"#) && third.contains(r#""generation":3"#), "{third}");
+    // Power was cut while the first copy was written.
+    let mut cut = fs::read(folder.path().join("1.bin")).unwrap();
+    cut[20] ^= 1;
+    fs::write(folder.path().join("cut.bin"), cut).unwrap();
+    let third = next("4.bin", "cut.bin", "2.bin");
+    assert!(third.contains(r#""address":270524416"#) && third.contains(r#""generation":3"#), "{third}");
+}
+
+#[test]
+fn files_that_are_no_pages_of_the_board_are_refused_as_previous() {
+    let folder = folder();
+    let path = folder.path();
+    done(path, &reported("rp2040", &["--output", "1.bin"]));
+    done(path, &reported("rp2040", &["--uf2", "--output", "both.uf2"]));
+    fs::write(path.join("empty"), "").unwrap();
+    fs::write(path.join("half"), [0xFF; BYTES / 2]).unwrap();
+    let previous = |file| reported("rp2040", &["--output", "2.bin", "--previous", "1.bin", file]);
+    for file in ["/etc/passwd", "both.uf2", "empty", "half"] {
+        refused(path, &previous(file), 2, &format!("{file} is neither a copy of settings nor an erased page"));
+    }
+    refused(path, &previous("1.bin"), 2, "both files hold one page, that of generation 1");
+    assert!(!path.join("2.bin").exists());
 }
 
 #[test]
@@ -148,6 +170,15 @@ fn every_mistake_is_reported() {
     refused(folder.path(), &reported("rp2040", &["--gateway", "10.0.0.1", "--output", "x"]), 2, "the server tells");
     let address = ["--address", "10.0.0.1/24", "--gateway", "255.255.255.255", "--output", "page.bin"];
     refused(folder.path(), &reported("rp2040", &address), 2, "no host's address");
+    let address = ["--address", "10.0.0.17/24", "--gateway", "10.0.1.1", "--output", "page.bin"];
+    refused(
+        folder.path(),
+        &reported("rp2040", &address),
+        2,
+        "10.0.1.1 is no other host of the network of 10.0.0.17/24",
+    );
+    let manager = ["--manager-address", "10.0.0.1:0", "--output", "page.bin"];
+    refused(folder.path(), &reported("rp2040", &manager), 2, "port 0 is no port");
     refused(folder.path(), &reported("rp2040", &["--address", "255.255.255.255/24"]), 2, "no address of a host");
     refused(folder.path(), &reported("rp2040", &["--uf2"]), 2, "--output");
     refused(folder.path(), &reported("rp2040", &["--output", "absent/page.bin"]), 1, "cannot write absent/page.bin");

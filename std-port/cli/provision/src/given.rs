@@ -29,7 +29,7 @@ pub(super) struct Given {
     #[arg(long, value_name = "NAME/ID")]
     manager: Option<NameAndId>,
     /// Where the manager is, for networks on which broadcasts do not pass.
-    #[arg(long, value_name = "ADDRESS:PORT")]
+    #[arg(long, value_name = "ADDRESS:PORT", value_parser = address_of_manager)]
     manager_address: Option<SocketAddrV4>,
     /// The board's address: dhcp, or as in 10.0.0.17/24.
     #[arg(long, value_name = "ADDRESS", default_value = "dhcp")]
@@ -86,9 +86,22 @@ fn names_network(address: Ipv4Addr, prefix: u8) -> bool {
     prefix < 31 && (host == 0 || host == hosts)
 }
 
+/// Whether a gateway is another host of the network. In a network of one address none is: it is behind that.
+fn is_reached(gateway: Ipv4Addr, address: Ipv4Addr, prefix: u8) -> bool {
+    let hosts = u32::MAX.checked_shr(prefix.into()).unwrap_or(0);
+    let same_network = prefix == 32 || (gateway.to_bits() ^ address.to_bits()) & !hosts == 0;
+    same_network && gateway != address && !names_network(gateway, prefix)
+}
+
 fn host(text: &str) -> Result<Ipv4Addr, &'static str> {
     let address = text.parse().map_err(|_| "write an IPv4 address as in 10.0.0.1")?;
     if is_of_host(address) { Ok(address) } else { Err("this is no host's address: write one as in 10.0.0.1") }
+}
+
+fn address_of_manager(text: &str) -> Result<SocketAddrV4, &'static str> {
+    let address: SocketAddrV4 = text.parse().map_err(|_| "write ADDRESS:PORT as in 10.0.0.1:7000")?;
+    host(&address.ip().to_string())?;
+    if address.port() == 0 { Err("port 0 is no port: write the manager's `tcp_port`") } else { Ok(address) }
 }
 
 impl Given {
@@ -136,6 +149,9 @@ impl Given {
         match (self.address, self.gateway) {
             (Address::Dhcp, None) => Ok(Network::Dhcp),
             (Address::Dhcp, Some(_)) => Err(Ended::usage("with --address dhcp the server tells the gateway")),
+            (Address::Static(address, prefix), Some(gateway)) if !is_reached(gateway, address, prefix) => {
+                Err(Ended::usage(format!("--gateway {gateway} is no other host of the network of {address}/{prefix}")))
+            }
             (Address::Static(address, prefix), gateway) => Ok(Network::Static { address, prefix, gateway }),
         }
     }
@@ -216,7 +232,7 @@ fn password(file: &Path) -> anyhow::Result<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::Address;
+    use super::{Address, address_of_manager, is_reached};
 
     #[test]
     fn addresses_are_read() {
@@ -224,6 +240,28 @@ mod tests {
         assert_eq!("10.0.0.17/24".parse(), Ok(Address::Static([10, 0, 0, 17].into(), 24)));
         for wrong in ["", "DHCP", "10.0.0.17", "10.0.0.17/33", "10.0.0/24", "10.0.0.17/-1", "::1/64"] {
             assert!(wrong.parse::<Address>().is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_gateway_is_another_host_of_the_network() {
+        let is_reached = |gateway: [u8; 4], prefix| is_reached(gateway.into(), [10, 0, 0, 17].into(), prefix);
+        for (gateway, prefix) in [([10, 0, 0, 1], 24), ([10, 0, 9, 1], 16), ([10, 0, 0, 16], 31), ([10, 0, 1, 1], 32)] {
+            assert!(is_reached(gateway, prefix), "{gateway:?}/{prefix}");
+        }
+        for (gateway, prefix) in
+            [([10, 0, 1, 1], 24), ([10, 0, 0, 17], 24), ([10, 0, 0, 255], 24), ([10, 0, 0, 18], 31)]
+        {
+            assert!(!is_reached(gateway, prefix), "{gateway:?}/{prefix}");
+        }
+    }
+
+    #[test]
+    fn a_managers_address_is_one_that_can_be_dialled() {
+        assert!(address_of_manager("10.0.0.1:7000").is_ok());
+        for wrong in ["10.0.0.1:0", "10.0.0.1", "0.0.0.0:7000", "255.255.255.255:7000", "127.0.0.1:7000", "[::1]:7000"]
+        {
+            assert!(address_of_manager(wrong).is_err(), "{wrong}");
         }
     }
 

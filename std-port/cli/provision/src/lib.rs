@@ -16,6 +16,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use cara_settings::board::{BOARDS, Board, find};
+use cara_settings::page::{BYTES, PageError, decode};
 use cara_std::keys::{Owner, check_replaceable, full_name, write_private};
 use serde_json::json;
 
@@ -110,7 +111,7 @@ fn write_file(
     file: &Path,
     global: &Global,
 ) -> anyhow::Result<()> {
-    let previous = arguments.previous.as_deref().map(pages).transpose()?;
+    let previous = arguments.previous.as_deref().map(|files| pages(files, board)).transpose()?;
     let written = match (&previous, arguments.uf2) {
         (Some([first, second]), _) => vec![copy::next(board, content, first, second)?],
         // Whatever the pages hold, these are newer than nothing.
@@ -161,12 +162,31 @@ fn read_whole(file: &Path) -> anyhow::Result<Zeroizing<Vec<u8>>> {
 }
 
 /// What the two files hold.
-fn pages(files: &[PathBuf]) -> anyhow::Result<[Zeroizing<Vec<u8>>; 2]> {
-    let read = |file: &PathBuf| read_whole(file);
-    match files {
-        [first, second] => Ok([read(first)?, read(second)?]),
-        _ => Err(Ended::usage("--previous takes two files")),
+fn pages(files: &[PathBuf], board: &Board) -> anyhow::Result<[Zeroizing<Vec<u8>>; 2]> {
+    let [first, second] = files else { return Err(Ended::usage("--previous takes two files")) };
+    let pages = [page(first, board)?, page(second, board)?];
+    // A copy gets the next generation of the other one.
+    match pages.each_ref().map(|page| decode(page)) {
+        [Ok((_, one)), Ok((_, other))] if one == other => {
+            Err(Ended::usage(format!("--previous: both files hold one page, that of generation {one}")))
+        }
+        _ => Ok(pages),
     }
+}
+
+/// A page with a copy, a damaged one included, or an erased page.
+fn page(file: &Path, board: &Board) -> anyhow::Result<Zeroizing<Vec<u8>>> {
+    let page = read_whole(file)?;
+    let is_erased = page.len() >= BYTES && page.iter().all(|byte| *byte == 0xFF);
+    if decode(&page).is_err_and(|error| error == PageError::Absent) && !is_erased {
+        let ([first, second], name) = (board.pages, file.display());
+        let text = format!(
+            "--previous: {name} is neither a copy of settings nor an erased page: read the pages of the board at {first:#x} and \
+             {second:#x}, {BYTES} bytes each, and erase what holds something else"
+        );
+        return Err(Ended::usage(text));
+    }
+    Ok(page)
 }
 
 fn report(
