@@ -58,8 +58,16 @@ _cara_names() {
 }
 "#;
 
-const FISH: &str =
-    "\ncomplete -c cara -a '(cara completions --line -- (commandline -opc)[2..-1] (commandline -ct) 2>/dev/null)'\n";
+const FISH: &str = r#"
+function __cara_names
+    set -g __cara_found (cara completions --line -- (commandline -opc)[2..-1] (commandline -ct) 2>/dev/null)
+    test (count $__cara_found) -gt 0
+end
+complete -c cara -n __cara_names -f -a '$__cara_found'
+"#;
+/// The one option whose value is such a name.
+const OFFERING: &str = " -l offering ";
+const NAMES_OFFERING: &str = " -l offering -f -a '(__cara_names; and string join \\n $__cara_found)' ";
 
 pub(crate) fn run(Arguments { shell, words, .. }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let Some(shell) = shell else {
@@ -84,12 +92,13 @@ fn script(shell: Shell) -> String {
     let mut script = String::from_utf8_lossy(&script).into_owned();
     match shell {
         Shell::Bash => script += BASH,
-        Shell::Fish => script += FISH,
+        Shell::Fish => script = script.replace(OFFERING, NAMES_OFFERING) + FISH,
         Shell::Zsh => {
             // Its last lines run what stands before them.
             let end = script.rfind("\nif [ \"$funcstack[1]\"").unwrap_or(script.len());
             script.insert_str(end, ZSH);
-            script = script.replace(":_default'", ":_cara_names'");
+            // With two colons an action sees the words from there on, and not the verb.
+            script = script.replace(":_default'", ":_cara_names'").replace("'*::", "'*:");
         }
         _ => {}
     }

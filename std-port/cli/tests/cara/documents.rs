@@ -50,6 +50,10 @@ fn every_shell_has_completions() {
             Some(script.out.as_str())
         );
     }
+    // With two colons zsh hides the verb from what asks for names.
+    let zsh = stage.ends(0, &["completions", "zsh"]).out;
+    assert!(zsh.contains("'*:words -- ") && !zsh.contains("'*::"), "{zsh}");
+    stage.ends(0, &["completions", "fish"]).says(" -l offering -f -a '(__cara_names; ");
     stage.ends(2, &["completions", "abacus"]);
 }
 
