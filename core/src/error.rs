@@ -502,6 +502,9 @@ pub enum Error {
         "the system does not permit this port: below 1024 it takes root or CAP_NET_BIND_SERVICE; choose another one"
     )]
     PortNotPermitted,
+    /// The call was to be made only while this unit leads, and it does not. Nothing was sent.
+    #[error("this manager does not lead, and the call is for one that does: wait for `Leading`, or call without that")]
+    NoAuthority,
     /// The unit has been stopped, or cannot be started (again).
     #[error("the unit does not run: it was stopped or runs already; make a new one")]
     NotRunning,
@@ -563,7 +566,7 @@ impl Error {
             | Self::NotAllowed
             | Self::Service(_)
             | Self::Refused(_) => Cause::Peer,
-            Self::Full(_) | Self::TooSoon { .. } => Cause::Resource,
+            Self::Full(_) | Self::TooSoon { .. } | Self::NoAuthority => Cause::Resource,
             Self::Closed(_) | Self::Network | Self::PortInUse | Self::PortNotPermitted | Self::NotRunning => {
                 Cause::Transport
             }

@@ -364,6 +364,13 @@ impl<'c, C: Caller, Q, W, K> Call<'c, C, Q, W, K> {
         self
     }
 
+    /// Only while this unit leads ([`UnitEvent::Leading`](crate::services::event::UnitEvent::Leading)), [`Error::NoAuthority`]
+    /// otherwise. This unit looks when it sends: what the call is for has to refuse lower claims itself, as a vehicle does.
+    pub const fn only_while_leading(mut self) -> Self {
+        self.options.only_while_leading = true;
+        self
+    }
+
     /// With these options in place of those so far.
     pub const fn with(mut self, options: RequestOptions) -> Self {
         self.options = options;

@@ -59,6 +59,13 @@ pub enum UnitEvent<F, N, E> {
         /// Its claim.
         claim: Claim,
     },
+    /// This manager leads from here on: it alone holds its authority's key, and its claim was made under that. Only on Linux.
+    Leading {
+        /// Its claim.
+        claim: Claim,
+    },
+    /// This manager does not lead any more. Its links and orders go on; calls that are only for a leader fail.
+    NotLeading,
     /// The claim of this manager is obeyed until this unit's next start only: it could not be stored, or not in time.
     ClaimNotKept {
         /// The manager.

@@ -67,7 +67,8 @@ entry!(node_hears, {
     node().store_claims();
     keep((node().claim(), node().take_claim_event(), node().obeyed(unknown())));
     node().stand_by(*unknown());
-    keep((node().is_standby(), node().lead(*unknown(), *unknown())));
+    node().not_raised(*unknown());
+    keep((node().is_standby(), node().starts_above(), node().lead(*unknown(), *unknown())));
 });
 
 entry!(node_dials, {

@@ -43,7 +43,7 @@ pub enum ClaimEvent {
     /// This claim is obeyed until this unit's next start: it could not be stored, or not in time.
     Unkept(Identity, Claim),
     /// This m_unit is to claim the one above: the port draws a claimant, stores, calls [`Node::set_claim`], and has each session
-    /// announce it. Where storing fails it does nothing.
+    /// announce it. Where storing fails it does nothing; where it may not claim now it calls [`Node::not_raised`].
     Raise(Claim),
     /// A live manager of this m_unit's identity has this higher claim: the port stores it and stops. One that is to stand by ends all
     /// links instead, and calls [`Node::stand_by`].
@@ -221,6 +221,11 @@ impl<P: Port> Node<P> {
     pub fn set_claim(&mut self, tagged: TaggedClaim) {
         self.claims.own = tagged;
         self.claims.rival = self.claims.rival.filter(|rival| rival.claim > tagged.claim);
+    }
+
+    /// This m_unit may not claim now, so that a [`ClaimEvent::Raise`] was not done: it comes again, as if for the first time.
+    pub fn not_raised(&mut self, now: Instant) {
+        (self.claims.next_raise, self.claims.pause) = (now, FIRST_PAUSE);
     }
 
     /// This m_unit starts beside a live one, or to take over from one that hangs: it raises its claim above all genuine ones until

@@ -35,6 +35,13 @@ impl<P: Port> Node<P> {
         P::MANAGES && P::STANDS_BY && self.claims.stage != Stage::Commands
     }
 
+    /// The claim above which this standby is to command: that of the last [`ClaimEvent::Lead`], or a higher one that was heard since.
+    /// `None` once somebody has answered.
+    pub fn starts_above(&self) -> Option<Claim> {
+        let above = self.claims.rival.map_or(Claim::NONE, |rival| rival.claim);
+        (self.claims.stage == Stage::Starts).then_some(above)
+    }
+
     /// The port has stored this claim, in answer to [`ClaimEvent::Lead`]: the m_unit commands with it from here on. `false` where it
     /// still stands by: somebody has answered meanwhile, or a higher claim was heard, above which it claims next.
     pub fn lead(&mut self, now: Instant, tagged: TaggedClaim) -> bool {

@@ -49,6 +49,8 @@ pub struct RequestOptions {
     pub progress: bool,
     /// How long a call that is given up still waits for its answer; zero for not at all. Only on Linux.
     pub answer_within: Duration,
+    /// Only while this unit leads, [`Error::NoAuthority`] otherwise. A port without leaders leaves it set, and is refused.
+    pub only_while_leading: bool,
 }
 
 impl RequestOptions {
@@ -64,6 +66,7 @@ impl RequestOptions {
             made: None,
             progress: false,
             answer_within: Duration::ZERO,
+            only_while_leading: false,
         }
     }
 
@@ -100,6 +103,10 @@ impl<P: Port> Calling<P> {
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
+        if options.only_while_leading {
+            // A port that knows who leads has looked, and taken it away.
+            return Err(Error::NoAuthority);
+        }
         // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
         let mut checked = self.check(wire, cx, callee, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
