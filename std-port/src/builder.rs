@@ -18,6 +18,7 @@ use core::net::SocketAddr;
 use crate::access::AccessTable;
 #[cfg(feature = "access")]
 use crate::access::{AccessError, watch::FileWatch};
+use crate::authority::Authority;
 use crate::config::Capacities;
 use crate::engine::claims::TakeOver;
 use crate::engine::{Engine, EngineParts, HubCell, Keys, message_buffer_bytes, node_storage};
@@ -67,6 +68,7 @@ pub struct Builder<T, R> {
     state_folder: Option<PathBuf>,
     take_over: TakeOver,
     stands_by: bool,
+    authority: Option<Box<dyn Authority>>,
     starts_stopped: Option<u16>,
     state: T,
     role: PhantomData<fn() -> R>,
@@ -116,6 +118,7 @@ impl<R> Builder<(), R> {
             state_folder: crate::claims::folder(),
             take_over: TakeOver::No,
             stands_by: false,
+            authority: None,
             starts_stopped: None,
             state: (),
             role: PhantomData,
@@ -176,6 +179,18 @@ impl<T: Send + 'static> Builder<T, MUnit> {
     /// ```
     pub fn standby(mut self) -> Self {
         self.stands_by = true;
+        self
+    }
+
+    /// The m_unit claims its vehicles only while this [`Authority`] has given it a key, which one manager of its name, id and fleet
+    /// has at a time: it starts with the key, or does not start ([`StartError::NoAuthority`]); a [standby](Self::standby) asks for
+    /// it when it is to command. With the key it leads ([`UnitEvent::Leading`](crate::UnitEvent::Leading),
+    /// [`is_leading`](crate::CommunicationSystem::is_leading)). Where it loses the key, or the authority does not answer in time, its links
+    /// and orders go on ([`UnitEvent::NotLeading`](crate::UnitEvent::NotLeading)); it raises its claim no more, and calls that are
+    /// [only for a leader](crate::Call::only_while_leading) fail with [`Error::NoAuthority`]. When it has the key again it raises its
+    /// claim, and leads. It takes keys: [`BuildError::AuthorityWithoutKeys`] in plain mode.
+    pub fn authority(mut self, authority: impl Authority) -> Self {
+        self.authority = Some(Box::new(authority));
         self
     }
 
@@ -319,6 +334,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             state_folder: self.state_folder,
             take_over: self.take_over,
             stands_by: self.stands_by,
+            authority: self.authority,
             starts_stopped: self.starts_stopped,
             state,
             role: PhantomData,
@@ -359,6 +375,9 @@ impl<T: Send + 'static, R> Builder<T, R> {
         let keys = self.keys.open(&self.identity, &self.target, self.fleet)?;
         if self.stands_by && keys.mode() == Mode::Plain {
             return Err(BuildError::StandbyWithoutKeys);
+        }
+        if self.authority.is_some() && keys.mode() == Mode::Plain {
+            return Err(BuildError::AuthorityWithoutKeys);
         }
         let discovery_port = self.discovery_port.unwrap_or(keys.mode().port());
         let own_threads = self.threads.is_none();
@@ -411,6 +430,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             state_folder: self.state_folder,
             take_over: if self.stands_by { TakeOver::No } else { self.take_over },
             stands_by: self.stands_by,
+            authority: self.authority,
             starts_stopped: self.starts_stopped,
             #[cfg(feature = "control")]
             audit: self.audit,
@@ -443,6 +463,9 @@ pub enum BuildError {
     /// A standby in plain mode, in which nobody can prove that the manager is there.
     #[error("a standby needs keys: in plain mode anybody could keep it waiting, or answer in its manager's name")]
     StandbyWithoutKeys,
+    /// A manager with an authority in plain mode, in which vehicles refuse nobody.
+    #[error("an authority needs keys: in plain mode no vehicle refuses the claim of another manager")]
+    AuthorityWithoutKeys,
 }
 
 /// So that a `main` which builds a unit and calls others needs one error.

@@ -97,6 +97,20 @@ pub enum StartError {
     /// An m_unit cannot store its claim, which it must before it speaks with it.
     #[error("the claim of this manager cannot be stored: {0}; name another folder of state (CARA_STATE), or none")]
     Claim(String),
+    /// The manager's authority has not given it the key, without which it may not claim.
+    #[error(
+        "the m_unit {identity} of fleet {} may not command, since it has not its authority's key: {why}; try again later, or start it as \
+         a standby",
+        fleet.0
+    )]
+    NoAuthority {
+        /// Its identity.
+        identity: Identity,
+        /// Its fleet.
+        fleet: Fleet,
+        /// What is known of it.
+        why: String,
+    },
     /// Something about the unit itself, or what the system refuses.
     #[error(transparent)]
     Unit(#[from] Error),
@@ -123,6 +137,7 @@ impl StartError {
             Self::JustTakenOver { .. } => "JustTakenOver".to_owned(),
             Self::NoOwnKey { .. } => "NoOwnKey".to_owned(),
             Self::Claim(_) => "Claim".to_owned(),
+            Self::NoAuthority { .. } => "NoAuthority".to_owned(),
             Self::Unit(error) => format!("{error:?}"),
         }
     }

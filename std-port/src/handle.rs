@@ -251,6 +251,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
         self.engine().hub.lock().hub.node.is_standby()
     }
 
+    /// Whether this manager leads: see [`Builder::authority`](crate::Builder::authority).
+    pub fn is_leading(&self) -> bool {
+        self.engine().leads()
+    }
+
     /// The claim of an m_unit, or the highest that an s_unit has obeyed.
     pub fn claim(&self) -> Claim {
         self.engine().hub.lock().hub.node.claim()
@@ -399,8 +404,8 @@ impl<T: Send + 'static, R> Handle<T, R> {
     }
 
     /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and
-    /// membership; on all links together, those that have ended included; in the port. The last seven
-    /// (`AccessFileWrong`, `BuffersInUse`, `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell
+    /// membership; on all links together, those that have ended included; in the port. The last eight
+    /// (`AccessFileWrong`, `BuffersInUse`, `BuffersPeak`, `LinksOpen`, `Leading`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell
     /// how it is now; no other ever goes back.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         pairs(self.engine().readings())

@@ -67,6 +67,7 @@ pub mod access;
 mod actuator;
 #[cfg(feature = "async")]
 pub mod asynchronous;
+mod authority;
 mod builder;
 mod claims;
 mod clock;
@@ -113,6 +114,7 @@ mod unit;
 pub use actuator::Actuator;
 #[cfg(feature = "async")]
 pub use asynchronous::{CallGivenUp, EventStream, EventsLost, SampleStream};
+pub use authority::{Authority, Key};
 pub use builder::{BuildError, Builder};
 pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT, Scheduling};
 pub use cara_core::distribution::claim::Claim;

@@ -172,6 +172,8 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         UnitEvent::TookCommand { claim } => {
             ("took_command", None, format!("this standby commands, with the claim {claim}"))
         }
+        UnitEvent::Leading { claim } => ("leading", None, format!("this manager leads, with the claim {claim}")),
+        UnitEvent::NotLeading => ("not_leading", None, "this manager does not lead: links and orders go on".to_owned()),
         UnitEvent::ClaimNotKept { peer, claim } => (
             "claim not stored",
             Some(peer),

@@ -63,6 +63,8 @@ pub(super) struct Parts<'e> {
     pub(super) pool: &'e MessagePool,
     pub(super) events: &'e Events,
     pub(super) guard: &'e Guard,
+    /// This manager leads.
+    pub(super) leads: bool,
     pub(super) latch: &'e Keeper,
     pub(super) notes: &'e Notes,
 }
@@ -140,7 +142,7 @@ impl Accounts {
         self.hooks_late.clone()
     }
 
-    fn of_port(&self, parts: &Parts<'_>, held: &Held) -> [Reading; 16] {
+    fn of_port(&self, parts: &Parts<'_>, held: &Held) -> [Reading; 17] {
         let pool = parts.pool.counters();
         let connected = parts.nodes.read().connected().count() as u64;
         let file = &parts.guard.file;
@@ -183,6 +185,11 @@ impl Accounts {
             gauge("BuffersInUse", "Message buffers in use.", pool.in_use as u64),
             gauge("BuffersPeak", "Most message buffers that were in use at a time.", pool.peak as u64),
             gauge("LinksOpen", "Links that are open, those that have not joined yet included.", held.links),
+            gauge(
+                "Leading",
+                "Whether this manager leads: it has its authority's key, and has claimed under it.",
+                u64::from(parts.leads),
+            ),
             gauge("NodesConnected", "Nodes that are connected.", connected),
             gauge("CallsHeld", "Calls of other nodes that run or wait here.", held.calls),
             gauge("CallsInFlight", "Calls of this unit that wait for a reply.", held.in_flight),

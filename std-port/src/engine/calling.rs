@@ -317,6 +317,10 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
         wait: bool,
     ) -> Result<CallId, CallError> {
+        if options.only_while_leading && !self.leads_at(now) {
+            return Err(Error::NoAuthority.into());
+        }
+        let options = &RequestOptions { only_while_leading: false, ..*options };
         let mut attempt =
             || self.with_at(now, link, state, |session, cx| session.request(cx, callee, parameters, options, wait));
         let mut outcome = attempt();

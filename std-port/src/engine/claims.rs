@@ -79,10 +79,10 @@ pub(super) enum Written {
     Failed(Job),
     /// Orders may not be obeyed any more.
     Obeyed,
-    /// The raised claim is stored: it counts.
-    Raised(Claim),
+    /// The claim, raised under this revision of the authority's key, is stored: it counts.
+    Raised(Claim, u64),
     /// The same of a standby's first one.
-    Leads(Claim),
+    Leads(Claim, u64),
 }
 
 impl Claims {
@@ -208,8 +208,8 @@ impl Claims {
         std::mem::take(&mut writer.waiting)
     }
 
-    /// What the thread that writes does, until nothing waits.
-    pub(super) fn write_next(&self, hub: &SharedHub, keys: &Keys) -> Option<Written> {
+    /// What the thread that writes does, until nothing waits. Without a `revision` above which to claim, nothing is claimed.
+    pub(super) fn write_next(&self, hub: &SharedHub, keys: &Keys, revision: Option<u64>) -> Option<Written> {
         let (job, mut kept) = {
             let mut writer = lock(&self.writer);
             if writer.waiting.is_empty() {
@@ -228,20 +228,18 @@ impl Claims {
                 }
                 Written::Nothing
             }
-            Job::Raise(above) => match self.raise(hub, kept, above) {
-                Ok(claim) => Written::Raised(claim),
-                Err(error) => {
-                    tracing::error!(%error, "a raised claim cannot be stored, and is not announced");
-                    Written::Nothing
-                }
-            },
-            Job::Lead(above) => {
-                let above = above.max(kept.own);
-                match self.raise(hub, kept, above) {
-                    Ok(claim) => Written::Leads(claim),
-                    Err(error) => {
+            Job::Raise(above) | Job::Lead(above) => {
+                let Some(revision) = revision else { return Some(Written::Failed(job)) };
+                match (self.raise(hub, kept, above.max(above_revision(revision))), &job) {
+                    (Ok(claim), Job::Lead(_)) => Written::Leads(claim, revision),
+                    (Ok(claim), _) => Written::Raised(claim, revision),
+                    (Err(error), Job::Lead(_)) => {
                         tracing::error!(%error, "the claim of this standby cannot be stored: it waits on");
                         Written::Failed(job)
+                    }
+                    (Err(error), _) => {
+                        tracing::error!(%error, "a raised claim cannot be stored, and is not announced");
+                        Written::Nothing
                     }
                 }
             }
@@ -249,7 +247,7 @@ impl Claims {
     }
 
     fn raise(&self, hub: &SharedHub, mut kept: KeptClaims, above: Claim) -> Result<Claim, String> {
-        let claim = above.raised(random());
+        let claim = above.max(kept.own).raised(random());
         kept.own = claim;
         self.store(hub, &kept)?;
         lock(&self.writer).kept = kept;
@@ -296,6 +294,11 @@ impl Claims {
             std::thread::sleep(LOOK);
         }
     }
+}
+
+/// The highest claim that is not above this revision of an authority's key: the next one is.
+pub(super) const fn above_revision(revision: u64) -> Claim {
+    Claim { term: revision, claimant: 0 }
 }
 
 /// Whether the pair key with which a claim was obeyed is still there.

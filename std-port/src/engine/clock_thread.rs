@@ -154,6 +154,8 @@ impl<T: Send + 'static> Engine<T> {
                 None => return,
                 Some(ClaimEvent::Keep(manager, tagged)) => self.leave_to_writer(Job::Keep(manager, tagged)),
                 Some(ClaimEvent::Raise(above)) => self.leave_to_writer(Job::Raise(above)),
+                // It claims as soon as it has the key.
+                Some(ClaimEvent::Lead(_)) if self.leadership.has_authority() => self.leadership.wake(),
                 Some(ClaimEvent::Lead(above)) => self.leave_to_writer(Job::Lead(above)),
                 Some(ClaimEvent::Unkept(peer, claim)) => {
                     tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored");
@@ -165,10 +167,11 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn leave_to_writer(&self, job: Job) {
+    pub(super) fn leave_to_writer(&self, job: Job) {
         let Some(me) = self.me.upgrade() else { return };
         let write = move || {
-            while let Some(written) = me.claims.write_next(&me.hub, me.keys()) {
+            let next = || me.claims.write_next(&me.hub, me.keys(), me.leadership.revision(me.now()));
+            while let Some(written) = next() {
                 me.claim_written(written);
             }
         };
@@ -182,18 +185,19 @@ impl<T: Send + 'static> Engine<T> {
                 self.driver.wake();
             }
             Written::Obeyed => self.links.look_at_orders(),
-            Written::Raised(claim) => {
-                tracing::warn!(%claim, "no other manager of this identity answers: its claim is raised above the one that vehicles obeyed");
+            Written::Raised(claim, revision) if self.leadership.claimed(self.now(), revision) => {
+                tracing::warn!(%claim, "this manager has raised its claim");
                 self.announce_claim(claim);
                 self.notify(UnitEvent::Raised { claim });
                 self.broadcast();
             }
-            Written::Failed(Job::Lead(_)) => {
+            Written::Raised(..) | Written::Failed(Job::Raise(_)) => self.hub.lock().hub.node.not_raised(self.now()),
+            Written::Leads(claim, revision) if self.leadership.claimed(self.now(), revision) => self.lead(claim),
+            Written::Leads(..) | Written::Failed(Job::Lead(_)) => {
                 self.hub.lock().hub.node.stand_by(self.now());
                 self.driver.wake();
             }
-            Written::Leads(claim) => self.lead(claim),
-            Written::Failed(_) | Written::Nothing => {}
+            Written::Failed(Job::Heard(_)) | Written::Nothing => {}
         }
     }
 
@@ -252,6 +256,7 @@ impl<T: Send + 'static> Engine<T> {
         self.leave_to_writer(Job::Heard(by));
         self.claims.step_down(false);
         self.notify(UnitEvent::StandsBy { by: Some(by) });
+        self.leadership.wake();
         self.driver.wake();
     }
 }
@@ -269,6 +274,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
         let others = self.poll_node().min(self.driver.go_on_listening(&self.sockets));
         let look = self.links.look(others, |link, state| self.settle(link, state));
         self.look_at_claims();
+        let others = others.min(self.look_at_leadership());
         self.poll_links().min(others).min(look).min(self.driver.alarms.sound(self.now()))
     }
 

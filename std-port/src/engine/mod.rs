@@ -8,7 +8,7 @@
 //! | `reader`, `watch`, `notices`, `details`, `streams`, `worker`, `state`, `state_gate`, `alarms`, `events` | state machines and memory, without any link |
 //! | `link`, `peer_cell`, `roster`, `pinging`, `served` | a link and its session, a node, a call as its handler has it |
 //! | `sockets`, `driving`, `hub`, `keys`, `peers`, `links` | sockets, threads and clock, the node, its keys, all nodes and all links |
-//! | `reading`, `tables`, `interfaces`, `presence`, `claims`, `access`, `noting`, `accounts`, `unjoined` | what is decided and counted with those |
+//! | `reading`, `tables`, `interfaces`, `presence`, `claims`, `leadership`, `access`, `noting`, `accounts`, `unjoined` | what is decided and counted with those |
 //! | `afterwards`, `tasks`, `services` | functions, and whatever runs with the application's state |
 //! | [`Engine`] | joins the parts, lends a session what it needs, and acts on what the parts return |
 //! | `settling`, `inbound` | its methods for a link that a thread has locked |
@@ -36,6 +36,7 @@ mod hub;
 mod inbound;
 mod interfaces;
 mod keys;
+mod leadership;
 pub(crate) mod link;
 mod links;
 mod membership;
@@ -106,6 +107,7 @@ use crate::access::AccessTable;
 #[cfg(feature = "access")]
 use crate::access::watch::FileWatch;
 use crate::actuator::Change;
+use crate::authority::Authority;
 use crate::config::Capacities;
 #[cfg(feature = "control")]
 use crate::control::Audit;
@@ -149,6 +151,7 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) key_watch: KeyWatch,
     pub(crate) guard: access::Guard,
     pub(crate) claims: claims::Claims,
+    pub(crate) leadership: Arc<leadership::Leadership>,
     pub(crate) latch: Keeper,
     pub(crate) accounts: accounts::Accounts,
     notes: Notes,
@@ -176,6 +179,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) state_folder: Option<PathBuf>,
     pub(crate) take_over: claims::TakeOver,
     pub(crate) stands_by: bool,
+    pub(crate) authority: Option<Box<dyn Authority>>,
     pub(crate) starts_stopped: Option<u16>,
     #[cfg(feature = "control")]
     pub(crate) audit: Option<Arc<Audit>>,
@@ -209,6 +213,7 @@ impl<T: Send + 'static> Engine<T> {
             driver,
             guard: access::Guard::default(),
             claims: claims::Claims::new(parts.state_folder, parts.take_over, parts.stands_by),
+            leadership: Arc::new(leadership::Leadership::new(parts.authority)),
             latch,
             accounts: accounts::Accounts::default(),
             notes: Notes {
@@ -368,6 +373,7 @@ impl<T: Send + 'static> Engine<T> {
             pool: &self.pool,
             events: &self.events,
             guard: &self.guard,
+            leads: self.leads(),
             latch: &self.latch,
             notes: &self.notes,
         })
@@ -409,8 +415,9 @@ impl<T: Send + 'static> Engine<T> {
             return Err(StartError::SocketHeld { identity, fleet, path });
         }
         let heard = running.and_then(|(_, report)| report).map_or(Claim::NONE, |report| report.claim());
-        self.claims.claim(&self.hub, self.keys(), self.driver.clock(), heard)?;
-        self.driver.start(self.clone(), &self.sockets)?;
+        self.claim(heard)
+            .and_then(|()| self.driver.start(self.clone(), &self.sockets))
+            .inspect_err(|_| self.give_up_key())?;
         if self.keys().mode() == Mode::Plain {
             tracing::warn!(
                 unit = %self.hub.lock().hub.node.identity(), discovery_port = self.sockets.datagrams.discovery_port(),
@@ -423,6 +430,14 @@ impl<T: Send + 'static> Engine<T> {
             self.notify(UnitEvent::StandsBy { by: None });
         }
         Ok(())
+    }
+
+    /// With an authority only once that has given the key.
+    fn claim(&self, heard: Claim) -> Result<(), StartError> {
+        let revision = self.seek_key()?;
+        let above = heard.max(claims::above_revision(revision));
+        self.claims.claim(&self.hub, self.keys(), self.driver.clock(), above)?;
+        self.started_under(revision)
     }
 
     /// What the unit moves has been stopped, or reset.
@@ -443,6 +458,7 @@ impl<T: Send + 'static> Engine<T> {
         // Those that wait for a node wait in vain.
         self.news.add();
         self.on_each_link(|session, cx| session.close(cx, CloseReason::StoppedHere));
+        self.leadership.wake();
         self.services.state.stop();
         self.services.go_on_with_parked();
         // Dropped at the end, when no thread of the unit is left.

@@ -8,6 +8,7 @@ mod access;
 mod actuators;
 #[cfg(feature = "async")]
 mod asynchronous;
+mod authority;
 mod callbacks;
 mod claims;
 mod constraints;
