@@ -41,7 +41,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 28] = [
+pub(crate) const GROUPS: [Group; 29] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -294,6 +294,15 @@ pub(crate) const GROUPS: [Group; 28] = [
         waits: false,
         run: |_| packages::check().into(),
     },
+    Group {
+        name: "etcd",
+        what: "managers that lead by an etcd, which is killed, stopped and cut off; clippy on that crate, which is outside of the workspace",
+        budget: 300,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| needing(install::program("etcd", "etcd-server"), etcd),
+    },
 ];
 
 impl From<Result<()>> for Outcome {
@@ -400,6 +409,15 @@ fn web() -> Outcome {
         binaries::build(&["cara", "agv", "warehouse", "cara-web-clicks"])?;
         Run::new(&workspace::target().join("debug/cara-web-clicks").to_string_lossy()).stream()
     })
+}
+
+fn etcd() -> Result<()> {
+    let cargo = |command| {
+        let place = ["--locked", "--manifest-path", "std-port/etcd/Cargo.toml", "--target-dir", "target/etcd"];
+        Run::cargo().args([command]).args(place)
+    };
+    cargo("clippy").args(["--all-targets", "--features", "tls", "--", "-D", "warnings"]).stream()?;
+    cargo("test").args(["--", "--nocapture"]).stream()
 }
 
 fn present(file: &str) -> Result<()> {
