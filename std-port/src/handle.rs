@@ -256,6 +256,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
         self.engine().leads()
     }
 
+    #[cfg(feature = "control")]
+    pub(crate) fn has_authority(&self) -> bool {
+        self.engine().leadership.has_authority()
+    }
+
     /// The claim of an m_unit, or the highest that an s_unit has obeyed.
     pub fn claim(&self) -> Claim {
         self.engine().hub.lock().hub.node.claim()

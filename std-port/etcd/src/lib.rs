@@ -21,8 +21,8 @@
 //! ```
 //!
 //! The key is the prefix, the fleet, and the manager's name and id: `cara/leaders/7/depot/1`. Its value is the process that has it, for
-//! people. Whoever may write there decides who leads. To give a key free whose holder hangs, delete it: `etcdctl del KEY`; the holder
-//! still counts on it until its next renewal or the end of its time.
+//! people. Whoever may write there decides who leads. Do not delete it by hand: its holder counts on it until it asks again, and two
+//! would lead meanwhile. A holder that has ended, or hangs, loses it with its lease.
 
 use std::error::Error;
 use std::time::Duration;

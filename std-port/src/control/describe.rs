@@ -33,6 +33,7 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
         interfaces: system.interfaces().iter().map(interface).collect(),
         constraints: constraints(&system.constraints()),
         connected: system.number_of_s_units() + system.number_of_m_units(),
+        leading: system.has_authority().then(|| system.is_leading()),
     }
 }
 

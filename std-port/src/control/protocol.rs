@@ -416,6 +416,9 @@ pub struct UnitInfo {
     pub constraints: ConstraintsInfo,
     /// Connected nodes.
     pub connected: usize,
+    /// Whether it leads; none without an authority.
+    #[serde(default)]
+    pub leading: Option<bool>,
 }
 
 /// What may be told of a unit's keys.

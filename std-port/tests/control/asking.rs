@@ -2,11 +2,11 @@
 
 use std::ops::ControlFlow;
 
-use cara_std::control::execute;
 use cara_std::control::protocol::{Answer, NodeInfo, Question};
-use cara_std::{Constraints, Duration, Error};
+use cara_std::control::{Control, execute};
+use cara_std::{Authority, Constraints, Duration, Error, Fleet, Identity, Key};
 
-use crate::support::{Depot, ask, call, manager, refused, until, vehicle, vehicle_of};
+use crate::support::{Depot, PATIENCE, ask, call, manager, refused, until, vehicle, vehicle_of};
 
 fn set(node: Option<&str>, constraint: &str, value: u64) -> Question {
     Question::Set { node: node.map(str::to_owned), constraint: constraint.to_owned(), value }
@@ -28,9 +28,33 @@ fn the_unit_tells_who_it_is() {
     assert_eq!(unit.epoch, format!("{:016x}", depot.system.epoch().0));
     assert!(unit.interfaces.iter().any(|interface| interface.address == "127.0.0.1" && interface.up), "{unit:?}");
     assert_eq!(unit.constraints.request_timeout_us, Constraints::M_UNIT.request_timeout.as_micros());
-    assert_eq!(unit.connected, 0);
+    assert_eq!((unit.connected, unit.leading), (0, None));
     let again = ask(&mut client, Question::Unit).unwrap();
     assert!(matches!(&again[..], [Answer::Unit(later)] if later.uptime_ms >= unit.uptime_ms));
+}
+
+/// An authority that gives its key, until the test ends.
+struct Always;
+
+impl Authority for Always {
+    fn hold(&mut self, _: &Identity, _: Fleet) -> Result<Option<Key>, Box<dyn std::error::Error + Send + Sync>> {
+        Ok(Some(Key { revision: 7, lasts: PATIENCE.into() }))
+    }
+
+    fn release(&mut self) {}
+}
+
+#[test]
+fn a_manager_with_an_authority_tells_whether_it_leads() {
+    let depot = Depot::of(|fleet, directory| {
+        manager("manager", 1, fleet).authority(Always).control(Control::Path(directory.join("manager.sock")))
+    });
+    let leading = |depot: &Depot| {
+        let answers = ask(&mut depot.client(), Question::Unit).unwrap();
+        let [Answer::Unit(unit)] = &answers[..] else { panic!("{answers:?}") };
+        unit.leading
+    };
+    assert_eq!(leading(&depot), Some(true));
 }
 
 #[test]

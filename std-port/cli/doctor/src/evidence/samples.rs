@@ -116,6 +116,7 @@ pub(crate) fn running(name: &str, id: u32) -> Running {
         interfaces: Vec::new(),
         constraints,
         connected: 0,
+        leading: None,
     };
     Running { unit, nodes: Vec::new(), refused: Vec::new(), counters: Vec::new(), files: None }
 }

@@ -141,7 +141,12 @@ fn draw_head(buffer: &mut Buffer, area: Rect, app: &App, now: Now, theme: Theme)
     let unit = &snapshot.unit;
     let up = span(Duration::from_millis(unit.uptime_ms) + app.age(now));
     let mode = unit.mode.as_deref().unwrap_or("");
-    let first = format!("cara top  {manager}  fleet {}  {}  up {up}", unit.fleet, clean(mode));
+    let leads = match unit.leading {
+        Some(true) => "  leads",
+        Some(false) => "  DOES NOT LEAD",
+        None => "",
+    };
+    let first = format!("cara top  {manager}  fleet {}  {}  up {up}{leads}", unit.fleet, clean(mode));
     put(buffer, area, 0, 0, &first, area.width, BOLD);
     let expected = snapshot.nodes.iter().filter(|node| node.expected);
     let missing = expected.clone().filter(|node| !node.connected).count();

@@ -103,6 +103,7 @@ fn unit() -> UnitInfo {
         interfaces: Vec::new(),
         constraints,
         connected: 2,
+        leading: None,
     }
 }
 
@@ -380,6 +381,18 @@ fn old_data_never_looks_live() {
 }
 
 /// Each text of a peer or of the manager, on each view and in each window.
+#[test]
+fn a_manager_with_an_authority_is_shown_leading_or_not() {
+    let head = |leading| {
+        let mut app = App::new("depot/1".into());
+        app.reported(News::Snapshot(Box::new(Snapshot { unit: UnitInfo { leading, ..unit() }, ..snapshot() })), at(0));
+        screen(&app, at(0)).lines().next().unwrap().to_owned()
+    };
+    let first = "cara top  depot/1  fleet 7  secured  up 3 min";
+    let shown = [None, Some(true), Some(false)].map(head);
+    assert_eq!(shown, [first.to_owned(), format!("{first}  leads"), format!("{first}  DOES NOT LEAD")]);
+}
+
 #[test]
 fn what_peers_say_does_not_act_on_the_terminal() {
     let evil = "a\u{1b}[31m\u{202e}b\u{7}\u{9b}\r\nc\u{200b}";
