@@ -35,6 +35,8 @@ enum Place {
     /// Member crates of the core: typed services and the cipher.
     CoreMember,
     Port,
+    /// What a program adds to the Linux port, which does not know it.
+    Provider,
     CommandLine,
     Examples,
     Tests,
@@ -112,6 +114,7 @@ impl Manifest {
         match (folders.next()?, folders.next()?) {
             ("core", "Cargo.toml") => Some(Place::Core),
             ("core", _) => Some(Place::CoreMember),
+            ("std-port", "etcd") => Some(Place::Provider),
             ("std-port", "cli") => Some(Place::CommandLine),
             ("std-port" | "embassy-port", _) => Some(Place::Port),
             ("examples", _) => Some(Place::Examples),
@@ -177,12 +180,13 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (Place::CoreMember, to) => matches!(to, Place::Core | Place::CoreMember),
         (Place::Port, Place::Core | Place::CoreMember) => true,
         // What tests of ports stand on: networks, processes, applications.
-        (Place::Port | Place::CommandLine, Place::Tests | Place::Examples) => for_tests,
+        (Place::Port | Place::Provider | Place::CommandLine, Place::Tests | Place::Examples) => for_tests,
         (Place::Port, _) => false,
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.
         (Place::Examples, Place::Tests) => for_tests,
-        (Place::CommandLine, Place::CommandLine) => true,
+        (Place::Provider | Place::CommandLine, Place::Provider) | (Place::Provider, Place::CommandLine) => false,
+        (_, Place::Provider) | (Place::CommandLine, Place::CommandLine) => true,
         (Place::Examples, Place::Examples) | (Place::Tests, Place::Tests | Place::Examples) => true,
         (Place::Tests | Place::Examples, Place::CommandLine) => false,
     }
