@@ -95,7 +95,7 @@ impl<P: Port> Node<P> {
             known.newest = Some((epoch, 0));
         }
         (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
-        known.under = None;
+        (known.under, known.is_missing) = (None, false);
         let offered = known.offered.take().filter(|(offered, _)| *offered > claim_of(claim.as_ref()));
         // Cancel a dial that is planned or under way: a second link of the same node would only be refused.
         self.table.cancel(place);

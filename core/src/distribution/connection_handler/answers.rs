@@ -217,6 +217,7 @@ impl<P: Port> Node<P> {
         if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
             return;
         }
+        self.hints.answered(from);
         let address = from.at_port(tcp_port);
         let is_higher = claim > self.obeyed(identity);
         let Some((place, forgotten)) = self.table.hear_of(identity, address, epoch) else {

@@ -130,6 +130,8 @@ pub(super) struct Questions {
 #[derive(Debug)]
 pub(super) struct Claims {
     pub(super) stage: Stage,
+    /// It has stood by before it commanded.
+    pub(super) has_stood_by: bool,
     pub(super) own: TaggedClaim,
     took_over: Option<Instant>,
     /// It raises its claim until it was the highest once.
@@ -149,6 +151,7 @@ impl Claims {
     pub(super) const fn new(now: Instant) -> Self {
         Self {
             stage: Stage::Commands,
+            has_stood_by: false,
             own: TaggedClaim::NONE,
             took_over: None,
             takes_over: false,
@@ -178,7 +181,7 @@ impl Claims {
     pub(super) fn stand_by(&mut self, now: Instant, next: Instant) {
         let obeyed = core::mem::take(&mut self.obeyed);
         let (rival, stores) = (self.rival, self.stores);
-        *self = Self { stage: Stage::StandsBy, rival, stores, obeyed, ..Self::new(now) };
+        *self = Self { stage: Stage::StandsBy, has_stood_by: true, rival, stores, obeyed, ..Self::new(now) };
         self.questions.next = next;
     }
 

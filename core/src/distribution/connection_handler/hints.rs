@@ -86,6 +86,13 @@ impl<E: Endpoint> Hints<E> {
         Some((hint.from, hint.who.clone()))
     }
 
+    /// This address has answered: if it has refused a link as yet, that may change soon.
+    pub(super) fn answered(&mut self, from: E) {
+        if let Some(hint) = self.list.iter_mut().find(|hint| is_same_host(hint.from, from)) {
+            (hint.asked, hint.not_before) = (1, hint.since + FIRST_SEARCH);
+        }
+    }
+
     /// The node is there: later hints at it begin from the start.
     pub(super) fn forget(&mut self, who: &Identity) {
         self.list.retain(|hint| hint.who != *who);

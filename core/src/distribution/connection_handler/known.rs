@@ -28,6 +28,8 @@ pub struct Known<E> {
     /// The highest claim with which it has answered while it was away, and the address.
     pub(super) offered: Option<(Claim, E)>,
     pub(super) state: NodeState,
+    /// An s_unit whose last link to this m_unit ended in no orderly way.
+    pub(super) is_missing: bool,
     /// Its link was opened from here.
     pub(super) dialed: bool,
     /// The link to it that is being opened.
@@ -125,6 +127,7 @@ impl<E> Known<E> {
             under: None,
             offered: None,
             state: NodeState::Away,
+            is_missing: false,
             dialed: false,
             dialing: None,
             newcomer: None,

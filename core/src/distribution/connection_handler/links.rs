@@ -93,10 +93,14 @@ impl<P: Port> Node<P> {
             // Another boot of it has been found, and is where this one is dialled.
             self.table.schedule(place, now, Task::Dial);
         }
+        // One that was stopped in an orderly way says so itself when it is back.
+        let is_orderly = matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere);
+        if P::MANAGES && !is_orderly {
+            self.miss(now, place);
+        }
         match self.config.target {
             _ if is_followed => {}
-            // One that was stopped in an orderly way says so itself when it is back.
-            Target::Everybody if matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere) => {}
+            Target::Everybody if is_orderly => {}
             Target::Everybody | Target::Fixed(..) => self.retry(now, place),
             Target::Manager(_) => {}
         }

@@ -26,6 +26,10 @@ pub(super) const LOST_LISTENING: Duration = Duration::from_millis(800);
 /// Searches that an m_unit makes after its start, or after it lost its last node, even if nodes join meanwhile: a lost
 /// datagram must not keep two managers apart.
 const M_UNIT_SEARCHES: u8 = 4;
+/// And so many while it has fewer nodes than it knows of, or misses an s_unit that was connected: for about a minute.
+pub(super) const MISSING_SEARCHES: u8 = 30;
+/// Meanwhile the back-off doubles up to this attempt: an s_unit that was cut off may itself search every 16 s by then.
+const MISSING_BACK_OFF_AFTER: u8 = 2;
 /// The back-off doubles up to this attempt.
 const LONGEST_BACK_OFF_AFTER: u8 = 5;
 /// With back-off at its longest, one in so many units that hold back searches regardless of what it hears. A unit that
@@ -162,12 +166,38 @@ impl<P: Port> Node<P> {
     fn is_searching(&self) -> bool {
         match self.config.target {
             Target::Fixed(..) => false,
-            Target::Everybody => self.search.attempt < M_UNIT_SEARCHES || self.table.joined() == 0,
+            Target::Everybody => {
+                self.search.attempt < M_UNIT_SEARCHES || self.table.joined() == 0 || self.misses_nodes()
+            }
             Target::Manager(_) => {
                 let place = self.target.as_ref().and_then(|target| self.table.find(target));
                 let known = place.and_then(|place| self.table.node(place));
                 known.is_none_or(|known| known.state == NodeState::Away && known.task.is_none())
             }
+        }
+    }
+
+    /// Whether s_units may be there that this m_unit does not have. One that has stood by does not know all of them, nor of
+    /// another manager behind a partition: it always searches.
+    fn misses_nodes(&self) -> bool {
+        if self.role() != Role::MUnit {
+            return false;
+        }
+        let has_fewer = self.known_nodes != u16::MAX && self.table.joined() < self.known_nodes;
+        let is_missing = || has_fewer || self.table.iter().any(|known| known.is_missing);
+        P::STANDS_BY && self.claims.has_stood_by || self.search.attempt < MISSING_SEARCHES && is_missing()
+    }
+
+    /// The link of a node has ended in no orderly way. If it is an s_unit, its manager searches until it is back; of m_units one
+    /// dials the other.
+    pub(super) fn miss(&mut self, now: Instant, place: usize) {
+        let misses_others = self.misses_nodes();
+        let s_unit = self.table.node_mut(place).filter(|known| known.identity.role() == Role::SUnit);
+        let Some(known) = s_unit else { return };
+        known.is_missing = true;
+        if !misses_others {
+            self.search.attempt = 0;
+            self.search.next = now + self.random.jitter(FIRST_SEARCH);
         }
     }
 
@@ -207,7 +237,8 @@ impl<P: Port> Node<P> {
 
     /// Schedules the next search with growing back-off.
     pub(super) fn plan_next(&mut self, now: Instant) {
-        let back_off = back_off(self.search.attempt);
+        let longest = if self.misses_nodes() { MISSING_BACK_OFF_AFTER } else { LONGEST_BACK_OFF_AFTER };
+        let back_off = back_off(self.search.attempt.min(longest));
         self.search.attempt = self.search.attempt.saturating_add(1);
         self.search.next = now + back_off + mostly_late(&mut self.random, back_off);
     }

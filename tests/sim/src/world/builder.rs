@@ -55,6 +55,7 @@ impl NewUnit {
             storing: Storing::Works,
             takes_over: false,
             stands_by: false,
+            expects: u16::MAX,
         };
         Self { shared: Rc::downgrade(shared), settings, segment: 0, ahead: Duration::ZERO }
     }
@@ -173,6 +174,12 @@ impl NewUnit {
     /// It stands by, and does so again when it has stepped down.
     pub fn stands_by(mut self) -> Self {
         self.settings.stands_by = true;
+        self
+    }
+
+    /// It knows of so many nodes that it is to meet.
+    pub fn expects(mut self, nodes: u16) -> Self {
+        self.settings.expects = nodes;
         self
     }
 

@@ -64,6 +64,7 @@ pub(super) struct Settings {
     pub(super) storing: Storing,
     pub(super) takes_over: bool,
     pub(super) stands_by: bool,
+    pub(super) expects: u16,
 }
 
 /// What a unit stores of claims.
@@ -159,6 +160,7 @@ impl UnitState {
         if let Some(m_units) = &settings.m_units {
             hub.node.choose(m_units.clone());
         }
+        hub.node.expect(settings.expects);
         let now = network.clock(self.host);
         if listens && settings.stands_by {
             hub.node.stand_by(now);

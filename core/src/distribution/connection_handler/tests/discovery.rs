@@ -51,6 +51,30 @@ fn an_m_unit_asks_a_few_times_and_goes_on_only_while_it_is_alone() {
     assert!(search_times(&mut joined, at(101_000)).len() > 1, "it is alone again");
 }
 
+/// An s_unit that was cut off searches seldom by the time that it can be reached again.
+#[test]
+fn an_m_unit_that_misses_an_s_unit_searches_until_it_is_back_or_for_a_minute() {
+    let agvs = [s_unit("agv", 1), s_unit("agv", 2)];
+    let lost = |reason| {
+        let mut node = depot();
+        for (link, agv) in agvs.iter().enumerate() {
+            join(&mut node, at(1), link as u16, agv);
+        }
+        search_times(&mut node, at(100_000));
+        node.left(at(100_000), LinkId(0), reason);
+        node
+    };
+    assert_eq!(search_times(&mut lost(CloseReason::Stopped), at(300_000)), []);
+    let mut node = lost(CloseReason::Silent);
+    let searches = search_times(&mut node, at(110_000));
+    let pauses = searches.windows(2).map(|pair| pair[1].since(pair[0]));
+    assert!(searches[0] < at(100_300) && pauses.max() <= Some(Duration::from_secs(2)), "{searches:?}");
+    join(&mut node, at(110_000), 2, &agvs[0]);
+    assert_eq!(search_times(&mut node, at(200_000)), []);
+    let count = search_times(&mut lost(CloseReason::Silent), at(900_000)).len();
+    assert_eq!(count, usize::from(search::MISSING_SEARCHES));
+}
+
 #[test]
 fn a_broadcast_that_is_asked_for_goes_out_at_once_or_when_the_budget_allows() {
     let mut node = depot();

@@ -107,6 +107,24 @@ fn hints_lead_to_few_questions_and_delay_nothing() {
     }
 }
 
+/// The manager may be fenced for now: what its earlier answers led to is no reason to ask it seldom.
+#[test]
+fn an_address_that_has_answered_is_asked_again_soon() {
+    let mut node = node(s_unit("agv", 1));
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    for count in 1..20 {
+        let now = at(u64::from(count) * 1_000);
+        let mut outbox = Outbox::default();
+        node.hear(now, address(1, 7_001), &who_has_bytes(&search_of(&depot, count)));
+        run(&mut node, now + Duration::from_millis(100), &mut outbox);
+        assert_eq!(outbox.sent.len(), 1, "{count}");
+        node.answered(now, address(1, 7_001), &announce_of(&depot, count, 0));
+        assert_eq!(due(&mut node, now).len(), 1, "it dials");
+        node.dialing(Some(&depot.identity), LinkId(0));
+        node.left(now, LinkId(0), CloseReason::Refused(Refusal::Fenced));
+    }
+}
+
 /// As many addresses as are asked side by side are told of again and again, and no node answers there.
 #[test]
 fn addresses_that_do_not_answer_give_way_to_a_new_one() {

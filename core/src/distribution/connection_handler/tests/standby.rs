@@ -226,6 +226,20 @@ fn it_takes_no_links_and_one_that_leads_searches_for_its_vehicles() {
     assert_eq!(standby.node.admit(at(standby.now), LinkId(0), address(2, 7_000), &agv), Admission::Accept);
 }
 
+/// It knows neither all vehicles nor of another manager, both of which a partition can hide.
+#[test]
+fn one_that_has_stood_by_always_searches() {
+    let mut standby = Standby::new();
+    standby.until_it_leads(4_000, nobody);
+    assert!(standby.node.lead(at(standby.now), tagged(claim(1))));
+    join(&mut standby.node, at(standby.now), 0, &s_unit("agv", 2));
+    for minute in 1..5 {
+        let mut outbox = Outbox::default();
+        run(&mut standby.node, at(standby.now + minute * 60_000), &mut outbox);
+        assert!((30..=60).contains(&outbox.broadcasts.len()), "{}", outbox.broadcasts.len());
+    }
+}
+
 /// One that steps down has heard the other one's claim.
 #[test]
 fn one_that_has_stepped_down_stands_by() {
