@@ -1,26 +1,25 @@
-//! Two or three managers of one identity that stand by for each other, and five vehicles, in runs drawn from seeds: managers and
-//! vehicles crash and hang, the network parts, disks fail. The claims that a vehicle obeys never decrease, and once a manager
-//! commands and its vehicles can be reached, each has it soon.
+//! One manager, or two or three of one identity that stand by for each other, and their vehicles, in runs drawn from seeds: managers
+//! and vehicles crash and hang, the network parts, disks fail. The claims that a vehicle obeys never decrease, and once a manager
+//! commands and its vehicles can be reached, each has it within 5 s.
 //!
-//! `CARA_SIM_SEEDS=10000 cargo test --release -p cara-sim --test standby` runs more seeds.
+//! `cargo xtask orders` runs more seeds.
 
-use std::cell::RefCell;
+use std::cell::Cell;
 use std::rc::Rc;
 
+use cara_core::config::Constraints;
 use cara_core::distribution::claim::Claim;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{Crash, Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
 
-const VEHICLES: u32 = 5;
 /// So long everything fails, and so long a manager may take to command alone afterwards, with the highest claim: one that vehicles
 /// refuse has to raise its own first.
 const FAULTS: Duration = Duration::from_secs(30);
-const STARTS: Duration = Duration::from_secs(20);
-/// And so long its vehicles to obey it: nearly all take less than 5 s. But one that was cut off searches every 8 to 16 s by then and
-/// holds back for others that search, and a manager that has other vehicles does not search for it.
-const JOINS: Duration = Duration::from_secs(40);
+const STARTS: Duration = Duration::from_secs(10);
+/// And so long all vehicles to obey it.
+const JOINS: Duration = Duration::from_secs(5);
 
 const fn millis(millis: u64) -> Duration {
     Duration::from_millis(millis)
@@ -30,28 +29,31 @@ fn between(random: &mut Random, least: u64, most: u64) -> Duration {
     millis(least + random.below(most - least))
 }
 
-type Executed = Rc<RefCell<Vec<Vec<Claim>>>>;
+#[derive(Clone, Copy)]
+struct Size {
+    managers: u64,
+    vehicles: u32,
+}
 
 struct Fleet {
     world: World,
     managers: Vec<UnitHandle>,
     vehicles: Vec<UnitHandle>,
-    executed: Executed,
 }
 
 impl Fleet {
-    /// All managers but the first may have a disk that fails or hangs.
-    fn new(seed: u64, managers: u64) -> Self {
+    /// All managers but the first may have a disk that fails or hangs. A single one does not stand by.
+    fn new(seed: u64, size: Size) -> Self {
         let world = World::secured(seed);
         let mut random = Random::new(seed ^ 0x57A2_DB1E);
-        let executed = Executed::default();
-        executed.borrow_mut().resize(VEHICLES as usize, Vec::new());
         let vehicle = |number: u32| {
-            let executed = Rc::clone(&executed);
+            let executed = Rc::new(Cell::new(Claim::NONE));
             let program = move |unit: &UnitHandle| {
                 let (executed, obeying) = (Rc::clone(&executed), unit.clone());
                 let drive = Service::new(move |_, _| {
-                    executed.borrow_mut()[number as usize].push(obeying.claim());
+                    let (claim, before) = (obeying.claim(), executed.get());
+                    assert!(claim >= before, "agv-{number} executes a command of {claim:?} after one of {before:?}");
+                    executed.set(claim);
                     Ok(())
                 });
                 unit.my_function_list()
@@ -61,7 +63,8 @@ impl Fleet {
             };
             world.s_unit(&format!("agv-{number}"), 10 + number).joins("manager", 1).program(program).start()
         };
-        let vehicles = (0..VEHICLES).map(vehicle).collect();
+        let vehicles = (0..size.vehicles).map(vehicle).collect();
+        let constraints = Constraints { maximum_nodes: size.vehicles as u16 + 8, ..Constraints::M_UNIT };
         let manager = |number: u64| {
             let storing = match random.below(6) {
                 0 if number > 0 => Storing::Fails,
@@ -69,10 +72,11 @@ impl Fleet {
                 _ => Storing::Works,
             };
             let ahead = Duration::from_micros(random.below(1 << 42));
-            world.m_unit("manager", 1).stands_by().storing(storing).clock(ahead).start()
+            let unit = world.m_unit("manager", 1).constraints(constraints).storing(storing).clock(ahead);
+            if size.managers > 1 { unit.stands_by().start() } else { unit.expects(size.vehicles as u16).start() }
         };
-        let managers = (0..managers).map(manager).collect();
-        Self { world, managers, vehicles, executed }
+        let managers = (0..size.managers).map(manager).collect();
+        Self { world, managers, vehicles }
     }
 
     /// Lets everybody work for a while; who commands has all of its vehicles drive.
@@ -89,9 +93,6 @@ impl Fleet {
                 }
             }
             self.world.run_for(millis(50));
-        }
-        for (number, executed) in self.executed.borrow().iter().enumerate() {
-            assert!(executed.is_sorted(), "agv-{number} executed commands of {executed:?}");
         }
     }
 
@@ -153,8 +154,8 @@ impl Fleet {
 }
 
 /// The longest times until one commanded and until all obeyed, and how often one took command and stood by again.
-fn run(seed: u64) -> (Duration, Duration, usize, usize) {
-    let mut fleet = Fleet::new(seed, 2 + seed % 2);
+fn run(seed: u64, size: Size) -> (Duration, Duration, usize, usize) {
+    let mut fleet = Fleet::new(seed, size);
     let mut random = Random::new(seed ^ 0x0FA1_77E5);
     let end = fleet.world.now() + FAULTS;
     while fleet.world.now() < end {
@@ -183,26 +184,40 @@ fn run(seed: u64) -> (Duration, Duration, usize, usize) {
     (starts.unwrap_or_default(), joins.unwrap_or_default(), took, stood)
 }
 
-#[test]
-fn whatever_fails_claims_never_decrease_and_each_vehicle_has_a_manager_soon() {
-    let ends = for_each_seed(30, run);
+fn runs(seeds: u64, vehicles: u32) {
+    let ends = for_each_seed(seeds, |seed| run(seed, Size { managers: 1 + seed % 3, vehicles }));
     let longest = |each: fn(&(Duration, Duration, usize, usize)) -> Duration| ends.iter().map(each).max();
     let sum = |each: fn(&(Duration, Duration, usize, usize)) -> usize| ends.iter().map(each).sum::<usize>();
     let (took, stood) = (sum(|end| end.2), sum(|end| end.3));
+    let later = |seconds| ends.iter().filter(|end| end.1 > Duration::from_secs(seconds)).count();
     println!(
-        "{} seeds: one commands within {:?}, all obey within {:?}; took command {took} times, stood by again {stood} times",
+        "{} seeds: one commands within {:?}; all obey within {:?}, in {} seeds later than 1 s, in {} than 3 s; took command {took} \
+         times, stood by again {stood} times",
         ends.len(),
         longest(|end| end.0),
-        longest(|end| end.1)
+        longest(|end| end.1),
+        later(1),
+        later(3)
     );
-    assert!(ends.len() == 1 || took > ends.len() && stood > 0, "{took} {stood}");
+    assert!(ends.len() < 10 || took > ends.len() / 2 && stood > 0, "{took} {stood}");
+}
+
+#[test]
+fn whatever_fails_claims_never_decrease_and_each_vehicle_has_a_manager_soon() {
+    runs(30, 5);
+}
+
+#[test]
+#[ignore = "a deep run: `cargo xtask orders`"]
+fn two_hundred_vehicles_have_a_manager_soon_whatever_fails() {
+    runs(2, 200);
 }
 
 /// Two that start at once, or of which neither hears the other, end with one that commands and one that stands by.
 #[test]
 fn of_two_that_command_the_lower_claim_stands_by_again() {
     for seed in 0..4 {
-        let mut fleet = Fleet::new(seed, 2);
+        let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 5 });
         assert!(fleet.until(STARTS, |fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader))).is_some());
         let hosts: Vec<_> = fleet.managers.iter().map(UnitHandle::host).collect();
         let standby = fleet.managers.iter().find(|manager| manager.is_standby()).expect("one stands by").clone();

@@ -1,5 +1,6 @@
-//! `cargo xtask orders`: fleets drawn from many seeds, in which nothing may move that is not wanted; and the same with bugs that
-//! are planted on purpose, each of which a normal run must find. A command of its own, for each bug is a build.
+//! `cargo xtask orders`: fleets drawn from many seeds, in which nothing may move that is not wanted and each vehicle has a manager
+//! soon; and the same with bugs that are planted on purpose, each of which a normal run must find. A command of its own, for each
+//! bug is a build.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -40,11 +41,18 @@ pub(crate) fn run(orders: &Orders) -> Result<ExitCode> {
     if orders.planted {
         return planted();
     }
-    for (test, seeds) in [("five_vehicles", orders.seeds), ("many_vehicles", orders.large)] {
+    let tests = [
+        ("orders", "five_vehicles", orders.seeds),
+        ("orders", "many_vehicles", orders.large),
+        ("standby", "each_vehicle_has_a_manager_soon", orders.seeds),
+        ("standby", "two_hundred_vehicles", orders.large),
+    ];
+    for (program, test, seeds) in tests {
         let start = Instant::now();
         let cargo =
-            Run::cargo().args(["test", "--quiet", "--release", "--package", "cara-sim", "--test", "orders", test]);
-        cargo.args(["--", "--nocapture"]).env("CARA_SIM_SEEDS", &seeds.to_string()).stream()?;
+            Run::cargo().args(["test", "--quiet", "--release", "--package", "cara-sim", "--test", program, test]);
+        let cargo = cargo.args(["--", "--nocapture", "--include-ignored"]);
+        cargo.env("CARA_SIM_SEEDS", &seeds.to_string()).stream()?;
         println!("{seeds} seeds in {:.0} s", start.elapsed().as_secs_f64());
     }
     Ok(ExitCode::SUCCESS)
