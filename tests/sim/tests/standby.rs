@@ -15,11 +15,11 @@ use cara_core::time::{Duration, Instant};
 use cara_sim::{Crash, Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
 
 /// So long everything fails, and so long a manager may take to command alone afterwards, with the highest claim: one that vehicles
-/// refuse has to raise its own first.
+/// refuse raises its own first, once in 30 s.
 const FAULTS: Duration = Duration::from_secs(30);
-const STARTS: Duration = Duration::from_secs(10);
-/// And so long all vehicles to obey it.
-const JOINS: Duration = Duration::from_secs(5);
+const STARTS: Duration = Duration::from_secs(35);
+/// And so long all vehicles to obey it. Nearly all do within 3 s; but a dial that a cut has swallowed is given up after 6 s only.
+const JOINS: Duration = Duration::from_secs(8);
 
 const fn millis(millis: u64) -> Duration {
     Duration::from_millis(millis)
@@ -33,6 +33,7 @@ fn between(random: &mut Random, least: u64, most: u64) -> Duration {
 struct Size {
     managers: u64,
     vehicles: u32,
+    disks_fail: bool,
 }
 
 struct Fleet {
@@ -67,8 +68,8 @@ impl Fleet {
         let constraints = Constraints { maximum_nodes: size.vehicles as u16 + 8, ..Constraints::M_UNIT };
         let manager = |number: u64| {
             let storing = match random.below(6) {
-                0 if number > 0 => Storing::Fails,
-                1 if number > 0 => Storing::Hangs,
+                0 if size.disks_fail && number > 0 => Storing::Fails,
+                1 if size.disks_fail && number > 0 => Storing::Hangs,
                 _ => Storing::Works,
             };
             let ahead = Duration::from_micros(random.below(1 << 42));
@@ -185,19 +186,19 @@ fn run(seed: u64, size: Size) -> (Duration, Duration, usize, usize) {
 }
 
 fn runs(seeds: u64, vehicles: u32) {
-    let ends = for_each_seed(seeds, |seed| run(seed, Size { managers: 1 + seed % 3, vehicles }));
+    let ends = for_each_seed(seeds, |seed| run(seed, Size { managers: 1 + seed % 3, vehicles, disks_fail: true }));
     let longest = |each: fn(&(Duration, Duration, usize, usize)) -> Duration| ends.iter().map(each).max();
     let sum = |each: fn(&(Duration, Duration, usize, usize)) -> usize| ends.iter().map(each).sum::<usize>();
     let (took, stood) = (sum(|end| end.2), sum(|end| end.3));
     let later = |seconds| ends.iter().filter(|end| end.1 > Duration::from_secs(seconds)).count();
     println!(
-        "{} seeds: one commands within {:?}; all obey within {:?}, in {} seeds later than 1 s, in {} than 3 s; took command {took} \
+        "{} seeds: one commands within {:?}; all obey within {:?}, in {} seeds later than 1 s, in {} than 5 s; took command {took} \
          times, stood by again {stood} times",
         ends.len(),
         longest(|end| end.0),
         longest(|end| end.1),
         later(1),
-        later(3)
+        later(5)
     );
     assert!(ends.len() < 10 || took > ends.len() / 2 && stood > 0, "{took} {stood}");
 }
@@ -213,11 +214,31 @@ fn two_hundred_vehicles_have_a_manager_soon_whatever_fails() {
     runs(2, 200);
 }
 
+/// Its vehicles miss three keep-alives, and then say when they heard it last: the standby does not wait for three more.
+#[test]
+fn a_manager_that_freezes_is_replaced_within_five_seconds() {
+    let has_leader = |fleet: &Fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader));
+    let took = for_each_seed(8, |seed| {
+        let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 5, disks_fail: false });
+        assert!(fleet.until(STARTS, has_leader).is_some());
+        fleet.run(between(&mut Random::new(seed), 3_000, 4_000));
+        let frozen = fleet.leader().expect("it has all").clone();
+        fleet.world.suspend(&frozen, Duration::from_secs(60));
+        let is_obeyed = |fleet: &Fleet| {
+            let other = fleet.managers.iter().find(|manager| manager.host() != frozen.host());
+            other.is_some_and(|other| !other.is_standby() && fleet.has_all(other))
+        };
+        fleet.until(STARTS, is_obeyed).unwrap_or(STARTS)
+    });
+    println!("replaced after {took:?}");
+    assert!(took.iter().all(|took| *took <= Duration::from_secs(5)), "{took:?}");
+}
+
 /// Two that start at once, or of which neither hears the other, end with one that commands and one that stands by.
 #[test]
 fn of_two_that_command_the_lower_claim_stands_by_again() {
     for seed in 0..4 {
-        let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 5 });
+        let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 5, disks_fail: true });
         assert!(fleet.until(STARTS, |fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader))).is_some());
         let hosts: Vec<_> = fleet.managers.iter().map(UnitHandle::host).collect();
         let standby = fleet.managers.iter().find(|manager| manager.is_standby()).expect("one stands by").clone();

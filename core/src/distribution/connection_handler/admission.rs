@@ -110,7 +110,7 @@ impl<P: Port> Node<P> {
             self.hints.plan(now, from, identity, now);
         }
         if identity.role() == Role::MUnit {
-            self.obey(now, identity, claim.as_ref());
+            self.obey(identity, claim.as_ref());
         }
         self.was_obeyed();
         debug!("link {} joins", link.0);

@@ -82,8 +82,8 @@ enum Keeping {
 struct Obeyed {
     tagged: TaggedClaim,
     keeping: Keeping,
-    /// When that manager was last connected, at the latest.
-    heard: Instant,
+    /// When that manager was last heard, at the latest; `None` while it is connected and misses no keep-alive.
+    heard: Option<Instant>,
 }
 
 impl Obeyed {
@@ -244,7 +244,7 @@ impl<P: Port> Node<P> {
 
     /// A claim of this manager was obeyed and stored in an earlier life.
     pub fn keep_obeyed(&mut self, now: Instant, manager: &Identity, tagged: TaggedClaim) {
-        let obeyed = Obeyed { tagged, keeping: Keeping::Kept, heard: now };
+        let obeyed = Obeyed { tagged, keeping: Keeping::Kept, heard: Some(now) };
         if self.claims.obeyed.push((manager.clone(), obeyed)).is_err() {
             self.counters.count(NodeCounter::ClaimsNotKept);
         }
@@ -309,8 +309,7 @@ impl<P: Port> Node<P> {
     /// What this unit tells a manager of the claims of that one's identity.
     pub(crate) fn obeyed_report(&self, now: Instant, manager: &Identity) -> Option<ClaimReport> {
         let obeyed = self.claims.of(manager)?;
-        let is_connected = self.node(manager).is_some_and(|known| known.is_joined());
-        let since = if is_connected { 0 } else { millis(now.since(obeyed.heard)) };
+        let since = obeyed.heard.map_or(0, |heard| millis(now.since(heard)));
         Some(ClaimReport { tagged: obeyed.tagged, since })
     }
 
@@ -348,18 +347,18 @@ impl<P: Port> Node<P> {
     }
 
     /// A manager that has joined is obeyed from here on; its claim is stored before the first moving call.
-    pub(super) fn obey(&mut self, now: Instant, manager: &Identity, claim: Option<&ClaimReport>) {
+    pub(super) fn obey(&mut self, manager: &Identity, claim: Option<&ClaimReport>) {
         let Some(tagged) = claim.map(|report| report.tagged) else { return };
         match self.claims.of_mut(manager) {
             Some(obeyed) if tagged.claim < obeyed.tagged.claim => {}
             Some(obeyed) if tagged.claim == obeyed.tagged.claim => {
                 // Its tag is another one where the manager's keys are.
-                (obeyed.tagged, obeyed.heard) = (tagged, now);
+                (obeyed.tagged, obeyed.heard) = (tagged, None);
                 obeyed.look_again();
             }
-            Some(obeyed) => *obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: now },
+            Some(obeyed) => *obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: None },
             None => {
-                let obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: now };
+                let obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: None };
                 if self.claims.obeyed.push((manager.clone(), obeyed)).is_err() {
                     self.counters.count(NodeCounter::ClaimsNotKept);
                 }
@@ -375,14 +374,21 @@ impl<P: Port> Node<P> {
     }
 
     /// A connected manager has raised its claim.
-    pub(crate) fn claim_raised(&mut self, now: Instant, manager: &Identity, claim: &ClaimReport) {
-        self.obey(now, manager, Some(claim));
+    pub(crate) fn claim_raised(&mut self, manager: &Identity, claim: &ClaimReport) {
+        self.obey(manager, Some(claim));
+    }
+
+    /// A connected manager misses keep-alives and was last heard at `heard`, or is heard again.
+    pub(crate) fn manager_heard(&mut self, heard: Option<Instant>, manager: &Identity) {
+        if let Some(obeyed) = self.claims.of_mut(manager) {
+            obeyed.heard = heard;
+        }
     }
 
     /// The link of a manager has ended.
     pub(super) fn manager_left(&mut self, now: Instant, manager: &Identity) {
         if let Some(obeyed) = self.claims.of_mut(manager) {
-            obeyed.heard = now;
+            obeyed.heard.get_or_insert(now);
         }
     }
 

@@ -138,6 +138,11 @@ impl Liveness {
         self.datagrams.missed >= MISSED_KEEP_ALIVES
     }
 
+    /// Whether a keep-alive was missed since the peer was last heard.
+    pub const fn is_silent(&self) -> bool {
+        self.silence.missed > 0
+    }
+
     /// How long ago the peer was last heard. Late looks make it too short by as much as they were late.
     pub fn silent_for(&self, now: Instant) -> Duration {
         let missed = (0..self.silence.missed).fold(Duration::ZERO, |missed, _| missed + self.period);

@@ -24,13 +24,21 @@ pub(super) struct Obedience {
     /// For a manager with a higher claim: until when the peer has to show life, and until when its orders may continue. Both in
     /// the far future if there is none.
     gives_way: (Instant, Instant),
+    /// The hub knows that the peer misses keep-alives.
+    is_silent: bool,
     /// This unit has raised its own claim, and the peer has not been notified.
     pub(super) has_news: bool,
 }
 
 impl Obedience {
     pub(super) const fn new() -> Self {
-        Self { may_move: None, waits: false, gives_way: (Instant::FAR_FUTURE, Instant::FAR_FUTURE), has_news: false }
+        Self {
+            may_move: None,
+            waits: false,
+            gives_way: (Instant::FAR_FUTURE, Instant::FAR_FUTURE),
+            is_silent: false,
+            has_news: false,
+        }
     }
 
     pub(super) fn gives_way(&self) -> bool {
@@ -49,9 +57,20 @@ impl Obedience {
     /// The peer has raised its claim.
     pub(super) fn claim_arrived<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, report: &ClaimReport) {
         let Some(peer) = wire.remote.as_ref().map(|remote| &remote.hello.identity) else { return };
-        let now = cx.now;
-        cx.hub.enter(&mut |hub| hub.node.claim_raised(now, peer, report));
+        cx.hub.enter(&mut |hub| hub.node.claim_raised(peer, report));
         self.may_move = None;
+    }
+
+    /// Tells the hub when the peer was last heard, once it misses a keep-alive: a standby that asks counts from then, and not
+    /// from the end of the link.
+    pub(super) fn note_silence<P: Port>(&mut self, wire: &Wire<P>, cx: &mut Context<'_, P>) {
+        let is_silent = wire.liveness.is_silent();
+        if core::mem::replace(&mut self.is_silent, is_silent) != is_silent
+            && let Some(remote) = &wire.remote
+        {
+            let heard = is_silent.then(|| cx.now - wire.liveness.silent_for(cx.now));
+            cx.hub.enter(&mut |hub| hub.node.manager_heard(heard, &remote.hello.identity));
+        }
     }
 
     /// The claim under which a moving call of the peer may begin. `None` makes the call wait until the port has stored the claim.

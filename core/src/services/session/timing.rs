@@ -204,6 +204,7 @@ impl<P: Port> Session<P> {
         if self.wire.holds && !self.wire.liveness.hears() {
             self.wire.heard(cx.now);
         }
+        self.granting.obedience.note_silence(&self.wire, cx);
         if !self.wire.due.has_come(Part::Liveness, cx.now) {
             return;
         }
@@ -212,6 +213,7 @@ impl<P: Port> Session<P> {
         if look.missed {
             self.wire.link.counters.count(LinkCounter::KeepAlivesMissed);
         }
+        self.granting.obedience.note_silence(&self.wire, cx);
         if look.lost {
             return self.wire.close(cx, CloseReason::Silent);
         }

@@ -8,8 +8,10 @@ use super::setup::Setup;
 use super::side::Side;
 use super::{none, text};
 use crate::config::Constraints;
+use crate::distribution::claim::{Claim, TaggedClaim};
 use crate::error::CloseReason;
 use crate::host::connections::LinkCounter;
+use crate::host::mailman::LinkId;
 use crate::time::Duration;
 
 fn stream_only() -> Pair {
@@ -49,6 +51,35 @@ fn a_silent_peer_is_given_up_as_soon_where_only_the_stream_passes() {
     lose_datagrams(&mut pair);
     let millis = silence(pair);
     assert!((2_500..=3_600).contains(&millis), "{millis} ms");
+}
+
+/// A standby asks the vehicle how long ago that was: it need not wait for three keep-alives more when the link has ended.
+#[test]
+fn a_vehicle_knows_when_it_last_heard_its_manager() {
+    let tagged = TaggedClaim { claim: Claim { term: 5, claimant: 1 }, ..TaggedClaim::NONE };
+    let mut pair = Pair::prepared(&Setup::default(), |pair| pair.manager.hub.hub.node.set_claim(tagged));
+    let manager = pair.manager.hub.hub.node.identity().clone();
+    let since = |pair: &Pair| pair.agv.hub.hub.node.obeyed_report(pair.agv.now, &manager).map(|report| report.since);
+    for pause in [2_000, 8_000] {
+        pair.run(Duration::from_secs(10));
+        assert_eq!(since(&pair), Some(0));
+        pair.manager.net.datagrams = Datagrams::Lost;
+        pair.manager.net.frozen = true;
+        pair.run(Duration::from_millis(1_400));
+        assert_eq!(since(&pair), Some(0), "it may come yet");
+        pair.run(Duration::from_millis(pause - 1_400));
+        assert!(
+            since(&pair).is_some_and(|since| (pause - 1_100..=pause).contains(&u64::from(since))),
+            "{:?}",
+            since(&pair)
+        );
+        pair.manager.net.datagrams = Datagrams::Pass;
+        pair.manager.net.frozen = false;
+    }
+    assert!(pair.agv.has(&Event::Closed(CloseReason::Silent)));
+    let (now, before) = (pair.agv.now, since(&pair));
+    pair.agv.hub.hub.node.left(now, LinkId(0), CloseReason::Silent);
+    assert_eq!(since(&pair), before);
 }
 
 fn lose_datagrams(pair: &mut Pair) {
