@@ -213,7 +213,6 @@ impl<P: Port> Session<P> {
         if look.missed {
             self.wire.link.counters.count(LinkCounter::KeepAlivesMissed);
         }
-        self.granting.obedience.note_silence(&self.wire, cx);
         if look.lost {
             return self.wire.close(cx, CloseReason::Silent);
         }
