@@ -100,6 +100,10 @@ fn attempt<T: Send + 'static>(
     match question {
         Question::Unit => send(sink, Answer::Unit(describe::unit(system))),
         Question::Nodes { offering } => nodes(system, offering.as_deref(), sink),
+        // The connection has a role; a unit of this process is asked with all rights, unless its caller asks `Role::permit`.
+        Question::As { .. } => {
+            Err(Failure::configuration("BadQuestion", "only a connection to a control socket acts for somebody").into())
+        }
         Question::Search => {
             system.broadcast();
             Ok(())

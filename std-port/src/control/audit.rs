@@ -6,6 +6,7 @@
 //! | `at_ms` | milliseconds since 1970 |
 //! | `origin` | `operator`, through the control socket, or `program` |
 //! | `uid`, `pid`, `program` | the process that asked |
+//! | `name`, `role` | the user, or for whom that process acts, and what they may do; no role of the program |
 //! | `ask`, `function` | what for; several functions of a stop or a reset with a comma between them |
 //! | `take_over` | `true` where an order of another unit, or of the other origin, was to give way |
 //! | `node` | of which node, as far as it is known |
@@ -27,12 +28,17 @@ use rustix::process::{getpid, getuid};
 use serde_json::{Value, json};
 
 use super::failure::name_of;
-use super::protocol::{Answer, CallQuestion, Question};
+use super::location::own_uid;
+use super::protocol::{Answer, CallQuestion, Failure, Question};
+use super::role::{Role, name_of_user};
 use crate::LineQueue;
 use crate::seldom::warn_seldom;
 
 /// A longer file is put aside, and the one before it is dropped: twice as much is kept.
 const LONGEST: u64 = 4 * 1024 * 1024;
+
+/// Of the name for whom a client acts.
+const LONGEST_NAME: usize = 64;
 
 /// The log's end of the queue. Whoever notes something watches a client, moves or stops something: none of them waits for a
 /// disk.
@@ -117,10 +123,11 @@ impl Audit {
 
 fn entry(origin: &str, who: &Who, line: &Line<'_>) -> Value {
     let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    let Who { uid, pid, program } = who;
+    let Who { uid, pid, program, name, role } = who;
     let Line { ask, function, take_over, node, outcome } = line;
     json!({
-        "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "ask": ask,
+        "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "name": name, "role": role,
+        "ask": ask,
         "function": function, "take_over": take_over, "node": node, "outcome": outcome,
     })
 }
@@ -128,7 +135,8 @@ fn entry(origin: &str, who: &Who, line: &Line<'_>) -> Value {
 /// Writes down at once what this process does without a unit.
 pub(super) fn note(path: &Path, ask: &str, node: &str, outcome: &str) -> io::Result<()> {
     let line = Line { ask, function: None, take_over: false, node: Some(node), outcome };
-    let entry = entry("operator", &Who::own(), &line);
+    let who = Who { role: Some(Role::Reset), ..Who::own() };
+    let entry = entry("operator", &who, &line);
     LogFile::open(path, LONGEST)?.write(format!("{entry}\n").as_bytes())
 }
 
@@ -147,20 +155,44 @@ pub(super) struct Who {
     uid: u32,
     pid: i32,
     program: String,
+    name: Option<String>,
+    /// None of a program that asks its own unit.
+    role: Option<Role>,
 }
 
 impl Who {
-    pub(super) fn of(stream: &UnixStream) -> io::Result<Self> {
+    pub(super) fn of(stream: &UnixStream, role: Role) -> io::Result<Self> {
         let credentials = socket_peercred(stream.as_fd())?;
         let (uid, pid) = (credentials.uid.as_raw(), credentials.pid.as_raw_nonzero().get());
         let program = std::fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-        Ok(Self { uid, pid, program: program.trim_end().to_owned() })
+        let (program, name) = (program.trim_end().to_owned(), name_of_user(uid));
+        Ok(Self { uid, pid, program, name, role: Some(role) })
+    }
+
+    pub(super) fn role(&self) -> Role {
+        self.role.unwrap_or(Role::Reset)
+    }
+
+    /// Acts for somebody else from here on. Users that have been given a role cannot, or they would choose the name in the log.
+    pub(super) fn act_as(&mut self, name: String, role: Role) -> Result<(), Failure> {
+        if self.uid != own_uid() && self.uid != 0 {
+            return Err(Failure::configuration("NotAllowed", "only the unit's own user and root act for others"));
+        }
+        if role > self.role() {
+            return Err(Failure::role(self.role(), role));
+        }
+        if name.is_empty() || name.len() > LONGEST_NAME || name.chars().any(char::is_control) {
+            let text = format!("a name has 1 to {LONGEST_NAME} bytes and no control characters");
+            return Err(Failure::configuration("BadQuestion", text));
+        }
+        (self.name, self.role) = (Some(name), Some(role));
+        Ok(())
     }
 
     fn own() -> Self {
         let (uid, pid) = (getuid().as_raw(), getpid().as_raw_nonzero().get());
         let program = std::fs::read_to_string("/proc/self/comm").unwrap_or_default();
-        Self { uid, pid, program: program.trim_end().to_owned() }
+        Self { uid, pid, program: program.trim_end().to_owned(), name: name_of_user(uid), role: None }
     }
 }
 
@@ -242,7 +274,8 @@ impl<'q> Asked<'q> {
             Question::Publish { node, .. } => of_node("publish", node.as_ref()),
             Question::Set { node, .. } => of_node("set", node.as_ref()),
             Question::Retire { node } => of_node("retire", Some(node)),
-            Question::Unit
+            Question::As { .. }
+            | Question::Unit
             | Question::Nodes { .. }
             | Question::Search
             | Question::Functions { .. }
@@ -339,6 +372,10 @@ mod tests {
 
     const LONG: Duration = Duration::from_secs(20);
 
+    fn who() -> Who {
+        Who { uid: 7, pid: 8, program: "cara".to_owned(), name: Some("anna".to_owned()), role: Some(Role::Operate) }
+    }
+
     fn lines(path: &Path) -> Vec<Value> {
         let text = std::fs::read_to_string(path).unwrap();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
@@ -349,7 +386,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("audit");
         let audit = Audit::open(&path).unwrap();
-        let who = Who { uid: 7, pid: 8, program: "cara".to_owned() };
+        let who = who();
         let stop = Question::Stop { node: None };
         let called = |id, error| Answer::Called {
             node: "agv".to_owned(),
@@ -376,6 +413,7 @@ mod tests {
         let first = &lines(&path)[0];
         assert_eq!((&first["ask"], &first["uid"], &first["origin"]), (&json!("stop"), &json!(7), &json!("operator")));
         assert_eq!(first["function"], "halt,brake");
+        assert_eq!((&first["name"], &first["role"]), (&json!("anna"), &json!("operate")));
     }
 
     #[test]
@@ -383,7 +421,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("audit");
         let audit = Audit::open(&path).unwrap();
-        let who = Who { uid: 7, pid: 8, program: "cara".to_owned() };
+        let who = who();
         let hold = Question::Hold(CallQuestion { function: "go".to_owned(), ..CallQuestion::default() });
         let ends: [fn(&mut Entry<'_>); 5] = [
             |entry| entry.note(&Answer::Ended { expired: false }),

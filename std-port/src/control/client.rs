@@ -259,7 +259,7 @@ impl Client {
     pub fn connect_to_stop(path: &Path) -> Result<Self, ControlError> {
         let stream = dial(path)?;
         let owner = peer_uid(&stream)?;
-        if ![owner, own_uid()].contains(&0) && owner != own_uid() {
+        if ![owner, own_uid()].contains(&0) && owner != own_uid() && !location::is_shared_by(path, owner) {
             let reason = format!("user {owner} answers there, and this is user {}", own_uid());
             return Err(ControlError::NotAllowed { path: path.to_owned(), reason });
         }

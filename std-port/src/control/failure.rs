@@ -6,6 +6,7 @@ use cara_core::error::{Cause, CloseReason, Error, ServiceError};
 use cara_core::services::access::Verb;
 
 use super::protocol::Failure;
+use super::role::Role;
 
 impl Failure {
     /// A failure of the question itself: it must be asked otherwise.
@@ -48,6 +49,15 @@ impl Failure {
         let text = format!(
             "the unit's access table does not let the operator {verb} '{function}': \
              add a rule with who = \"operator\" to it"
+        );
+        Self::new(Error::NotAllowed.cause(), &name_of(&Error::NotAllowed), text)
+    }
+
+    /// The operator's role does not include it.
+    pub fn role(has: Role, needed: Role) -> Self {
+        let text = format!(
+            "this needs the role `{needed}`, and you have `{has}`; every role may stop. Roles are given by the unit's \
+             `operators` and by the page's token file"
         );
         Self::new(Error::NotAllowed.cause(), &name_of(&Error::NotAllowed), text)
     }

@@ -100,7 +100,7 @@ pub(super) fn defaults() -> Vec<PathBuf> {
 /// Whether a directory is named as in [`defaults`] and is this user's, so that no unit was put apart there.
 fn is_default(directory: &Path) -> bool {
     let name = directory.file_name().unwrap_or_default();
-    (name == "cara" || *name == *format!("cara-{}", own_uid())) && enter(directory).is_ok()
+    (name == "cara" || *name == *format!("cara-{}", own_uid())) && enter(directory, EnteredBy::Owner).is_ok()
 }
 
 pub(super) fn own_uid() -> u32 {
@@ -164,7 +164,8 @@ fn fnv(bytes: &[u8]) -> u64 {
 
 /// The sockets in a directory, live or stale; none in a directory that other users can write to.
 pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, LocationError> {
-    match enter(directory) {
+    let is_named = set("CARA_CONTROL_DIR").is_some_and(|named| named == directory);
+    match enter(directory, if is_named { EnteredBy::Anybody } else { EnteredBy::Owner }) {
         Ok(_) => {}
         Err(LocationError::System { error, .. }) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         Err(error) => return Err(error),
@@ -182,8 +183,20 @@ pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, LocationError> {
 #[derive(Clone, Debug)]
 pub(super) struct Location {
     path: PathBuf,
+    entered_by: EnteredBy,
     /// Identifies the file, so that a later one at the same path is not removed.
     file: Mark,
+}
+
+/// Who may be able to enter a directory of control sockets. No other user may ever write there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum EnteredBy {
+    /// This user, whose directory it is.
+    Owner,
+    /// Also its group: the directory of a socket that is shared.
+    Group,
+    /// Whoever: a client was told to look there, and believes whose directory it is.
+    Anybody,
 }
 
 /// Device and number of a file, which may be used again, and the time of its last change.
@@ -199,19 +212,20 @@ impl Location {
         &self.path
     }
 
-    /// Opens the socket at `path`, replacing a stale one.
-    pub(super) fn open(path: &Path) -> Result<(Self, UnixListener), LocationError> {
+    /// Opens the socket at `path`, replacing a stale one. Who can enter the directory of one that is shared can connect.
+    pub(super) fn open(path: &Path, is_shared: bool) -> Result<(Self, UnixListener), LocationError> {
+        let (entered_by, mode) = if is_shared { (EnteredBy::Group, 0o666) } else { (EnteredBy::Owner, 0o600) };
         let directory = parent(path)?;
         let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
         made.map_err(|error| LocationError::system(directory, error))?;
-        let directory = enter(directory)?;
+        let directory = enter(directory, entered_by)?;
         let _lock = lock(&directory).map_err(|error| LocationError::system(path, error))?;
         make_room(path)?;
         let listener = listen_at(path, &directory).map_err(|error| LocationError::system(path, error))?;
-        // Other users cannot enter the directory, so the socket was not reachable with wider permissions in between.
-        set_permissions(path, Permissions::from_mode(0o600)).map_err(|error| LocationError::system(path, error))?;
+        // Users who must not connect cannot enter the directory, so the socket was not reachable with wider permissions in between.
+        set_permissions(path, Permissions::from_mode(mode)).map_err(|error| LocationError::system(path, error))?;
         let file = mark(path).map_err(|error| LocationError::system(path, error))?;
-        Ok((Self { path: path.to_owned(), file }, listener))
+        Ok((Self { path: path.to_owned(), entered_by, file }, listener))
     }
 
     /// Whether the file is still there, with whatever permissions.
@@ -221,7 +235,9 @@ impl Location {
 
     /// Removes the file, unless it is another one by now.
     pub(super) fn remove(&self) {
-        let Some(directory) = self.path.parent().and_then(|directory| enter(directory).ok()) else { return };
+        let Some(directory) = self.path.parent().and_then(|directory| enter(directory, self.entered_by).ok()) else {
+            return;
+        };
         let Ok(_lock) = lock(&directory) else { return };
         if mark(&self.path).is_ok_and(|file| file == self.file) {
             let _ = std::fs::remove_file(&self.path);
@@ -234,16 +250,21 @@ fn parent(path: &Path) -> Result<&Path, LocationError> {
     directory.ok_or_else(|| LocationError::NoDirectory(path.to_owned()))
 }
 
-/// Opens a directory that belongs to this user and that no other user can enter.
-fn enter(path: &Path) -> Result<OwnedFd, LocationError> {
+/// Opens a directory that belongs to this user and that no other user can enter, unless `entered_by` says otherwise.
+fn enter(path: &Path, entered_by: EnteredBy) -> Result<OwnedFd, LocationError> {
     let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::RDONLY | OFlags::CLOEXEC;
     let directory = open(path, flags, Mode::empty()).map_err(|errno| LocationError::system(path, errno))?;
     let found = fstat(&directory).map_err(|errno| LocationError::system(path, errno))?;
     let mode = found.st_mode & 0o777;
-    if found.st_uid != own_uid() {
+    let closed_to_others = match entered_by {
+        EnteredBy::Owner => 0o077,
+        EnteredBy::Group => 0o027,
+        EnteredBy::Anybody => 0o022,
+    };
+    if found.st_uid != own_uid() && entered_by != EnteredBy::Anybody {
         return Err(LocationError::Foreign { path: path.to_owned(), owner: found.st_uid });
     }
-    if mode & 0o077 != 0 {
+    if mode & closed_to_others != 0 {
         return Err(LocationError::Open { path: path.to_owned(), mode });
     }
     Ok(directory)
@@ -280,7 +301,7 @@ fn make_room(path: &Path) -> Result<(), LocationError> {
 
 /// Whether a process has the socket, including one that hangs: the system accepts connections for it.
 pub(super) fn is_held(path: &Path) -> bool {
-    let is_own = parent(path).and_then(enter).is_ok();
+    let is_own = parent(path).and_then(|directory| enter(directory, EnteredBy::Group)).is_ok();
     is_own && dial(path).map_or_else(|error| error.kind() == io::ErrorKind::WouldBlock, |_| true)
 }
 
@@ -318,6 +339,12 @@ fn address(path: &Path, directory: &OwnedFd) -> io::Result<SocketAddrUnix> {
         }
         address => Ok(address?),
     }
+}
+
+/// Whether a socket is in a directory of that user in which nobody else can have put it.
+pub(super) fn is_shared_by(path: &Path, owner: u32) -> bool {
+    let directory = parent(path).and_then(|directory| enter(directory, EnteredBy::Anybody));
+    directory.is_ok_and(|directory| fstat(&directory).is_ok_and(|found| found.st_uid == owner))
 }
 
 /// The user at the other end of a connection.
@@ -378,7 +405,7 @@ mod tests {
     fn the_directory_is_made_for_its_owner_alone_and_so_is_the_socket() {
         let above = directory();
         let path = above.path().join("deep").join("unit.sock");
-        let (location, _listener) = Location::open(&path).unwrap();
+        let (location, _listener) = Location::open(&path, false).unwrap();
         assert_eq!((mode(path.parent().unwrap()), mode(&path)), (0o700, 0o600));
         assert!(dial(&path).is_ok());
         location.remove();
@@ -391,7 +418,7 @@ mod tests {
         let open = above.path().join("open");
         std::fs::create_dir(&open).unwrap();
         set_permissions(&open, Permissions::from_mode(0o750)).unwrap();
-        assert!(matches!(Location::open(&open.join("unit.sock")), Err(LocationError::Open { mode: 0o750, .. })));
+        assert!(matches!(Location::open(&open.join("unit.sock"), false), Err(LocationError::Open { mode: 0o750, .. })));
         assert!(matches!(sockets(&open), Err(LocationError::Open { .. })));
     }
 
@@ -400,7 +427,7 @@ mod tests {
         let above = directory();
         let link = above.path().join("link");
         std::os::unix::fs::symlink(above.path(), &link).unwrap();
-        assert!(matches!(Location::open(&link.join("unit.sock")), Err(LocationError::System { .. })));
+        assert!(matches!(Location::open(&link.join("unit.sock"), false), Err(LocationError::System { .. })));
     }
 
     /// Some directory of another user; there is none that root does not own in every container, so root looks on.
@@ -412,17 +439,19 @@ mod tests {
             println!("skipped: the process of number 1 belongs to this user");
             return;
         }
-        assert!(matches!(enter(foreign), Err(LocationError::Foreign { owner: found, .. }) if found == owner));
+        assert!(
+            matches!(enter(foreign, EnteredBy::Owner), Err(LocationError::Foreign { owner: found, .. }) if found == owner)
+        );
     }
 
     #[test]
     fn a_socket_without_a_process_is_replaced_and_a_live_one_is_not() {
         let above = directory();
         let path = above.path().join("unit.sock");
-        let (stale, listener) = Location::open(&path).unwrap();
-        assert!(matches!(Location::open(&path), Err(LocationError::InUse(_))));
+        let (stale, listener) = Location::open(&path, false).unwrap();
+        assert!(matches!(Location::open(&path, false), Err(LocationError::InUse(_))));
         drop(listener);
-        let (location, _listener) = Location::open(&path).unwrap();
+        let (location, _listener) = Location::open(&path, false).unwrap();
         stale.remove();
         assert!(path.exists(), "it is another's by now");
         location.remove();
@@ -434,16 +463,16 @@ mod tests {
         let above = directory();
         let path = above.path().join("unit.sock");
         std::fs::write(&path, "precious").unwrap();
-        assert!(matches!(Location::open(&path), Err(LocationError::NotASocket(_))));
+        assert!(matches!(Location::open(&path, false), Err(LocationError::NotASocket(_))));
         assert_eq!(std::fs::read(&path).unwrap(), b"precious");
-        assert!(matches!(Location::open(Path::new("unit.sock")), Err(LocationError::NoDirectory(_))));
+        assert!(matches!(Location::open(Path::new("unit.sock"), false), Err(LocationError::NoDirectory(_))));
     }
 
     #[test]
     fn a_path_longer_than_a_sockets_address_serves() {
         let above = directory();
         let path = above.path().join("d".repeat(120)).join("unit.sock");
-        let (location, _listener) = Location::open(&path).unwrap();
+        let (location, _listener) = Location::open(&path, false).unwrap();
         assert!(dial(&path).is_ok());
         assert_eq!(sockets(path.parent().unwrap()).unwrap(), std::slice::from_ref(&path));
         location.remove();

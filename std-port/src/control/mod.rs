@@ -5,8 +5,8 @@
 //! removes it when it is stopped. [`Client`] is the other end; [`execute`] answers the same questions against a unit of
 //! this process. The messages are in [`protocol`].
 //!
-//! Access to the socket gives all rights of the program: there are no finer ones. So the directory belongs to its owner
-//! alone, and each connection must come from the same user or from root.
+//! The unit's own user, and root, have all rights of the program. So the directory belongs to its owner alone, and each
+//! connection must come from the same user or from root; others are let in with a [`Role`] by [`Control::Shared`] alone.
 
 mod answering;
 mod attributes;
@@ -24,6 +24,7 @@ pub mod json;
 mod lines;
 mod location;
 pub mod protocol;
+mod role;
 mod select;
 mod server;
 mod stop;
@@ -41,6 +42,7 @@ pub use client::{
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use forgetting::{ForgetError, Forgotten, forget_claims, state_folder};
 pub use location::{directories, directory};
+pub use role::{OperatorError, Operators, Role};
 pub(crate) use server::Server;
 
 use cara_core::distribution::identity::{Fleet, Identity};
@@ -60,6 +62,9 @@ pub enum Control {
     Default,
     /// At this path. Its directory is made if it is not there, and must be the owner's alone.
     Path(PathBuf),
+    /// At this path, also for other users of the host, each with a role. Its directory has to be there, and must be the unit's
+    /// user's; its group may enter it (mode 0750), and others must not.
+    Shared(PathBuf, Operators),
     /// Nowhere.
     Off,
 }
@@ -74,7 +79,7 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
             (path.clone().unwrap_or_default(), path.is_some())
         }
         // Any unit may have been told this path.
-        Control::Path(path) => (
+        Control::Path(path) | Control::Shared(path, _) => (
             path.clone(),
             match Client::connect(path) {
                 Ok(client) => client.unit().unit == identity.to_string() && client.unit().fleet == fleet.0,
@@ -93,15 +98,16 @@ pub(crate) fn open<T: Send + 'static>(
     audit: Option<Arc<Audit>>,
     guest: CommunicationSystem<T>,
 ) -> Option<Server> {
+    let operators = if let Control::Shared(_, operators) = control { Some(operators.clone()) } else { None };
     let paths = match control {
         Control::Off => return None,
-        Control::Path(path) => vec![path.clone()],
+        Control::Path(path) | Control::Shared(path, _) => vec![path.clone()],
         Control::Default => {
             let name = location::file_name(&guest.identity(), guest.fleet());
             location::defaults().iter().map(|directory| directory.join(&name)).collect()
         }
     };
-    match Server::open(paths, audit, guest) {
+    match Server::open(paths, operators, audit, guest) {
         Ok(server) => Some(server),
         Err(error) => {
             tracing::warn!(%error, "there is no control socket: the `cara` command will not find this unit");

@@ -10,6 +10,8 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
+use super::role::Role;
+
 /// In the manager's first line, so that an older command recognises a newer manager.
 pub const CONTROL_VERSION: u32 = 2;
 
@@ -23,6 +25,14 @@ pub const LONGEST_LINE: usize = 4 * 1024 * 1024;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "ask", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Question {
+    /// Act for somebody from here on: as if this connection had the role, which must not exceed its own, and under this name in
+    /// the audit log. For the unit's own user and root, such as the server of a page whose users have roles of their own.
+    As {
+        /// Who that is, in 1 to 64 bytes.
+        name: String,
+        /// What they may do.
+        role: Role,
+    },
     /// Asks for the unit's identity and state. Answered by [`Answer::Unit`].
     Unit,
     /// Asks for the known nodes and the refused ones. An [`Answer::Node`] for each, an [`Answer::Refused`] for each
@@ -141,7 +151,7 @@ impl Question {
 
     /// Whether it is answered also where all connections are in use.
     pub(super) fn is_of_a_stop(&self) -> bool {
-        matches!(self, Self::Stop { .. } | Self::Unit | Self::Nodes { .. })
+        matches!(self, Self::As { .. } | Self::Stop { .. } | Self::Unit | Self::Nodes { .. })
     }
 }
 

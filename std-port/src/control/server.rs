@@ -18,8 +18,9 @@ use rustix::net::{SendFlags, send};
 use super::answering::execute_for;
 use super::audit::{Audit, Entry, Who};
 use super::lines::{Line, Lines};
-use super::location::{Location, LocationError, own_uid, peer_uid};
+use super::location::{Location, LocationError, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
+use super::role::{Operators, Role};
 use crate::CommunicationSystem;
 use crate::executor::OwnThread;
 use crate::locks::lock;
@@ -64,6 +65,8 @@ struct Shared {
     waker: Waker,
     stopping: AtomicBool,
     idle_limit: Duration,
+    /// Users besides the unit's own; none where the socket is not shared.
+    operators: Option<Operators>,
     audit: Option<Arc<Audit>>,
     connections: Mutex<Connections>,
     socket: Mutex<Socket>,
@@ -107,12 +110,13 @@ impl Server {
     /// must not be one that keeps the unit running.
     pub(super) fn open<T: Send + 'static>(
         paths: Vec<PathBuf>,
+        operators: Option<Operators>,
         audit: Option<Arc<Audit>>,
         system: CommunicationSystem<T>,
     ) -> Result<Self, LocationError> {
         let path = paths.first().cloned().unwrap_or_default();
-        let (location, listener) = Location::open(&path)?;
-        let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| {
+        let (location, listener) = Location::open(&path, operators.is_some())?;
+        let started = Shared::new(IDLE_TIMEOUT, operators, audit).and_then(|shared| {
             lock(&shared.socket).location = Some(location.clone());
             shared.keep_socket(paths)?;
             shared.accept_with(listener, system)
@@ -148,10 +152,10 @@ impl Server {
 }
 
 impl Shared {
-    fn new(idle_limit: Duration, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
+    fn new(idle_limit: Duration, operators: Option<Operators>, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
         let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
         let (socket, stopped) = (Mutex::default(), Condvar::new());
-        Ok(Arc::new(Self { waker, stopping, idle_limit, audit, connections, socket, stopped }))
+        Ok(Arc::new(Self { waker, stopping, idle_limit, operators, audit, connections, socket, stopped }))
     }
 
     /// Makes the socket again when it has vanished, in a thread that nothing waits for: its directory may be on a disk that
@@ -172,7 +176,7 @@ impl Shared {
             // What stands above a folder of the system's is not ours to make.
             let is_below = |path: &PathBuf| path.ancestors().nth(2).is_some_and(Path::is_dir);
             let usable = paths.iter().enumerate().filter(|(number, path)| *number == 0 || is_below(path));
-            let opened = usable.map(|(_, path)| Location::open(path)).reduce(Result::or);
+            let opened = usable.map(|(_, path)| Location::open(path, self.operators.is_some())).reduce(Result::or);
             match opened {
                 Some(Ok((location, listener))) => {
                     is_reported = false;
@@ -263,8 +267,8 @@ impl Shared {
     fn accepted<T: Send + 'static>(self: &Arc<Self>, stream: UnixStream, system: &CommunicationSystem<T>) {
         // Everything that is refused is small enough for an empty socket's buffer.
         let refuse = |failure| drop(write(&mut &stream, &Answer::Failed(failure)));
-        if !peer_uid(&stream).is_ok_and(|uid| uid == own_uid() || uid == 0) {
-            return refuse(Failure::configuration("NotAllowed", "only the user that runs the unit may ask it"));
+        if let Err(failure) = self.role_of(&stream) {
+            return refuse(failure);
         }
         let mut connections = lock(&self.connections);
         // A stop ends those that it finds.
@@ -294,6 +298,19 @@ impl Shared {
         }
     }
 
+    fn role_of(&self, stream: &UnixStream) -> Result<Role, Failure> {
+        let uid = peer_uid(stream).ok();
+        let nobody_else = Operators::default();
+        let operators = self.operators.as_ref().unwrap_or(&nobody_else);
+        uid.and_then(|uid| operators.role_of(uid)).ok_or_else(|| {
+            // Not in the audit log: whoever may only try must not be able to fill it.
+            warn_seldom!(?uid, "a user who is no operator has tried to connect to the control socket");
+            let text =
+                "only the user that runs the unit may ask it, and those in its `operators`: have yours added there";
+            Failure::configuration("NotAllowed", text)
+        })
+    }
+
     fn serve<T: Send + 'static>(
         &self,
         stream: UnixStream,
@@ -306,15 +323,13 @@ impl Shared {
         stream.set_read_timeout(Some(self.idle_limit))?;
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         let mut lines = Lines::new(&stream);
-        let audit = match &self.audit {
-            Some(audit) => Some((&**audit, Who::of(&stream)?)),
-            None => None,
-        };
-        let outcome = self.converse(&mut lines, idle, full_when_opened, audit.as_ref(), system);
-        if let Some((audit, who)) = &audit {
+        let role = self.role_of(&stream).map_err(|failure| io::Error::other(failure.text))?;
+        let mut who = Who::of(&stream, role)?;
+        let outcome = self.converse(&mut lines, idle, full_when_opened, &mut who, system);
+        if let Some(audit) = &self.audit {
             // It is given up; what was sent before can still be read.
             let _ = stream.shutdown(Shutdown::Both);
-            self.note_rest(&mut lines, audit, who, system.is_stopped());
+            self.note_rest(&mut lines, audit, &who, system.is_stopped());
         }
         outcome
     }
@@ -334,7 +349,7 @@ impl Shared {
         lines: &mut Lines<&UnixStream>,
         idle: &Mutex<Option<Instant>>,
         full_when_opened: bool,
-        audit: Option<&(&Audit, Who)>,
+        who: &mut Who,
         system: &CommunicationSystem<T>,
     ) -> io::Result<()> {
         let stream = *lines.source();
@@ -355,6 +370,10 @@ impl Shared {
             }
             *lock(idle) = None;
             match question(line) {
+                Ok(Question::As { name, role }) => {
+                    let outcome = who.act_as(name, role).map_or_else(Answer::Failed, |()| Answer::Done);
+                    let _ = writer.borrow_mut().sink(&outcome);
+                }
                 Ok(question) => {
                     let client = RefCell::new(Beats { stream, lines, last: Instant::now() });
                     let lives = || {
@@ -362,13 +381,15 @@ impl Shared {
                         client.borrow_mut().lives().filter(|_| !self.is_stopping())
                     };
                     writer.borrow_mut().waits = !question.waits_for_no_reader();
-                    let mut entry = audit.and_then(|(audit, who)| Entry::of(audit, who, &question));
+                    let mut entry = self.audit.as_ref().and_then(|audit| Entry::of(audit, who, &question));
                     let mut sink = |answer| {
                         entry.iter_mut().for_each(|entry| entry.note(&answer));
                         writer.borrow_mut().sink(&answer)
                     };
                     if full_when_opened && !question.is_of_a_stop() {
                         let _ = sink(Answer::Failed(full()));
+                    } else if let Err(failure) = who.role().permit(system, &question) {
+                        let _ = sink(Answer::Failed(failure));
                     } else if !question.needs_its_client() || lives().is_some() {
                         execute_for(system, &question, &mut sink, &lives);
                     }
@@ -511,7 +532,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("audit");
         let system = manager(fleet(), Constraints::M_UNIT);
-        let shared = Shared::new(IDLE_TIMEOUT, Some(Arc::new(Audit::open(&path).unwrap()))).unwrap();
+        let shared = Shared::new(IDLE_TIMEOUT, None, Some(Arc::new(Audit::open(&path).unwrap()))).unwrap();
         let (mut client, served) = UnixStream::pair().unwrap();
         client.write_all(b"{\"ask\":\"retire\",\"node\":\"agv/1\"}\n{\"ask\":\"nodes\"}\n").unwrap();
         client.shutdown(Shutdown::Write).unwrap();
@@ -531,7 +552,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("audit");
         let system = manager(fleet(), Constraints::M_UNIT);
-        let shared = Shared::new(IDLE_TIMEOUT, Some(Arc::new(Audit::open(&path).unwrap()))).unwrap();
+        let shared = Shared::new(IDLE_TIMEOUT, None, Some(Arc::new(Audit::open(&path).unwrap()))).unwrap();
         let asked = [
             r#"{"ask":"stop","node":null}"#,
             r#"{"ask":"reset","node":"agv/1"}"#,
@@ -592,7 +613,7 @@ mod tests {
     #[test]
     fn a_client_that_asks_nothing_is_ended_and_one_that_waits_for_an_answer_is_not() {
         let system = manager(fleet(), Constraints::M_UNIT);
-        let shared = Shared::new(Duration::from_millis(20), None).unwrap();
+        let shared = Shared::new(Duration::from_millis(20), None, None).unwrap();
         std::thread::scope(|scope| {
             let client = |asks: &[u8]| {
                 let (client, served) = UnixStream::pair().unwrap();

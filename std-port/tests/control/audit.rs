@@ -15,15 +15,15 @@ use crate::support::{Depot, ask, call, manager, until};
 const LEASE: cara_std::Duration = cara_std::Duration::from_secs(600);
 
 /// A depot with an audit log and a vehicle that drives, halts and is reset.
-struct Audited {
-    depot: Depot,
+pub(crate) struct Audited {
+    pub(crate) depot: Depot,
     peer: Peer<()>,
     path: PathBuf,
     agv: Unit,
 }
 
 impl Audited {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let depot = Depot::of(|fleet, directory| {
             let builder = manager("manager", 1, fleet).control(Control::Path(directory.join("manager.sock")));
             builder.audit(directory.join("audit")).unwrap()
@@ -47,7 +47,7 @@ impl Audited {
         Self { depot, peer, path, agv }
     }
 
-    fn lines(&self) -> Vec<Value> {
+    pub(crate) fn lines(&self) -> Vec<Value> {
         let text = std::fs::read_to_string(&self.path).unwrap();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     }

@@ -12,4 +12,5 @@ mod keyed;
 mod operator;
 mod origin;
 mod places;
+mod roles;
 mod support;
