@@ -18,7 +18,7 @@ use rustix::net::{SendFlags, send};
 use super::answering::execute_for;
 use super::audit::{Audit, Entry, Who};
 use super::lines::{Line, Lines};
-use super::location::{Location, LocationError, peer_uid};
+use super::location::{Location, LocationError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
 use super::role::{Operators, Role};
 use crate::CommunicationSystem;
@@ -29,6 +29,8 @@ use crate::sys::epoll::{Epoll, Events, Interest, Waker};
 
 /// Connections at a time.
 pub(super) const MOST_CONNECTIONS: usize = 8;
+/// Those of one user other than the unit's own, so that none keeps the others out.
+const MOST_OF_A_USER: usize = MOST_CONNECTIONS / 2;
 /// Connections beyond them, on which a unit can only be stopped.
 const RESERVED: usize = 4;
 /// The name of the failure that anything else ends with there.
@@ -36,7 +38,8 @@ pub(super) const FULL: &str = "Full";
 
 /// Why no more is done for a client.
 pub(super) fn full() -> Failure {
-    Failure::resource(FULL, format!("{MOST_CONNECTIONS} connections are open already: close one"))
+    let text = format!("{MOST_CONNECTIONS} connections are open already, or {MOST_OF_A_USER} of this user: close one");
+    Failure::resource(FULL, text)
 }
 /// A client that takes nothing for so long is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
@@ -92,6 +95,8 @@ struct Connections {
 /// A connection.
 struct Open {
     stream: UnixStream,
+    /// Which other user than the unit's own has it.
+    uid: Option<u32>,
     /// Since when it is idle; `None` while a question is answered.
     idle: Arc<Mutex<Option<Instant>>>,
 }
@@ -276,15 +281,20 @@ impl Shared {
             return;
         }
         connections.threads.retain(|thread| !thread.is_finished());
-        let is_full = connections.open.len() >= MOST_CONNECTIONS && !connections.make_room();
-        if is_full && connections.open.len() >= MOST_CONNECTIONS + RESERVED {
+        let uid = peer_uid(&stream).ok().filter(|uid| *uid != own_uid());
+        let of_user = connections.open.values().filter(|open| uid.is_some() && open.uid == uid).count();
+        let is_full =
+            of_user >= MOST_OF_A_USER || connections.open.len() >= MOST_CONNECTIONS && !connections.make_room();
+        if is_full
+            && (of_user >= MOST_OF_A_USER + RESERVED / 2 || connections.open.len() >= MOST_CONNECTIONS + RESERVED)
+        {
             return refuse(full());
         }
         let Ok(kept) = stream.try_clone() else { return };
         let number = connections.next;
         let (own, system) = (self.clone(), system.clone());
         let idle = Arc::new(Mutex::new(Some(Instant::now())));
-        let open = Open { stream: kept, idle: idle.clone() };
+        let open = Open { stream: kept, uid, idle: idle.clone() };
         let thread = std::thread::Builder::new().name("cara-control".into());
         let thread = thread.spawn(move || {
             // The end of a connection is not logged: the client knows.

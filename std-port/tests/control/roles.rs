@@ -5,7 +5,7 @@ use std::os::unix::process::CommandExt;
 use std::process::Command;
 
 use cara_std::control::protocol::{Answer, Failure, Question};
-use cara_std::control::{Client, Control, OperatorError, Operators, Role};
+use cara_std::control::{Client, Control, ControlError, OperatorError, Operators, Role};
 
 use crate::audit::Audited;
 use crate::support::{Depot, ask, call, manager, until};
@@ -121,7 +121,12 @@ fn other_users_are_let_in_with_their_roles() {
         let mut client = Client::connect(path.as_ref()).unwrap();
         assert!(matches!(ask(&mut client, acting("root", Role::Stop)), Err(failure) if failure.error == "NotAllowed"));
         assert!(matches!(ask(&mut client, Question::Reset { node: None }), Err(_)));
-        ask(&mut client, Question::Stop { node: None }).unwrap();
+        let _held: Vec<_> = (0..3).map(|_| Client::connect(path.as_ref()).unwrap()).collect();
+        assert!(
+            matches!(Client::connect(path.as_ref()), Err(ControlError::Full { .. })),
+            "a user has some of them only"
+        );
+        ask(&mut Client::connect_to_stop(path.as_ref()).unwrap(), Question::Stop { node: None }).unwrap();
         return;
     }
     let mut operators = Operators::default();
