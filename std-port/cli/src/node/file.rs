@@ -1,6 +1,7 @@
 //! A configuration file as it is written: every table and key that there is, each value with its place. What the values
 //! mean together is checked by [`settings`](super::settings).
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use cara_std::Attributes;
@@ -114,6 +115,7 @@ pub(super) struct Capacities {
 pub(super) struct Control {
     pub(super) off: Maybe<bool>,
     pub(super) path: Maybe<String>,
+    pub(super) operators: Maybe<BTreeMap<String, Spanned<cara_std::control::Role>>>,
     pub(super) audit: Maybe<String>,
 }
 

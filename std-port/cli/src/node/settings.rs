@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::path::PathBuf;
 
 use cara_std::access::AccessTable;
-use cara_std::control::Control;
+use cara_std::control::{Control, Operators};
 use cara_std::{Capacities, Constraints, Identity, Interfaces};
 
 use super::file::{self, File, Maybe, Role};
@@ -312,12 +312,36 @@ fn control(table: &file::Control, role: Role, mistakes: &mut Vec<Mistake>) -> Co
             mistakes.push(Mistake::new(path.span(), "an s_unit has no control socket", help));
         }
     }
+    if let Some(operators) = table.operators.as_ref().filter(|_| table.path.is_none()) {
+        let help =
+            "write path = \"/run/cara/plant.sock\", in a directory of this user's that the operators' group may enter";
+        mistakes.push(Mistake::new(
+            operators.span(),
+            "other users cannot reach the control socket in its usual place",
+            help,
+        ));
+    }
     let Some(path) = &table.path else { return if off { Control::Off } else { Control::Default } };
     if off || path.get_ref().is_empty() || path.get_ref().contains('\0') {
         let help = "write a path, or off = true, or neither for the usual place";
         mistakes.push(Mistake::new(path.span(), "there is no control socket at this path", help));
     }
-    Control::Path(path.get_ref().into())
+    let path = PathBuf::from(path.get_ref());
+    operators(table, mistakes)
+        .map_or_else(|| Control::Path(path.clone()), |operators| Control::Shared(path.clone(), operators))
+}
+
+/// The users besides the node's own.
+fn operators(table: &file::Control, mistakes: &mut Vec<Mistake>) -> Option<Operators> {
+    let mut operators = Operators::default();
+    for (user, role) in table.operators.as_ref()?.get_ref() {
+        if let Err(error) = operators.add(user, *role.get_ref()) {
+            let help =
+                "write users of this host with stop, see, operate or reset, as operators = { anna = \"operate\" }";
+            mistakes.push(Mistake::new(role.span(), error.to_string(), help));
+        }
+    }
+    Some(operators)
 }
 
 fn audit(table: &file::Control, mistakes: &mut Vec<Mistake>) -> Option<PathBuf> {

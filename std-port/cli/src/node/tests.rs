@@ -85,6 +85,26 @@ fn what_the_example_leaves_out_is_right_too() {
 }
 
 #[test]
+fn operators_have_a_role_each_and_a_path() {
+    let with = |control: &str| settings(&format!("name = \"a\"\nid = 1\n[control]\n{control}\n"));
+    let path = "path = \"/run/cara/a.sock\"";
+    let shared = EXAMPLE.replace("# path = ", "path = ").replace("# operators = ", "operators = ");
+    assert!(
+        matches!(settings(&shared).unwrap().control, Control::Shared(_, operators) if operators != Default::default())
+    );
+    for (wrong, told) in [
+        (format!("{path}\noperators = {{ 4711 = \"stopp\" }}"), "did you mean `stop`?"),
+        (format!("{path}\noperators = {{ 4711 = \"stop\", 04711 = \"see\" }}"), "are the same user"),
+        (format!("{path}\noperators = {{ 4711 = \"stop\", 4711 = \"see\" }}"), "duplicate key"),
+        (format!("{path}\noperators = {{ nobody-has-this-name = \"stop\" }}"), "no user 'nobody-has-this-name'"),
+        ("operators = { 4711 = \"stop\" }".to_owned(), "write path = "),
+    ] {
+        let mistake = with(&wrong).unwrap_err();
+        assert!(mistake.contains(told), "{mistake}");
+    }
+}
+
+#[test]
 fn the_command_line_stands_above_the_file() {
     let text = "name = \"a\"\nid = 1\nfleet = 1\nm_units = []\ntcp_port = 1\nmetrics.listen = \"127.0.0.1:1\"\n";
     let source = Source { name: "test.toml".into(), text: text.into() };
