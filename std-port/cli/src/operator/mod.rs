@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use cara_std::CommunicationSystem;
 use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
-use cara_std::control::{Client, Closer, execute, execute_while};
+use cara_std::control::{Client, Closer, Role, execute, execute_while};
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
@@ -37,6 +37,8 @@ pub(crate) struct Operator {
     unit: Unit,
     /// How long nodes were waited for.
     waited: Option<Duration>,
+    /// What may be asked of a unit of this process; one of another process knows that itself.
+    role: Role,
 }
 
 enum Unit {
@@ -78,7 +80,7 @@ impl Way {
             Self::Socket(path) => Unit::Running(running::at(path, connect)?),
             Self::Own(system) => Unit::Own(system.clone()),
         };
-        Ok(Operator { unit, waited: None })
+        Ok(Operator { unit, waited: None, role: Role::Reset })
     }
 }
 
@@ -108,7 +110,7 @@ impl Operator {
         if global.act_as.is_none()
             && let Some(client) = running::choose(global, Client::connect_to_stop)?
         {
-            return Ok(Self { unit: Unit::Running(client), waited: None });
+            return Ok(Self { unit: Unit::Running(client), waited: None, role: Role::Reset });
         }
         Self::open(global, need)
     }
@@ -128,10 +130,10 @@ impl Operator {
     pub(crate) fn open_if_any(global: &Global, need: &Need) -> anyhow::Result<Option<Self>> {
         let Some(identity) = &global.act_as else {
             let client = running::choose(global, Client::connect)?;
-            return Ok(client.map(|client| Self { unit: Unit::Running(client), waited: None }));
+            return Ok(client.map(|client| Self { unit: Unit::Running(client), waited: None, role: Role::Reset }));
         };
         let system = own::start(identity, global)?;
-        let mut operator = Self { unit: Unit::Own(system), waited: None };
+        let mut operator = Self { unit: Unit::Own(system), waited: None, role: Role::Reset };
         own::wait_for(&mut operator, need, global.wait())?;
         operator.waited = Some(global.wait());
         Ok(Some(operator))
@@ -200,7 +202,7 @@ impl Operator {
 
     /// A second connection to the same unit, for questions that are answered at the same time.
     pub(crate) fn another(&self) -> anyhow::Result<Self> {
-        Ok(Self { waited: self.waited, ..self.way().open()? })
+        Ok(Self { waited: self.waited, role: self.role, ..self.way().open()? })
     }
 
     /// How the same unit is reached again, also by other threads and after its restart.
@@ -220,7 +222,14 @@ impl Operator {
         lives: &dyn Fn() -> Option<Instant>,
     ) -> anyhow::Result<()> {
         match &mut self.unit {
-            Unit::Own(system) => execute_while(system, question, each, lives),
+            Unit::Own(system) => match (self.role.permit(system, question), question) {
+                (Err(failure), _) => drop(each(Answer::Failed(failure))),
+                (Ok(()), Question::As { role, .. }) => {
+                    self.role = self.role.min(*role);
+                    let _ = each(Answer::Done);
+                }
+                (Ok(()), _) => execute_while(system, question, each, lives),
+            },
             Unit::Running(client) => running::pass_on(client, question, each)?,
         }
         Ok(())

@@ -8,7 +8,7 @@ use std::sync::{Arc, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes, to_bytes};
-use axum::extract::State;
+use axum::extract::{Extension, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use cara_std::control::protocol::{Answer, CallQuestion, Failure, Question};
@@ -22,7 +22,8 @@ use crate::limits::{BODY, CALLS, Place, RESETS};
 use crate::picture::Section;
 use crate::push::piecewise;
 use crate::server::Shared;
-use crate::{Beat, form};
+use crate::users::User;
+use crate::{Beat, Connection, form};
 
 /// A hold ends when its page has not said for so long that it is there.
 pub(crate) const ATTENDED: Duration = Duration::from_millis(1500);
@@ -38,9 +39,13 @@ const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 const LISTEN: Duration = Duration::from_secs(6);
 
 type Asked = State<Arc<Shared>>;
+/// Whose token the request has.
+type Of = Extension<Arc<User>>;
 
 /// A hold of a page.
 pub(crate) struct Hold {
+    /// Whose it is: nobody else's page keeps it.
+    user: Arc<User>,
     /// When the page last said that it is there.
     last: Instant,
     /// Passes that on to the manager, once it is asked.
@@ -48,7 +53,7 @@ pub(crate) struct Hold {
 }
 
 /// The functions of a node: `{"node": …}`.
-pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
+pub(crate) async fn functions(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
     let node = match read(body).await {
         Ok(asked) => asked["node"].as_str().unwrap_or_default().to_owned(),
         Err(refusal) => return refusal,
@@ -58,7 +63,7 @@ pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
     let own = shared.clone();
     let asked = spawn_blocking(move || {
         let mut lines = Vec::new();
-        ask(&own, false, &Question::Functions { node }, |line| {
+        ask(&own, &user, false, &Question::Functions { node }, |line| {
             lines.push(line);
             true
         });
@@ -68,7 +73,7 @@ pub(crate) async fn functions(State(shared): Asked, body: Body) -> Response {
 }
 
 /// A call, or with `"hold": true` one that is kept: until its end, or until the page is gone or says nothing more.
-pub(crate) async fn call(State(shared): Asked, body: Body) -> Response {
+pub(crate) async fn call(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
     let mut asked = match read(body).await {
         Ok(asked) => asked,
         Err(refusal) => return refusal,
@@ -80,10 +85,10 @@ pub(crate) async fn call(State(shared): Asked, body: Body) -> Response {
     };
     let Some(place) = Place::take(&shared.limits, |limits| &limits.calls) else { return busy("calls", CALLS) };
     let (to, answers) = mpsc::channel(ANSWERS);
-    let hold = is_held.then(|| shared.begin_hold());
+    let hold = is_held.then(|| shared.begin_hold(user.clone()));
     spawn_blocking(move || {
         let _place = place;
-        kept(&shared, question, hold, &to);
+        kept(&shared, &user, question, hold, &to);
         if let Some(hold) = hold {
             shared.holds().remove(&hold);
         }
@@ -92,12 +97,13 @@ pub(crate) async fn call(State(shared): Asked, body: Body) -> Response {
 }
 
 /// Asks, and gives up when the page is gone.
-fn kept(shared: &Arc<Shared>, question: CallQuestion, hold: Option<u64>, to: &mpsc::Sender<Bytes>) {
+fn kept(shared: &Arc<Shared>, user: &User, question: CallQuestion, hold: Option<u64>, to: &mpsc::Sender<Bytes>) {
     let reported = |line: &Value| to.blocking_send(piece(line)).is_ok();
     if !hold.is_none_or(|hold| reported(&json!({ "answer": "held", "hold": hold }))) {
         return;
     }
     let opened = shared.unit.connect(false).and_then(|mut way| {
+        act_for(&mut *way, user)?;
         if let Some(hold) = hold {
             let beat = way.beats()?;
             shared.holds().entry(hold).and_modify(|hold| hold.beat = Some(beat));
@@ -159,13 +165,13 @@ async fn attend(
 }
 
 /// `{"hold": …}`: its page is there. This alone renews what it holds.
-pub(crate) async fn beat(State(shared): Asked, body: Body) -> Response {
+pub(crate) async fn beat(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
     let asked = match read(body).await {
         Ok(asked) => asked,
         Err(refusal) => return refusal,
     };
     let mut holds = shared.holds();
-    match asked["hold"].as_u64().and_then(|hold| holds.get_mut(&hold)) {
+    match asked["hold"].as_u64().and_then(|hold| holds.get_mut(&hold)).filter(|hold| hold.user == user) {
         Some(hold) => {
             hold.last = Instant::now();
             hold.beat.iter().for_each(|beat| beat());
@@ -181,7 +187,7 @@ pub(crate) async fn ready(body: Body) -> Response {
 }
 
 /// `{"node": …}`, or null for all. It is carried out to its end, also where the page is gone.
-pub(crate) async fn stop(State(shared): Asked, body: Body) -> Response {
+pub(crate) async fn stop(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
     let node = match named(body).await {
         Ok(node) => node,
         Err(refusal) => return refusal,
@@ -197,14 +203,14 @@ pub(crate) async fn stop(State(shared): Asked, body: Body) -> Response {
         }
         spawn_blocking(move || {
             let _place = (turn, Place::take(&shared.limits, |limits| &limits.stops));
-            carry_out(&shared, &Question::Stop { node }, &to);
+            carry_out(&shared, &user, &Question::Stop { node }, &to);
         });
     });
     streamed(answers)
 }
 
 /// Likewise, but for the turn.
-pub(crate) async fn reset(State(shared): Asked, body: Body) -> Response {
+pub(crate) async fn reset(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
     let node = match named(body).await {
         Ok(node) => node,
         Err(refusal) => return refusal,
@@ -213,14 +219,14 @@ pub(crate) async fn reset(State(shared): Asked, body: Body) -> Response {
     let (to, answers) = mpsc::channel(STOP_ANSWERS);
     spawn_blocking(move || {
         let _place = place;
-        carry_out(&shared, &Question::Reset { node }, &to);
+        carry_out(&shared, &user, &Question::Reset { node }, &to);
     });
     streamed(answers)
 }
 
 /// The page may be gone, or read nothing: what it asked for goes on.
-fn carry_out(shared: &Shared, question: &Question, to: &mpsc::Sender<Bytes>) {
-    ask(shared, true, question, |line| {
+fn carry_out(shared: &Shared, user: &User, question: &Question, to: &mpsc::Sender<Bytes>) {
+    ask(shared, user, true, question, |line| {
         let _ = to.try_send(piece(&line));
         true
     });
@@ -262,8 +268,13 @@ pub(crate) async fn doctor(State(shared): Asked, body: Body) -> Response {
 }
 
 /// Asks, and passes on each answer as a line until that says `false`. The last one is the end.
-fn ask(shared: &Shared, for_a_stop: bool, question: &Question, mut each: impl FnMut(Value) -> bool) {
+fn ask(shared: &Shared, user: &User, for_a_stop: bool, question: &Question, mut each: impl FnMut(Value) -> bool) {
     let outcome = shared.unit.connect(for_a_stop).and_then(|mut way| {
+        let acts = act_for(&mut *way, user);
+        // A stop is carried out also by a manager that knows of no users.
+        if !matches!(question, Question::Stop { .. }) {
+            acts?;
+        }
         way.ask(question, &mut |answer| match each(shown(&answer)) {
             true => ControlFlow::Continue(()),
             false => ControlFlow::Break(()),
@@ -272,6 +283,22 @@ fn ask(shared: &Shared, for_a_stop: bool, question: &Question, mut each: impl Fn
     if let Err(error) = outcome {
         each(failed(&failure(&error)));
     }
+}
+
+/// The manager decides what the user may do, and notes the name. It is not told of the only one, who may do everything.
+fn act_for(way: &mut dyn Connection, user: &User) -> anyhow::Result<()> {
+    let Some(name) = user.name.clone() else { return Ok(()) };
+    let mut refused = None;
+    way.ask(&Question::As { name, role: user.role }, &mut |answer| {
+        if let Answer::Failed(failure) = answer {
+            refused = Some(failure);
+        }
+        ControlFlow::Continue(())
+    })?;
+    refused.map_or(Ok(()), |failure| {
+        let text = format!("the manager does not act for a user of this page: {failure}; is it older than `cara web`?");
+        Err(Ended::failed(failure.error, text))
+    })
 }
 
 /// An answer in the form of the page.
@@ -327,9 +354,9 @@ fn streamed(answers: mpsc::Receiver<Bytes>) -> Response {
 }
 
 impl Shared {
-    fn begin_hold(&self) -> u64 {
+    fn begin_hold(&self, user: Arc<User>) -> u64 {
         let hold = self.next_hold.fetch_add(1, Ordering::Relaxed);
-        self.holds().insert(hold, Hold { last: Instant::now(), beat: None });
+        self.holds().insert(hold, Hold { user, last: Instant::now(), beat: None });
         hold
     }
 

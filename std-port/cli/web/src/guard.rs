@@ -14,6 +14,7 @@ use axum::extract::{ConnectInfo, Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use cara_std::control::Role;
 use futures_core::Stream;
 use subtle::ConstantTimeEq;
 use tokio::time::{sleep, timeout};
@@ -21,6 +22,7 @@ use tokio::time::{sleep, timeout};
 use crate::limits::{BODY, Place};
 use crate::lines::{Asks, Caller};
 use crate::server::Shared;
+use crate::users::User;
 
 /// In each request that changes something: a form of another site cannot set it.
 pub(crate) const HEADER: &str = "x-cara";
@@ -46,7 +48,7 @@ const HEADERS: [(HeaderName, &str); 6] = [
 
 /// What requests are held against.
 pub(crate) struct Guard {
-    token: String,
+    users: Vec<Arc<User>>,
     scheme: &'static str,
     names: Vec<String>,
     /// Where browsers see the page: those of a proxy.
@@ -102,14 +104,16 @@ pub(crate) enum Refusal {
     Host,
     Origin,
     Token,
+    Role,
 }
 
 impl Guard {
-    pub(crate) fn new(token: String, has_tls: bool, names: &[String], outside: &[Outside]) -> Self {
+    pub(crate) fn new(users: Vec<User>, has_tls: bool, names: &[String], outside: &[Outside]) -> Self {
         let scheme = if has_tls { "https" } else { "http" };
         let names = names.iter().map(|name| name.to_ascii_lowercase());
         let names = names.chain(outside.iter().map(|outside| outside.host.clone())).collect();
-        Self { token, scheme, names, origins: outside.iter().map(|outside| outside.origin.clone()).collect() }
+        let users = users.into_iter().map(Arc::new).collect();
+        Self { users, scheme, names, origins: outside.iter().map(|outside| outside.origin.clone()).collect() }
     }
 
     /// Whether a request may pass. `for_data` is one that is not for the files of the page, which hold no secret.
@@ -122,7 +126,7 @@ impl Guard {
         if for_data && !self.is_from_here(method, headers, host) {
             return Err(Refusal::Origin);
         }
-        if for_data && !self.has_token(headers) {
+        if for_data && self.user(headers).is_none() {
             return Err(Refusal::Token);
         }
         Ok(())
@@ -149,11 +153,13 @@ impl Guard {
         origin.is_some_and(is_own) && headers.contains_key(HEADER) && site.is_none_or(|site| site == "same-origin")
     }
 
-    fn has_token(&self, headers: &HeaderMap) -> bool {
+    /// Who has the token. All are compared, so that the time says nothing about which one it is.
+    fn user(&self, headers: &HeaderMap) -> Option<Arc<User>> {
         let reported = text(headers, header::AUTHORIZATION)
             .and_then(|reported| reported.strip_prefix("Bearer "))
             .unwrap_or_default();
-        reported.as_bytes().ct_eq(self.token.as_bytes()).into()
+        let is = |user: &User| bool::from(reported.as_bytes().ct_eq(user.token.as_bytes()));
+        self.users.iter().fold(None, |found, user| if is(user) { Some(user) } else { found }).cloned()
     }
 }
 
@@ -165,13 +171,19 @@ fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
 pub(crate) async fn pass(
     State(shared): State<Arc<Shared>>,
     ConnectInfo(caller): ConnectInfo<Caller>,
-    request: Request,
+    mut request: Request,
     next: Next,
 ) -> Response {
     let asks = caller.asks();
     let path = request.uri().path();
     let (for_data, is_stop) = (path.starts_with("/api/"), path == "/api/stop");
     let checked = shared.guard.check(request.method(), request.headers(), for_data);
+    let user = shared.guard.user(request.headers()).filter(|_| for_data);
+    // All else is asked of the manager, which knows what it needs and writes down what it refuses.
+    let may_see = user.as_ref().is_none_or(|user| user.role >= Role::See);
+    let is_hidden = !may_see && (path == "/api/map" || path == "/api/doctor");
+    let checked = checked.and(if is_hidden { Err(Refusal::Role) } else { Ok(()) });
+    user.into_iter().for_each(|user| drop(request.extensions_mut().insert(user)));
     // A file is nothing that a connection is kept for.
     asks.proves(for_data && checked.is_ok());
     let mut place = None;
@@ -258,6 +270,9 @@ async fn refuse(shared: &Shared, refusal: Refusal) -> Response {
             sleep(WRONG_TOKEN).await;
             (StatusCode::UNAUTHORIZED, "the token is missing or wrong")
         }
+        Refusal::Role => {
+            (StatusCode::FORBIDDEN, "this needs the role `see`, and this token has `stop`: ask for another one")
+        }
     };
     (status, text).into_response()
 }
@@ -270,7 +285,7 @@ mod tests {
 
     fn guard() -> Guard {
         let outside: Outside = "https://Fleet.example/hall".parse().unwrap();
-        Guard::new(TOKEN.to_owned(), false, &["Depot.example".to_owned()], &[outside])
+        Guard::new(vec![User::only(TOKEN.to_owned())], false, &["Depot.example".to_owned()], &[outside])
     }
 
     fn headers(list: &[(&'static str, &str)]) -> HeaderMap {

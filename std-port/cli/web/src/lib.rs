@@ -19,6 +19,7 @@ mod server;
 mod start;
 #[cfg(test)]
 mod tests;
+mod users;
 mod watching;
 
 use std::net::SocketAddr;
@@ -44,7 +45,8 @@ pub struct Arguments {
     /// Where to listen; port 0 is a free one.
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8420")]
     listen: SocketAddr,
-    /// A file with the token that a page must know, instead of a key that is drawn. Only its owner may read it.
+    /// A file with the token that a page must know, instead of a key that is drawn; or with a line `ROLE NAME TOKEN` for each
+    /// user, whose role is stop, see, operate or reset. Only its owner may read it.
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
     /// The certificate for TLS, as PEM, with those of its issuers behind it.

@@ -5,9 +5,11 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::fmt::Write;
 use std::time::Instant;
 
+use cara_std::control::Role;
 use serde_json::{Value, json};
 
 use crate::limits::{EVENTS, Limits, STREAMS};
+use crate::users::User;
 
 /// Kinds of things that are told.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -188,12 +190,16 @@ impl Picture {
         self.change > seen.change
     }
 
-    /// What has changed since, as JSON, with the way to the manager in each. Notes that it is seen.
-    pub(crate) fn news(&self, seen: &mut Seen, limits: &Limits) -> String {
+    /// What has changed since, as JSON, with the way to the manager in each, and who is told. Notes that it is seen. Who may only
+    /// stop is told of what there is to stop.
+    pub(crate) fn news(&self, seen: &mut Seen, user: &User, limits: &Limits) -> String {
         let Link { up, answered, error } = &self.link;
         let link = json!({ "up": up, "answered": answered, "error": error });
-        let mut text = format!("{{\"now\":{},\"link\":{link}", self.now());
-        for (section, name) in SECTIONS {
+        let me = json!({ "name": user.name, "role": user.role });
+        let mut text = format!("{{\"now\":{},\"me\":{me},\"link\":{link}", self.now());
+        let may_see = user.role >= Role::See;
+        let is_told = |section| may_see || section == Section::Unit || section == Section::Nodes;
+        for (section, name) in SECTIONS.into_iter().filter(|(section, _)| is_told(*section)) {
             self.tables[section as usize].write(&mut text, name, seen.change);
         }
         let first = self.events.front().map_or(self.events_seen, |(number, _)| number - 1);
@@ -204,7 +210,7 @@ impl Picture {
         }
         let news = self.events.iter().filter(|(number, _)| *number > seen.events).map(|(_, event)| event.as_str());
         let news: Vec<&str> = news.collect();
-        if !news.is_empty() {
+        if may_see && !news.is_empty() {
             // Writing to a string cannot fail.
             let _ = write!(text, ",\"events\":[{}]", news.join(","));
         }
@@ -234,8 +240,12 @@ impl Table {
 mod tests {
     use super::*;
 
+    fn everything() -> User {
+        User::only(String::new())
+    }
+
     fn news(picture: &Picture, seen: &mut Seen) -> Value {
-        serde_json::from_str(&picture.news(seen, &Limits::new())).unwrap()
+        serde_json::from_str(&picture.news(seen, &everything(), &Limits::new())).unwrap()
     }
 
     #[test]
@@ -285,9 +295,9 @@ mod tests {
     fn events_are_kept_up_to_a_limit_and_those_passed_over_are_counted() {
         let (mut picture, mut seen, limits) = (Picture::new(), Seen::default(), Limits::new());
         picture.event(&json!(0));
-        picture.news(&mut seen, &limits);
+        picture.news(&mut seen, &everything(), &limits);
         (1..=EVENTS + 5).for_each(|number| assert!(picture.event(&json!(number)) <= EVENTS));
-        let reported: Value = serde_json::from_str(&picture.news(&mut seen, &limits)).unwrap();
+        let reported: Value = serde_json::from_str(&picture.news(&mut seen, &everything(), &limits)).unwrap();
         assert_eq!(reported["events"].as_array().unwrap().len(), EVENTS);
         assert_eq!(limits.json().as_array().unwrap()[7]["refused"], 5);
     }

@@ -7,7 +7,7 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
-use axum::extract::State;
+use axum::extract::{Extension, State};
 use axum::http::{HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use futures_core::Stream;
@@ -17,6 +17,7 @@ use tokio::time::{Instant, sleep};
 use crate::limits::{PAGES, Place};
 use crate::picture::Seen;
 use crate::server::Shared;
+use crate::users::User;
 
 /// Between two messages with news.
 const TICK: Duration = Duration::from_millis(100);
@@ -24,14 +25,14 @@ const TICK: Duration = Duration::from_millis(100);
 const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
 
 /// `GET /api/stream`.
-pub(crate) async fn stream(State(shared): State<Arc<Shared>>) -> Response {
+pub(crate) async fn stream(State(shared): State<Arc<Shared>>, Extension(user): Extension<Arc<User>>) -> Response {
     let Some(place) = Place::take(&shared.limits, |limits| &limits.pages) else {
         let text = format!("{PAGES} pages are open already, which is all that `cara web` serves: close one");
         return (StatusCode::SERVICE_UNAVAILABLE, text).into_response();
     };
     // One message waits at most: the next is made when that has been taken, of what is the newest then.
     let (to, messages) = mpsc::channel(1);
-    tokio::spawn(notify(shared, to, place));
+    tokio::spawn(notify(shared, user, to, place));
     piecewise("text/event-stream", messages)
 }
 
@@ -41,14 +42,14 @@ pub(crate) fn piecewise(kind: &'static str, pieces: mpsc::Receiver<Bytes>) -> Re
     (headers, Body::from_stream(Pieces(pieces))).into_response()
 }
 
-async fn notify(shared: Arc<Shared>, to: mpsc::Sender<Bytes>, _place: Place) {
+async fn notify(shared: Arc<Shared>, user: Arc<User>, to: mpsc::Sender<Bytes>, _place: Place) {
     let mut seen = Seen::default();
     let mut last: Option<Instant> = None;
     while let Ok(permit) = to.reserve().await {
         let is_due = last.is_none_or(|last| last.elapsed() >= SIGN_OF_LIFE);
         let news = {
             let picture = shared.picture();
-            (is_due || picture.has_news(seen)).then(|| picture.news(&mut seen, &shared.limits))
+            (is_due || picture.has_news(seen)).then(|| picture.news(&mut seen, &user, &shared.limits))
         };
         match news {
             Some(news) => {

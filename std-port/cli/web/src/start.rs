@@ -17,10 +17,9 @@ use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 
 use crate::Arguments;
 use crate::guard::{Guard, Outside};
-use crate::map;
+use crate::users::User;
+use crate::{map, users};
 
-/// Fewest characters of a token: fewer could be found by trying.
-const TOKEN_LEAST: usize = 16;
 /// Bytes of a key that is drawn.
 const DRAWN: usize = 16;
 /// Longest token, certificate and key, in bytes.
@@ -72,14 +71,14 @@ pub(crate) fn prepare(arguments: Arguments) -> anyhow::Result<Prepared> {
         (Some(cert), Some(key)) => Some(tls(cert, key)?),
         _ => None,
     };
-    let (token, drawn) = match token_file {
-        Some(file) => (token(&file)?, None),
+    let (users, drawn) = match token_file {
+        Some(file) => (users_of(&file)?, None),
         None => {
             let mut bytes = [0; DRAWN];
             getrandom::fill(&mut bytes)
                 .map_err(|error| anyhow::anyhow!("the system has no random numbers: {error}"))?;
             let key = hex::encode(bytes);
-            (key.clone(), Some(key))
+            (vec![User::only(key.clone())], Some(key))
         }
     };
     let map = background.map(|file| background_of(&file)).transpose()?;
@@ -88,7 +87,7 @@ pub(crate) fn prepare(arguments: Arguments) -> anyhow::Result<Prepared> {
     })?;
     listener.set_nonblocking(true)?;
     let address = listener.local_addr()?;
-    let guard = Guard::new(token, tls.is_some(), &host_name, &origin);
+    let guard = Guard::new(users, tls.is_some(), &host_name, &origin);
     Ok(Prepared { listener, tls, guard, map, address, drawn, outside: origin.into_iter().next() })
 }
 
@@ -112,18 +111,10 @@ fn bytes(path: &Path) -> anyhow::Result<Vec<u8>> {
     Ok(bytes.to_vec())
 }
 
-fn token(path: &Path) -> anyhow::Result<String> {
-    let text = String::from_utf8(bytes(path)?).unwrap_or_default();
-    let token = text.trim();
-    let is_plain = token.bytes().all(|byte| byte.is_ascii_graphic());
-    if token.len() < TOKEN_LEAST || !is_plain {
-        return Err(Ended::usage(format!(
-            "{} has no token: one line of at least {TOKEN_LEAST} letters and digits, as of `openssl rand -hex 32`",
-            path.display()
-        )));
-    }
+fn users_of(path: &Path) -> anyhow::Result<Vec<User>> {
+    let users = users::read(path, &String::from_utf8(bytes(path)?).unwrap_or_default())?;
     private_file(path)?;
-    Ok(token.to_owned())
+    Ok(users)
 }
 
 fn tls(cert: &Path, key: &Path) -> anyhow::Result<TlsAcceptor> {

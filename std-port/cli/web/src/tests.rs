@@ -10,6 +10,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use cara_std::control::Role;
 use cara_std::control::protocol::{Answer, Failure, Question};
 use serde_json::{Value, json};
 
@@ -25,6 +26,8 @@ struct Fake {
     asked: Mutex<Sender<Question>>,
     go: Arc<Mutex<Receiver<()>>>,
     is_gone: AtomicBool,
+    /// It knows no users.
+    is_old: Arc<AtomicBool>,
     beats: Arc<AtomicUsize>,
 }
 
@@ -32,6 +35,7 @@ struct Way {
     asked: Sender<Question>,
     go: Arc<Mutex<Receiver<()>>>,
     wanted: Arc<AtomicBool>,
+    is_old: Arc<AtomicBool>,
     beats: Arc<AtomicUsize>,
 }
 
@@ -39,7 +43,7 @@ impl Unit for Fake {
     fn connect(&self, _: bool) -> anyhow::Result<Box<dyn Connection>> {
         anyhow::ensure!(!self.is_gone.load(Ordering::Acquire), "no unit answers");
         let (asked, wanted) = (self.asked.lock().unwrap().clone(), Arc::new(AtomicBool::new(true)));
-        Ok(Box::new(Way { asked, go: self.go.clone(), wanted, beats: self.beats.clone() }))
+        Ok(Box::new(Way { asked, go: self.go.clone(), wanted, is_old: self.is_old.clone(), beats: self.beats.clone() }))
     }
 
     fn findings(&self, _: Duration) -> anyhow::Result<Value> {
@@ -87,6 +91,14 @@ impl Connection for Way {
                 }
                 let _ = each(called(None));
             }
+            Question::As { .. } => {
+                self.asked.send(question.clone())?;
+                if self.is_old.load(Ordering::Acquire) {
+                    let _ = each(Answer::Failed(Failure::configuration("BadQuestion", "the line is no question")));
+                    return Ok(());
+                }
+            }
+            Question::Reset { .. } => self.asked.send(question.clone())?,
             Question::Stop { .. } => {
                 self.asked.send(question.clone())?;
                 let _ = each(called(Some(Failure::configuration("NoStop", "it has none"))));
@@ -150,8 +162,8 @@ fn stage_with(change: impl FnOnce(Arguments, &std::path::Path) -> Arguments) -> 
     let address = prepared.listener.local_addr().unwrap();
     let ((asked, has_asked), (go, goes)) = (channel(), channel());
     let go_on = Arc::new(Mutex::new(goes));
-    let unit =
-        Arc::new(Fake { asked: Mutex::new(asked), go: go_on, is_gone: AtomicBool::new(false), beats: Arc::default() });
+    let (is_gone, is_old, beats) = (AtomicBool::new(false), Arc::default(), Arc::default());
+    let unit = Arc::new(Fake { asked: Mutex::new(asked), go: go_on, is_gone, is_old, beats });
     let own = unit.clone();
     std::thread::spawn(move || server::serve(prepared, own));
     Stage { address, asked: has_asked, go, unit, _folder: folder }
@@ -194,8 +206,12 @@ impl Stage {
     }
 
     /// Reads pushed messages until one of them fits.
-    fn follow(&self, mut fits: impl FnMut(&Value) -> bool) -> TcpStream {
-        let mut stream = self.send("GET", "/api/stream", &[], "");
+    fn follow(&self, fits: impl FnMut(&Value) -> bool) -> TcpStream {
+        self.follow_as(&format!("Bearer {TOKEN}"), fits)
+    }
+
+    fn follow_as(&self, bearer: &str, mut fits: impl FnMut(&Value) -> bool) -> TcpStream {
+        let mut stream = self.send("GET", "/api/stream", &[("authorization", bearer)], "");
         let (mut text, mut piece) = (Vec::new(), [0; 4096]);
         loop {
             let read = stream.read(&mut piece).unwrap();
@@ -277,6 +293,99 @@ fn other_sites_and_strangers_are_refused_and_counted() {
         };
         (refused("host name"), refused("another site"), refused("token")) == (1, 4, 5)
     });
+}
+
+const USERS: &str = "stop gate 0123456789abcdef-gate\nsee lobby 0123456789abcdef-lobby\n\
+                     operate anna 0123456789abcdef-anna\nreset bert 0123456789abcdef-bert\n";
+
+fn stage_of_users() -> Stage {
+    stage_with(|arguments, folder| Arguments { token_file: Some(secret(folder, "users", USERS)), ..arguments })
+}
+
+fn of(name: &str) -> String {
+    format!("Bearer 0123456789abcdef-{name}")
+}
+
+/// The manager decides, by `Role::permit`; what it is not asked, the server decides.
+#[test]
+fn the_manager_is_told_who_asks_and_every_user_may_stop() {
+    let stage = stage_of_users();
+    let users = [("gate", Role::Stop), ("lobby", Role::See), ("anna", Role::Operate), ("bert", Role::Reset)];
+    for (name, role) in users {
+        let bearer = of(name);
+        let post = |path: &str, body: &Value| {
+            let answer = stage.answer("POST", path, &[("authorization", &bearer)], &body.to_string());
+            assert!(starts(&answer, 200), "{name} {path}: {answer}");
+        };
+        let asked = || stage.asked.recv_timeout(PATIENCE).unwrap();
+        let is_told = || assert_eq!(asked(), Question::As { name: name.to_owned(), role });
+        post("/api/stop", &json!({ "node": null }));
+        is_told();
+        assert!(matches!(asked(), Question::Stop { node: None }));
+        post("/api/reset", &json!({ "node": "agv/1" }));
+        is_told();
+        assert!(matches!(asked(), Question::Reset { .. }));
+        post("/api/call", &call("f", false));
+        is_told();
+        assert!(matches!(asked(), Question::Call(_)));
+        post("/api/call", &call("f", true));
+        is_told();
+        assert!(matches!(asked(), Question::Hold(_)));
+        post("/api/functions", &json!({ "node": "agv/1" }));
+        is_told();
+        let ready = stage.answer("POST", "/api/ready", &[("authorization", &bearer)], "{}");
+        assert!(starts(&ready, 204), "{name}: {ready}");
+        let status = if role == Role::Stop { 403 } else { 200 };
+        for (method, path) in [("GET", "/api/map"), ("POST", "/api/doctor")] {
+            let answer = stage.answer(method, path, &[("authorization", &bearer)], "{}");
+            assert!(starts(&answer, status), "{name} {path}: {answer}");
+        }
+    }
+    let stranger = stage.answer("POST", "/api/stop", &[], "{\"node\":null}");
+    assert!(starts(&stranger, 401) && stage.asked.try_recv().is_err(), "the only token of other tests: {stranger}");
+}
+
+#[test]
+fn a_page_is_told_its_role_and_what_that_sees() {
+    let stage = stage_of_users();
+    let told = |name: &str, fits: &dyn Fn(&Value) -> bool| drop(stage.follow_as(&of(name), fits));
+    told("lobby", &|message| {
+        assert_eq!(message["me"], json!({ "name": "lobby", "role": "see" }));
+        !message["values"]["rows"]["1"].is_null()
+    });
+    told("gate", &|message| {
+        let seen =
+            message.as_object().unwrap().keys().all(|key| ["now", "me", "link", "unit", "nodes"].contains(&&**key));
+        assert!(seen, "{message}");
+        message["nodes"]["rows"]["agv/1@s_unit"]["connected"] == true
+    });
+}
+
+#[test]
+fn nobody_elses_page_keeps_a_hold() {
+    let stage = stage_of_users();
+    let _held = stage.send("POST", "/api/call", &[("authorization", &of("anna"))], &call("wait", true).to_string());
+    while !matches!(stage.asked.recv_timeout(PATIENCE), Ok(Question::Hold(_))) {}
+    let beat = |name: &str| stage.answer("POST", "/api/beat", &[("authorization", &of(name))], "{\"hold\":1}");
+    assert!(starts(&beat("bert"), 410));
+    assert_eq!(stage.unit.beats.load(Ordering::Acquire), 0);
+    assert!(starts(&beat("anna"), 204) || starts(&beat("anna"), 410), "unless this host was too slow");
+}
+
+#[test]
+fn a_manager_that_knows_no_users_is_stopped_and_asked_nothing_else() {
+    let stage = stage_of_users();
+    stage.unit.is_old.store(true, Ordering::Release);
+    let bearer = of("bert");
+    let post = |path: &str, body: Value| stage.answer("POST", path, &[("authorization", &bearer)], &body.to_string());
+    for (path, body) in [("/api/call", call("f", false)), ("/api/reset", json!({ "node": null }))] {
+        let refused = post(path, body);
+        assert!(refused.contains("older than `cara web`"), "{refused}");
+    }
+    assert!(post("/api/stop", json!({ "node": null })).contains("called"));
+    let asked: Vec<_> = std::iter::from_fn(|| stage.asked.try_recv().ok()).collect();
+    let changes = asked.iter().filter(|question| !matches!(question, Question::As { .. }));
+    assert!(matches!(changes.collect::<Vec<_>>()[..], [Question::Stop { .. }]), "{asked:?}");
 }
 
 /// With what a stop needs, and without doing anything.
@@ -476,7 +585,10 @@ fn files_that_cannot_be_used_are_told() {
     let with = |token: &'static str| {
         refused(move |folder| Arguments { token_file: Some(secret(folder, "token", token)), ..arguments() })
     };
-    assert!(with("short").contains("at least 16") && with("with a space in it 0123456789").contains("has no token"));
+    assert!(
+        with("short").contains("at least 16")
+            && with("with a space in it 0123456789").contains("token:1: this is no role")
+    );
     let readable = refused(|folder| {
         let file = secret(folder, "token", TOKEN);
         std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o640)).unwrap();

@@ -3,6 +3,7 @@
 
 import { $, make, span, text } from "./dom.js";
 import { ask, beat } from "./api.js";
+import { may, state } from "./state.js";
 
 // A page that holds says so four times in the length of the lease, and often enough for the server, which gives up after 1.5 s.
 // Nothing else renews it.
@@ -60,9 +61,12 @@ function form(node, info) {
   const options = optionsOf(info);
   const outcome = make("p", { className: "outcome", role: "status", hidden: true });
   const call = make("button", { type: "submit", className: "primary" }, `Call ${info.name}`);
+  const needed = info.reset ? "reset" : info.stop && !info.lease_us ? "stop" : "operate";
+  call.disabled = !may(needed);
+  const refusal = call.disabled && make("p", { className: "faint" }, `Your role, ${state.me.role}, may not call this: it needs ${needed}.`);
   const running = { abort: null };
   const made = make("form", { noValidate: true, autocomplete: "off" }, make("p", { className: "faint code" }, info.signature),
-    info.help ? make("p", { className: "help" }, info.help) : null, ...fields.map((one) => one.element), options.element, call, outcome);
+    info.help ? make("p", { className: "help" }, info.help) : null, ...fields.map((one) => one.element), options.element, call, refusal, outcome);
   made.addEventListener("submit", (event) => {
     event.preventDefault();
     if (running.abort) return running.abort.abort();

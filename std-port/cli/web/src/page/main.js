@@ -7,7 +7,7 @@ import * as charts from "./charts.js";
 import * as map from "./map.js";
 import * as nodes from "./nodes.js";
 import * as stop from "./stop.js";
-import { state, take, trouble } from "./state.js";
+import { may, ROLES, state, take, trouble } from "./state.js";
 
 // Between two attempts to reach the server again.
 const RETRY = 1000;
@@ -108,6 +108,9 @@ function drawLink() {
   stop.note(wrong);
   flag($("link"), "bad", wrong);
   flag($("link"), "good", !wrong && state.heard !== null);
+  $("me").hidden = !state.me?.name;
+  if (state.me?.name) text($("me"), `${state.me.name} ${ROLES[state.me.role] ?? state.me.role}`);
+  $("doctor").disabled = doctorLooks || !may("see");
   const unit = state.unit[""];
   if (unit) {
     text($("unit"), `${unit.name}/${unit.id}`);
@@ -152,9 +155,9 @@ function keyboard(event) {
   }
 }
 
+let doctorLooks = false;
 async function doctor() {
-  const button = $("doctor");
-  button.disabled = true;
+  doctorLooks = $("doctor").disabled = true;
   text($("doctor-about"), "listens for 6 s …");
   try {
     for await (const line of api.ask("api/doctor", {})) {
@@ -163,7 +166,7 @@ async function doctor() {
   } catch (error) {
     text($("doctor-about"), `not reached: ${error.message}`);
   }
-  button.disabled = false;
+  doctorLooks = false;
 }
 
 api.token();

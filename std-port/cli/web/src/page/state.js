@@ -5,7 +5,14 @@ export const state = {
   events: [], link: null, chosen: null,
   // When the last message came, by the page's clock, and the server's clock then.
   heard: null, server: 0,
+  // Whose token this page has: a name, or none, and a role.
+  me: null,
 };
+
+// What each role may do; each may do what those before it may.
+export const ROLES = { stop: "may stop", see: "may look and stop", operate: "may command and stop, not reset", reset: "may do everything" };
+const RANKS = Object.keys(ROLES);
+export const may = (role) => RANKS.indexOf(state.me?.role ?? "reset") >= RANKS.indexOf(role);
 
 const KEPT = 200;
 // Nothing for so long is a loss: the server says something each second, and looks twice a second.
@@ -18,6 +25,7 @@ export function take(message) {
   state.heard = performance.now();
   state.server = message.now;
   state.link = message.link;
+  state.me = message.me;
   for (const name of Object.keys(message)) {
     const table = message[name];
     if (table?.rows) {

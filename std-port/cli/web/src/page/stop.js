@@ -3,7 +3,7 @@
 import { $, flag, make, span, text } from "./dom.js";
 import { ask } from "./api.js";
 import { failure } from "./forms.js";
-import { nodes, state } from "./state.js";
+import { may, nodes, state } from "./state.js";
 
 // A vehicle that has not acknowledged by then is shown as such, though its answer may still come.
 const LATE = 1000;
@@ -26,7 +26,7 @@ export async function prepare() {
     refused = error;
   }
   isReady = refused === null;
-  for (const button of ["stop-all", "reset-all"]) $(button).disabled = !isReady;
+  $("stop-all").disabled = !isReady;
   return isReady;
 }
 
@@ -37,6 +37,11 @@ export function refusal() {
 }
 
 export function note(isCutOff) {
+  // Every role stops.
+  const title = may("reset") ? "" : `needs the role reset; yours is ${state.me.role}`;
+  $("reset-all").disabled = !isReady || !may("reset");
+  $("node-reset").disabled = !may("reset");
+  for (const button of ["reset-all", "node-reset"]) if ($(button).title !== title) $(button).title = title;
   const started = isReady ? "" : "this page has not started";
   text($("stop-note"), refused ? "refused by the server" : isCutOff ? "no connection" : started);
 }
