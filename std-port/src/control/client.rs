@@ -41,6 +41,8 @@ pub enum UnitState {
     Answers,
     /// It runs and has no free connection; its refusal.
     Full(String),
+    /// It does not let this user in; why.
+    Refuses(String),
     /// It holds its socket and does not answer: the process hangs or is stopped.
     Silent,
 }
@@ -58,6 +60,9 @@ impl RunningUnit {
         match &self.state {
             UnitState::Answers => None,
             UnitState::Full(text) => Some(ControlError::Full { unit, text: text.clone() }),
+            UnitState::Refuses(reason) => {
+                Some(ControlError::NotAllowed { path: self.path.clone(), reason: reason.clone() })
+            }
             UnitState::Silent => Some(ControlError::Silent { unit, path: self.path.clone() }),
         }
     }
@@ -92,7 +97,7 @@ pub enum ControlError {
     /// Several units answer.
     #[error("several managers run here: name one of {}", list(.0))]
     Several(Vec<RunningUnit>),
-    /// The socket is not this user's.
+    /// The socket is not this user's, who is none of its operators.
     #[error("{path}: {reason}")]
     NotAllowed {
         /// The socket or its directory.
@@ -207,6 +212,7 @@ fn look(path: &Path) -> Option<RunningUnit> {
     match Client::connect(path) {
         Ok(client) => Some(client.unit),
         Err(ControlError::Full { text, .. }) => Some(RunningUnit::unasked(path, UnitState::Full(text))),
+        Err(ControlError::NotAllowed { reason, .. }) => Some(RunningUnit::unasked(path, UnitState::Refuses(reason))),
         Err(ControlError::Silent { .. }) => Some(RunningUnit::unasked(path, UnitState::Silent)),
         Err(_) => None,
     }
@@ -412,6 +418,9 @@ fn refused(path: &Path, error: ControlError) -> ControlError {
     let unit = location::reported_by_name(path).0;
     match error {
         ControlError::Failed(failure) if failure.error == FULL => ControlError::Full { unit, text: failure.text },
+        ControlError::Failed(failure) if failure.error == "NotAllowed" => {
+            ControlError::NotAllowed { path: path.to_owned(), reason: failure.text }
+        }
         ControlError::Broken(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
             ControlError::Silent { unit, path: path.to_owned() }
         }

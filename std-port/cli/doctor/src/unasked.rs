@@ -23,7 +23,7 @@ fn finding(seen: &Evidence, which: Option<&Which>, unit: &RunningUnit) -> Option
     let (name, path) = (&unit.unit, unit.path.display());
     let meant = which.is_some_and(|which| which.is_text(name));
     match &unit.state {
-        UnitState::Answers => None,
+        UnitState::Answers | UnitState::Refuses(_) => None,
         UnitState::Silent => {
             let found = format!(
                 "{name} runs on this host (control socket {path}) and does not answer: its process hangs or is stopped"

@@ -12,7 +12,8 @@ const USER: u32 = 4711;
 #[test]
 fn another_user_looks_and_stops_and_is_told_what_else_needs() {
     let mut stage = Stage::empty();
-    let (socket, audit) = (stage.control().join("manager.sock"), stage.control().join("audit"));
+    let socket = stage.control().join(format!("manager-1-{}.sock", stage.fleet));
+    let audit = stage.control().join("audit");
     fs::set_permissions(stage.control(), fs::Permissions::from_mode(0o750)).unwrap();
     if chown(stage.control(), None, Some(USER)).is_err() {
         println!("skipped: only root can be other users");
@@ -22,6 +23,7 @@ fn another_user_looks_and_stops_and_is_told_what_else_needs() {
     let (fleet, operators) = (stage.fleet, format!("operators = {{ {USER} = \"see\" }}"));
     let control = format!("[control]\npath = {socket:?}\naudit = {audit:?}\n{operators}\n");
     fs::write(&file, format!("name = \"manager\"\nid = 1\nfleet = {fleet}\n{control}")).unwrap();
+    stage.know("agv", 7);
     stage.start_manager_with(&[file.to_str().unwrap()]);
     stage.start_agv("agv", 7);
     until("the AGV is there", || stage.ready() == 1);
@@ -39,11 +41,11 @@ fn another_user_looks_and_stops_and_is_told_what_else_needs() {
     let call = asked(&["call", "agv", "echo(text: \"hello\")"]);
     assert_eq!(call.code, 1);
     call.says("needs the role `operate`, and you have `see`");
-    let reset = asked(&["reset", "--socket", socket.to_str().unwrap(), "--json"]);
+    let reset = asked(&["reset", "agv", "--json"]);
     assert_eq!((reset.code, &reset.error()["name"]), (1, &"NotAllowed".into()));
     asked(&["stop", "agv"]).says("published no function that stops");
-    let stranger = asked_by(USER + 1, &["stop"]).unwrap();
-    assert_ne!(stranger.code, 0);
+    let stranger = asked_by(USER + 1, &["stop", "agv"]).unwrap();
+    assert_eq!(stranger.code, 3);
     stranger.says("have yours added");
     let noted = || fs::read_to_string(&audit).unwrap();
     until("it is noted", || noted().contains("NoStop"));
