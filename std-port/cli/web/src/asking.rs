@@ -23,7 +23,7 @@ use crate::picture::Section;
 use crate::push::piecewise;
 use crate::server::Shared;
 use crate::users::User;
-use crate::{Beat, Connection, form};
+use crate::{Beat, Connection, form, guard};
 
 /// A hold ends when its page has not said for so long that it is there.
 pub(crate) const ATTENDED: Duration = Duration::from_millis(1500);
@@ -246,7 +246,10 @@ async fn named(body: Body) -> Result<Option<String>, Response> {
 }
 
 /// Has the doctor look, and tells all pages what it found.
-pub(crate) async fn doctor(State(shared): Asked, body: Body) -> Response {
+pub(crate) async fn doctor(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
+    if let Some(refusal) = guard::unseen(&user) {
+        return refusal;
+    }
     if let Err(refusal) = read(body).await {
         return refusal;
     }

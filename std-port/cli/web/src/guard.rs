@@ -104,7 +104,6 @@ pub(crate) enum Refusal {
     Host,
     Origin,
     Token,
-    Role,
 }
 
 impl Guard {
@@ -178,11 +177,7 @@ pub(crate) async fn pass(
     let path = request.uri().path();
     let (for_data, is_stop) = (path.starts_with("/api/"), path == "/api/stop");
     let checked = shared.guard.check(request.method(), request.headers(), for_data);
-    let user = shared.guard.user(request.headers()).filter(|_| for_data);
-    // All else is asked of the manager, which knows what it needs and writes down what it refuses.
-    let may_see = user.as_ref().is_none_or(|user| user.role >= Role::See);
-    let is_hidden = !may_see && (path == "/api/map" || path == "/api/doctor");
-    let checked = checked.and(if is_hidden { Err(Refusal::Role) } else { Ok(()) });
+    let user = shared.guard.user(request.headers());
     user.into_iter().for_each(|user| drop(request.extensions_mut().insert(user)));
     // A file is nothing that a connection is kept for.
     asks.proves(for_data && checked.is_ok());
@@ -249,6 +244,12 @@ impl Stream for Answer {
     }
 }
 
+/// The answer to a user who sees nothing, where the manager is not asked: all else it decides and writes down itself.
+pub(crate) fn unseen(user: &User) -> Option<Response> {
+    let text = "this needs the role `see`, and this token has `stop`: ask for another one";
+    (user.role < Role::See).then(|| (StatusCode::FORBIDDEN, text).into_response())
+}
+
 async fn refuse(shared: &Shared, refusal: Refusal) -> Response {
     let (status, text) = match refusal {
         Refusal::Host => {
@@ -269,9 +270,6 @@ async fn refuse(shared: &Shared, refusal: Refusal) -> Response {
             shared.limits.tokens.refuse();
             sleep(WRONG_TOKEN).await;
             (StatusCode::UNAUTHORIZED, "the token is missing or wrong")
-        }
-        Refusal::Role => {
-            (StatusCode::FORBIDDEN, "this needs the role `see`, and this token has `stop`: ask for another one")
         }
     };
     (status, text).into_response()

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
 
-use axum::extract::State;
+use axum::extract::{Extension, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
@@ -19,6 +19,7 @@ use crate::limits::{Limits, STOPS_OF_ALL, STOPS_OF_ONE};
 use crate::lines::Caller;
 use crate::picture::Picture;
 use crate::start::Prepared;
+use crate::users::User;
 use crate::{Unit, asking, map, page, push, watching};
 
 /// What all requests share.
@@ -87,7 +88,10 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
 }
 
 /// The map, or null.
-async fn background(State(shared): State<Arc<Shared>>) -> Response {
+async fn background(State(shared): State<Arc<Shared>>, Extension(user): Extension<Arc<User>>) -> Response {
+    if let Some(refusal) = guard::unseen(&user) {
+        return refusal;
+    }
     let map = shared.map.as_ref().map_or(serde_json::Value::Null, map::json);
     ([(header::CONTENT_TYPE, "application/json")], map.to_string()).into_response()
 }

@@ -27,6 +27,7 @@ export async function prepare() {
   }
   isReady = refused === null;
   $("stop-all").disabled = !isReady;
+  $("reset-all").disabled = !isReady || !may("reset");
   return isReady;
 }
 
