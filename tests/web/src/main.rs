@@ -58,6 +58,7 @@ fn main() -> Result<()> {
         stop(&browser).await?;
         crowd(&browser, &url).await?;
         let (_, key) = url.split_once('#').context("the address has a key")?;
+        roles(&browser, &stage).await?;
         proxy::stop(&browser, &stage, key).await?;
         browser.open("about:blank").await?;
         browser.open(&url).await?;
@@ -313,6 +314,29 @@ async fn values(browser: &Browser, stage: &mut Stage) -> Result<()> {
     browser.click(&format!("{form} button.primary")).await?;
     let shown = format!("document.querySelector('{form} .outcome').innerText.replace(/\\s/g, '')");
     browser.wait("the box has got each digit", &format!("{shown}.startsWith('l={load}')")).await?;
+    browser.check_faults().await
+}
+
+/// A user who may look: what else the page could do is disabled, but for a stop.
+async fn roles(browser: &Browser, stage: &Stage) -> Result<()> {
+    let (_web, url) = stage.start_web_for("see lobby 0123456789abcdef\n")?;
+    browser.open(&format!("{url}#0123456789abcdef")).await?;
+    browser.says("#me", "lobby may look and stop").await?;
+    browser.says("#nodes", "agv-1/11").await?;
+    browser.click("#nodes tr:first-child button").await?;
+    browser.says("#functions summary", "go_to").await?;
+    let form = open(browser, "go_to").await?;
+    browser.says(&form, "Your role, see, may not call this: it needs operate.").await?;
+    browser.says(&format!("{form} button.primary:disabled"), "Call go_to").await?;
+    browser
+        .wait(
+            "nor reset",
+            "document.querySelector('#reset-all:disabled') && document.querySelector('#node-reset:disabled')",
+        )
+        .await?;
+    browser.wait("a stop can be asked for", "document.querySelector('#stop-all:enabled')").await?;
+    browser.click("#stop-all").await?;
+    browser.says("#stop-summary", &format!("{0} of {0} acknowledged", AGVS.len())).await?;
     browser.check_faults().await
 }
 

@@ -118,6 +118,18 @@ impl Stage {
         Ok(format!("http://{listen}/#{key}"))
     }
 
+    /// Another server of the page, for these users; it ends when it is dropped.
+    pub(crate) fn start_web_for(&self, users: &str) -> Result<(Process, String)> {
+        let file = self.folder.path().join("users");
+        std::fs::write(&file, users)?;
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o600))?;
+        let file = file.display().to_string();
+        let mut web = self.process("users", "cara", &["web", "--listen", "127.0.0.1:0", "--token-file", &file])?;
+        let line = web.expect("the page is at ", PATIENCE)?.text;
+        let url = line.rsplit_once(' ').context("it names an address")?.1.to_owned();
+        Ok((web, url))
+    }
+
     /// A node with a record in its signature, which it echoes.
     pub(crate) fn start_box(&mut self) -> Result<()> {
         self.keys.add(&["box/20"])?;
