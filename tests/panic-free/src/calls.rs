@@ -79,7 +79,12 @@ fn known(failed: &CallError<(), Option<Detail>>) {
 
 entry!(calls_made, {
     let call = call().timeout(*unknown::<Duration>()).priority(*unknown()).renewing(*unknown());
-    let call = call.take_over().best_effort().cancelled_by(unknown()).answer_within(*unknown::<Duration>());
+    let call = call
+        .take_over()
+        .only_while_leading()
+        .best_effort()
+        .cancelled_by(unknown())
+        .answer_within(*unknown::<Duration>());
     if let Err(failed) = call.send() {
         known(&failed);
     }

@@ -87,7 +87,13 @@ entry!(link_counters, {
 entry!(liveness, {
     let mut liveness = Liveness::new(*unknown(), *unknown());
     liveness.heard(*unknown());
-    keep((liveness.hears(), liveness.is_heard(), liveness.is_deaf(), liveness.stream_silent_for(*unknown())));
+    keep((
+        liveness.hears(),
+        liveness.is_heard(),
+        liveness.is_silent(),
+        liveness.is_deaf(),
+        liveness.stream_silent_for(*unknown()),
+    ));
     keep((liveness.deadline(), liveness.poll(*unknown(), *unknown())));
 });
 

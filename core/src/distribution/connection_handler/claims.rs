@@ -82,8 +82,8 @@ enum Keeping {
 struct Obeyed {
     tagged: TaggedClaim,
     keeping: Keeping,
-    /// When that manager was last heard, at the latest; `None` while it is connected and misses no keep-alive.
-    heard: Option<Instant>,
+    /// When that manager was last heard, at the latest; the far future while it is connected and misses no keep-alive.
+    heard: Instant,
 }
 
 impl Obeyed {
@@ -244,7 +244,7 @@ impl<P: Port> Node<P> {
 
     /// A claim of this manager was obeyed and stored in an earlier life.
     pub fn keep_obeyed(&mut self, now: Instant, manager: &Identity, tagged: TaggedClaim) {
-        let obeyed = Obeyed { tagged, keeping: Keeping::Kept, heard: Some(now) };
+        let obeyed = Obeyed { tagged, keeping: Keeping::Kept, heard: now };
         if self.claims.obeyed.push((manager.clone(), obeyed)).is_err() {
             self.counters.count(NodeCounter::ClaimsNotKept);
         }
@@ -309,7 +309,7 @@ impl<P: Port> Node<P> {
     /// What this unit tells a manager of the claims of that one's identity.
     pub(crate) fn obeyed_report(&self, now: Instant, manager: &Identity) -> Option<ClaimReport> {
         let obeyed = self.claims.of(manager)?;
-        let since = obeyed.heard.map_or(0, |heard| millis(now.since(heard)));
+        let since = millis(now.since(obeyed.heard));
         Some(ClaimReport { tagged: obeyed.tagged, since })
     }
 
@@ -353,12 +353,12 @@ impl<P: Port> Node<P> {
             Some(obeyed) if tagged.claim < obeyed.tagged.claim => {}
             Some(obeyed) if tagged.claim == obeyed.tagged.claim => {
                 // Its tag is another one where the manager's keys are.
-                (obeyed.tagged, obeyed.heard) = (tagged, None);
+                (obeyed.tagged, obeyed.heard) = (tagged, Instant::FAR_FUTURE);
                 obeyed.look_again();
             }
-            Some(obeyed) => *obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: None },
+            Some(obeyed) => *obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: Instant::FAR_FUTURE },
             None => {
-                let obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: None };
+                let obeyed = Obeyed { tagged, keeping: Keeping::Unasked, heard: Instant::FAR_FUTURE };
                 if self.claims.obeyed.push((manager.clone(), obeyed)).is_err() {
                     self.counters.count(NodeCounter::ClaimsNotKept);
                 }
@@ -378,8 +378,8 @@ impl<P: Port> Node<P> {
         self.obey(manager, Some(claim));
     }
 
-    /// A connected manager misses keep-alives and was last heard at `heard`, or is heard again.
-    pub(crate) fn manager_heard(&mut self, heard: Option<Instant>, manager: &Identity) {
+    /// A connected manager misses keep-alives and was last heard at `heard`; in the far future, it is heard again.
+    pub(crate) fn manager_heard(&mut self, heard: Instant, manager: &Identity) {
         if let Some(obeyed) = self.claims.of_mut(manager) {
             obeyed.heard = heard;
         }
@@ -388,7 +388,7 @@ impl<P: Port> Node<P> {
     /// The link of a manager has ended.
     pub(super) fn manager_left(&mut self, now: Instant, manager: &Identity) {
         if let Some(obeyed) = self.claims.of_mut(manager) {
-            obeyed.heard.get_or_insert(now);
+            obeyed.heard = obeyed.heard.min(now);
         }
     }
 

@@ -68,7 +68,7 @@ impl Obedience {
         if core::mem::replace(&mut self.is_silent, is_silent) != is_silent
             && let Some(remote) = &wire.remote
         {
-            let heard = is_silent.then(|| cx.now - wire.liveness.silent_for(cx.now));
+            let heard = if is_silent { cx.now - wire.liveness.silent_for(cx.now) } else { Instant::FAR_FUTURE };
             cx.hub.enter(&mut |hub| hub.node.manager_heard(heard, &remote.hello.identity));
         }
     }
