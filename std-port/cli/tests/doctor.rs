@@ -291,10 +291,10 @@ fn without_a_name_all_that_is_strange_is_listed() {
 }
 
 #[test]
-fn a_directory_of_sockets_that_others_can_enter_is_told() {
+fn a_directory_of_sockets_that_others_can_write_to_is_told() {
     let clinic = Clinic::new();
     let _manager = clinic.manager("boss", 64);
-    clinic.open_sockets_to_others();
+    clinic.let_others_write_sockets();
     clinic.doctor(&["agv", "--listen", "3s"]).is(&["ask-its-manager", "control-refused"], 4);
 }
 

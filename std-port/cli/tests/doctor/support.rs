@@ -150,8 +150,8 @@ impl Clinic {
     }
 
     /// From then on no unit can be asked.
-    pub(crate) fn open_sockets_to_others(&self) {
-        std::fs::set_permissions(self.sockets.path(), Permissions::from_mode(0o755)).unwrap();
+    pub(crate) fn let_others_write_sockets(&self) {
+        std::fs::set_permissions(self.sockets.path(), Permissions::from_mode(0o722)).unwrap();
     }
 
     /// Exit code, standard output and standard error.
