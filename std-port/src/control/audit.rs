@@ -12,6 +12,7 @@
 //! | `node` | of which node, as far as it is known |
 //! | `outcome` | `ok`, the error's name, or `gone` where the asking ended before the answer; of what was held, how it ended: `ended`, `expired`, `released` by its client, an error; `stopped` where the unit itself was stopped first |
 
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -30,7 +31,7 @@ use serde_json::{Value, json};
 use super::failure::name_of;
 use super::location::own_uid;
 use super::protocol::{Answer, CallQuestion, Failure, Question};
-use super::role::{Role, name_of_user};
+use super::role::{Role, names_of_users};
 use crate::LineQueue;
 use crate::seldom::warn_seldom;
 
@@ -39,6 +40,9 @@ const LONGEST: u64 = 4 * 1024 * 1024;
 
 /// Of the name for whom a client acts.
 const LONGEST_NAME: usize = 64;
+
+/// Of what a client wrote, in bytes.
+const LONGEST_TEXT: usize = 256;
 
 /// The log's end of the queue. Whoever notes something watches a client, moves or stops something: none of them waits for a
 /// disk.
@@ -125,6 +129,9 @@ fn entry(origin: &str, who: &Who, line: &Line<'_>) -> Value {
     let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let Who { uid, pid, program, name, role } = who;
     let Line { ask, function, take_over, node, outcome } = line;
+    // What a client wrote may be as long as a line of its own: it would push what was logged before out of the file.
+    let [function, node] =
+        [function, node].map(|text| text.map(|text| &text[..text.floor_char_boundary(LONGEST_TEXT)]));
     json!({
         "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "name": name, "role": role,
         "ask": ask,
@@ -161,12 +168,13 @@ pub(super) struct Who {
 }
 
 impl Who {
-    pub(super) fn of(stream: &UnixStream, role: Role) -> io::Result<Self> {
+    /// Reads no file of a disk, which may hang: names were read before.
+    pub(super) fn of(stream: &UnixStream, role: Role, names: &BTreeMap<u32, String>) -> io::Result<Self> {
         let credentials = socket_peercred(stream.as_fd())?;
         let (uid, pid) = (credentials.uid.as_raw(), credentials.pid.as_raw_nonzero().get());
         let program = std::fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-        let (program, name) = (program.trim_end().to_owned(), name_of_user(uid));
-        Ok(Self { uid, pid, program, name, role: Some(role) })
+        let program = program.trim_end().to_owned();
+        Ok(Self { uid, pid, program, name: names.get(&uid).cloned(), role: Some(role) })
     }
 
     pub(super) fn role(&self) -> Role {
@@ -192,7 +200,7 @@ impl Who {
     fn own() -> Self {
         let (uid, pid) = (getuid().as_raw(), getpid().as_raw_nonzero().get());
         let program = std::fs::read_to_string("/proc/self/comm").unwrap_or_default();
-        Self { uid, pid, program: program.trim_end().to_owned(), name: name_of_user(uid), role: None }
+        Self { uid, pid, program: program.trim_end().to_owned(), name: names_of_users().remove(&uid), role: None }
     }
 }
 

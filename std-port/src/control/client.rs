@@ -292,6 +292,9 @@ impl Client {
             Some(wanted) => running_called(directory, wanted),
             None => running_in(directory),
         })?;
+        let (refusing, others): (Vec<_>, Vec<_>) =
+            running.into_iter().partition(|unit| matches!(unit.state, UnitState::Refuses(_)));
+        let running = if others.is_empty() { refusing } else { others };
         match &running[..] {
             [] => Err(none(first_of(directories, running_in)?, directories, unit)),
             [only] => only.refusal().map_or_else(|| Self::connect(&only.path), Err),

@@ -114,6 +114,9 @@ pub enum OperatorError {
     /// There is no such user.
     #[error("this host has no user '{0}' in /etc/passwd: write its name there, or its number")]
     Unknown(String),
+    /// Root needs no role.
+    #[error("root may do everything, whatever role it is given: leave it out")]
+    Root,
     /// The user is there already.
     #[error("'{0}' and '{1}' are the same user: leave one of them out")]
     Doubled(String, String),
@@ -124,6 +127,9 @@ impl Operators {
     pub fn add(&mut self, user: &str, role: Role) -> Result<(), OperatorError> {
         let number = || users().into_iter().find(|(name, _)| name == user).map(|(_, uid)| uid);
         let Some(uid) = user.parse().ok().or_else(number) else { return Err(OperatorError::Unknown(user.to_owned())) };
+        if uid == 0 {
+            return Err(OperatorError::Root);
+        }
         if let Some((other, _)) = self.0.get(&uid) {
             return Err(OperatorError::Doubled(other.clone(), user.to_owned()));
         }
@@ -140,17 +146,17 @@ impl Operators {
     }
 }
 
-/// The name of a user.
-pub(super) fn name_of_user(uid: u32) -> Option<String> {
-    users().into_iter().find(|(_, number)| *number == uid).map(|(name, _)| name)
+/// The names of users, of several the first.
+pub(super) fn names_of_users() -> BTreeMap<u32, String> {
+    users().into_iter().rev().map(|(name, uid)| (uid, name)).collect()
 }
 
 /// Those of this host alone: a directory service is not asked.
 fn users() -> Vec<(String, u32)> {
-    let listed = std::fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let listed = std::fs::read("/etc/passwd").unwrap_or_default();
     let user = |line: &str| {
         let mut words = line.split(':');
         Some((words.next()?.to_owned(), words.nth(1)?.parse().ok()?))
     };
-    listed.lines().filter_map(user).collect()
+    String::from_utf8_lossy(&listed).lines().filter_map(user).collect()
 }

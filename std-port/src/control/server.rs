@@ -1,7 +1,7 @@
 //! The socket of a running unit: one thread that accepts, and one for each open connection.
 
 use std::cell::RefCell;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io::{self, Write};
 use std::net::Shutdown;
 use std::ops::ControlFlow;
@@ -20,7 +20,7 @@ use super::audit::{Audit, Entry, Who};
 use super::lines::{Line, Lines};
 use super::location::{Location, LocationError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
-use super::role::{Operators, Role};
+use super::role::{Operators, Role, names_of_users};
 use crate::CommunicationSystem;
 use crate::executor::OwnThread;
 use crate::locks::lock;
@@ -71,6 +71,8 @@ struct Shared {
     /// Users besides the unit's own; none where the socket is not shared.
     operators: Option<Operators>,
     audit: Option<Arc<Audit>>,
+    /// Of the host's users, as they were at the start.
+    names: BTreeMap<u32, String>,
     connections: Mutex<Connections>,
     socket: Mutex<Socket>,
     /// Told when the unit stops.
@@ -103,8 +105,9 @@ struct Open {
 
 impl Connections {
     /// Ends the connection that has asked nothing for the longest time; `false` if all are in use.
-    fn make_room(&mut self) -> bool {
-        let idle = self.open.iter().filter_map(|(number, open)| Some((lock(&open.idle).as_ref()?.elapsed(), *number)));
+    fn make_room(&mut self, of: impl Fn(&Open) -> bool) -> bool {
+        let of = self.open.iter().filter(|(_, open)| of(open));
+        let idle = of.filter_map(|(number, open)| Some((lock(&open.idle).as_ref()?.elapsed(), *number)));
         let Some((_, number)) = idle.filter(|(idle, _)| *idle >= GIVES_WAY).max() else { return false };
         self.open.remove(&number).is_some_and(|open| open.stream.shutdown(Shutdown::Both).is_ok())
     }
@@ -160,7 +163,8 @@ impl Shared {
     fn new(idle_limit: Duration, operators: Option<Operators>, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
         let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
         let (socket, stopped) = (Mutex::default(), Condvar::new());
-        Ok(Arc::new(Self { waker, stopping, idle_limit, operators, audit, connections, socket, stopped }))
+        let names = if audit.is_some() { names_of_users() } else { BTreeMap::new() };
+        Ok(Arc::new(Self { waker, stopping, idle_limit, operators, audit, names, connections, socket, stopped }))
     }
 
     /// Makes the socket again when it has vanished, in a thread that nothing waits for: its directory may be on a disk that
@@ -281,13 +285,18 @@ impl Shared {
             return;
         }
         connections.threads.retain(|thread| !thread.is_finished());
-        let uid = peer_uid(&stream).ok().filter(|uid| *uid != own_uid());
-        let of_user = connections.open.values().filter(|open| uid.is_some() && open.uid == uid).count();
-        let is_full =
-            of_user >= MOST_OF_A_USER || connections.open.len() >= MOST_CONNECTIONS && !connections.make_room();
-        if is_full
-            && (of_user >= MOST_OF_A_USER + RESERVED / 2 || connections.open.len() >= MOST_CONNECTIONS + RESERVED)
-        {
+        // Root could end the unit as well.
+        let uid = peer_uid(&stream).ok().filter(|uid| ![own_uid(), 0].contains(uid));
+        let is_of_user = |open: &Open| uid.is_some() && open.uid == uid;
+        let of_user = |connections: &Connections| connections.open.values().filter(|open| is_of_user(open)).count();
+        let is_full = of_user(&connections) >= MOST_OF_A_USER && !connections.make_room(is_of_user)
+            || connections.open.len() >= MOST_CONNECTIONS && !connections.make_room(|_| true);
+        let of_others = connections.open.values().filter(|open| open.uid.is_some()).count();
+        // Half of what is for stopping is for the unit's own user and root alone.
+        let may_not_stop = of_user(&connections) >= MOST_OF_A_USER + RESERVED / 2
+            || uid.is_some() && of_others >= MOST_CONNECTIONS + RESERVED / 2
+            || connections.open.len() >= MOST_CONNECTIONS + RESERVED;
+        if is_full && may_not_stop {
             return refuse(full());
         }
         let Ok(kept) = stream.try_clone() else { return };
@@ -334,7 +343,7 @@ impl Shared {
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         let mut lines = Lines::new(&stream);
         let role = self.role_of(&stream).map_err(|failure| io::Error::other(failure.text))?;
-        let mut who = Who::of(&stream, role)?;
+        let mut who = Who::of(&stream, role, &self.names)?;
         let outcome = self.converse(&mut lines, idle, full_when_opened, &mut who, system);
         if let Some(audit) = &self.audit {
             // It is given up; what was sent before can still be read.

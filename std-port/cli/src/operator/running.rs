@@ -35,7 +35,11 @@ pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option
         Ok(all)
     });
     let all = all.map_err(error)?;
-    let meant: Vec<_> = all.iter().collect();
+    let mut meant: Vec<_> = all.iter().collect();
+    // Another unit that lets this user in is meant before one that does not.
+    if meant.iter().any(|unit| !matches!(unit.state, UnitState::Refuses(_))) {
+        meant.retain(|unit| !matches!(unit.state, UnitState::Refuses(_)));
+    }
     match (meant.as_slice(), wanted) {
         ([], None) => Ok(None),
         ([], Some(wanted)) => Err(Ended::no_unit(match of_others(Some(&wanted), global.fleet).as_str() {

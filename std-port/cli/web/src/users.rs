@@ -30,7 +30,7 @@ impl User {
 pub(crate) fn read(path: &Path, text: &str) -> anyhow::Result<Vec<User>> {
     let shown = path.display();
     let only = text.trim();
-    if is_token(only) {
+    if is_token(only) && !only.starts_with('#') {
         return Ok(vec![User::only(only.to_owned())]);
     }
     let none = || {
