@@ -180,7 +180,7 @@ impl<P: Port> Node<P> {
     /// Whether s_units may be there that this m_unit does not have. One that has stood by does not know all of them, nor of
     /// another manager behind a partition: it always searches.
     fn misses_nodes(&self) -> bool {
-        if self.role() != Role::MUnit {
+        if !P::MANAGES || self.role() != Role::MUnit {
             return false;
         }
         let has_fewer = self.known_nodes != u16::MAX && self.table.joined() < self.known_nodes;
