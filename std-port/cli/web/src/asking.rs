@@ -299,7 +299,9 @@ fn act_for(way: &mut dyn Connection, user: &User) -> anyhow::Result<()> {
         ControlFlow::Continue(())
     })?;
     refused.map_or(Ok(()), |failure| {
-        let text = format!("the manager does not act for a user of this page: {failure}; run `cara web` as its user, and not newer than it");
+        let text = format!(
+            "the manager does not act for a user of this page: {failure}; run `cara web` as its user, and not newer than it"
+        );
         Err(Ended::failed(failure.error, text))
     })
 }

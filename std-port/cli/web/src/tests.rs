@@ -380,7 +380,7 @@ fn a_manager_that_knows_no_users_is_stopped_and_asked_nothing_else() {
     let post = |path: &str, body: Value| stage.answer("POST", path, &[("authorization", &bearer)], &body.to_string());
     for (path, body) in [("/api/call", call("f", false)), ("/api/reset", json!({ "node": null }))] {
         let refused = post(path, body);
-        assert!(refused.contains("older than `cara web`"), "{refused}");
+        assert!(refused.contains("not newer than it"), "{refused}");
     }
     assert!(post("/api/stop", json!({ "node": null })).contains("called"));
     let asked: Vec<_> = std::iter::from_fn(|| stage.asked.try_recv().ok()).collect();
