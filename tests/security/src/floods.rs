@@ -135,10 +135,11 @@ fn value(counters: &Counters, name: &str) -> u64 {
     counters.get(name).copied().unwrap_or(0)
 }
 
-/// Datagrams that the manager accepted beyond the newcomer's own.
+/// Datagrams that the manager accepted beyond the newcomer's own: its searches, and its question if it heard the manager search.
 fn believed(before: &Counters, after: &Counters, newcomer: Vec<(&'static str, u64)>) -> u64 {
     let heard: u64 = BELIEVED.iter().map(|name| value(after, name) - value(before, name)).sum();
-    heard.saturating_sub(value(&named(newcomer), "WhoHasSent"))
+    let newcomer = named(newcomer);
+    heard.saturating_sub(value(&newcomer, "WhoHasSent") + value(&newcomer, "HintsAsked"))
 }
 
 /// Opens link after link and says hello on each, every other time in the name of a vehicle that is connected.
