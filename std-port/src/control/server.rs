@@ -348,17 +348,22 @@ impl Shared {
         if let Some(audit) = &self.audit {
             // It is given up; what was sent before can still be read.
             let _ = stream.shutdown(Shutdown::Both);
-            self.note_rest(&mut lines, audit, &who, system.is_stopped());
+            self.note_rest(&mut lines, audit, who, system.is_stopped());
         }
         outcome
     }
 
     /// What a client has asked for that was never looked at, since it had gone: while the process was stopped it may have been
     /// asked for much, and none of it is carried out.
-    fn note_rest(&self, lines: &mut Lines<&UnixStream>, audit: &Audit, who: &Who, unit_stops: bool) {
+    fn note_rest(&self, lines: &mut Lines<&UnixStream>, audit: &Audit, mut who: Who, unit_stops: bool) {
         while let Ok(Some(line)) = lines.next() {
-            if let Some(mut entry) = question(line).ok().as_ref().and_then(|question| Entry::of(audit, who, question)) {
+            let Ok(question) = question(line) else { continue };
+            if let Some(mut entry) = Entry::of(audit, &who, &question) {
                 entry.give_up(unit_stops || self.is_stopping());
+            }
+            if let Question::As { name, role } = question {
+                // Where it may not, it asked for the rest in its own name.
+                let _ = who.act_as(name, role);
             }
         }
     }
@@ -578,6 +583,7 @@ mod tests {
             r#"{"ask":"nodes","offering":null}"#,
             r#"{"ask":"stop","node":"agv/2"}"#,
         ];
+        let acting = r#"{"ask":"as","name":"bert","role":"see"}"#;
         let recorded = |from: usize| {
             written(&shared);
             let text = std::fs::read_to_string(&path).unwrap();
@@ -588,10 +594,13 @@ mod tests {
         };
         // It has gone before it was greeted.
         let (mut client, served) = UnixStream::pair().unwrap();
-        client.write_all(format!("{}\n", asked.join("\n")).as_bytes()).unwrap();
+        client.write_all(format!("{}\n{acting}\n{}\n", asked[..3].join("\n"), asked[3]).as_bytes()).unwrap();
         drop(client);
         assert!(shared.serve(served, &Mutex::default(), false, &system).is_err());
         assert_eq!(recorded(0), ["stop - gone", "reset agv/1 gone", "stop agv/2 gone"]);
+        let text = std::fs::read_to_string(&path).unwrap();
+        let in_his_name: Vec<_> = text.lines().map(|line| line.contains(r#""name":"bert""#)).collect();
+        assert_eq!(in_his_name, [false, false, true]);
         // It goes behind what it asked, which is looked at all the same: a stop is carried out.
         let (mut client, served) = UnixStream::pair().unwrap();
         client.write_all(format!("{{\"ask\":\"watch\"}}\n{}\n{}\n", asked[1], asked[3]).as_bytes()).unwrap();

@@ -1,4 +1,4 @@
-//! Units of this host that hold a control socket and cannot be asked: they hang, or too many ask.
+//! Units of this host that hold a control socket and cannot be asked: they hang, too many ask, or they refuse this user.
 
 use cara_std::control::{RunningUnit, UnitState};
 
@@ -23,7 +23,11 @@ fn finding(seen: &Evidence, which: Option<&Which>, unit: &RunningUnit) -> Option
     let (name, path) = (&unit.unit, unit.path.display());
     let meant = which.is_some_and(|which| which.is_text(name));
     match &unit.state {
-        UnitState::Answers | UnitState::Refuses(_) => None,
+        UnitState::Answers => None,
+        UnitState::Refuses(reason) => {
+            let found = format!("{name} runs on this host and does not let this user ask it: {reason}");
+            Some(Finding::warning(Id::ControlRefused, found, REFUSES).about(name))
+        }
         UnitState::Silent => {
             let found = format!(
                 "{name} runs on this host (control socket {path}) and does not answer: its process hangs or is stopped"
@@ -40,6 +44,8 @@ fn finding(seen: &Evidence, which: Option<&Which>, unit: &RunningUnit) -> Option
 
 const HANGS: &str = "restart it, and start no second one beside it; a process that was stopped (state T in `ps`) goes on \
                      with `kill -CONT`";
+const REFUSES: &str = "run the doctor as the user that runs it, or add this user to its `operators`; what the unit knows is missing \
+                       from the other findings";
 const FULL: &str = "end commands that go on asking it (`cara watch`, scripts that wait), then run the doctor again: what the \
                     unit knows is missing from the other findings";
 
@@ -63,6 +69,8 @@ mod tests {
         assert_eq!(ids(&unasked(UnitState::Silent)), [Id::UnitHangs, Id::Duplicate]);
         let full = unasked(UnitState::Full("too many".into()));
         assert_eq!(ids(&full), [Id::ControlFull, Id::NoManager, Id::Duplicate]);
+        let refuses = unasked(UnitState::Refuses("not you".into()));
+        assert_eq!(ids(&refuses), [Id::ControlRefused, Id::NoManager, Id::Duplicate]);
         assert_eq!(ids(&unasked(UnitState::Answers)), [Id::NoManager, Id::Duplicate]);
     }
 }
