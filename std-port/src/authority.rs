@@ -18,6 +18,7 @@ pub trait Authority: Send + 'static {
     ) -> Result<Option<Key>, Box<dyn std::error::Error + Send + Sync>>;
 
     /// Gives the key back, if it has it, so that another one gets it at once: called when the manager does not command any more.
+    /// [`stop`](crate::CommunicationSystem::stop) waits half a second for it.
     fn release(&mut self);
 }
 

@@ -72,6 +72,19 @@ pub(super) enum Job {
     Heard(Claim),
 }
 
+impl Job {
+    /// Takes a job of the same kind in, so that no more than one of each of these waits: the higher claim is enough.
+    fn merge(&mut self, job: Self) -> Option<Self> {
+        match (self, job) {
+            (Self::Raise(above), Self::Raise(other))
+            | (Self::Lead(above), Self::Lead(other))
+            | (Self::Heard(above), Self::Heard(other)) => *above = (*above).max(other),
+            (_, job) => return Some(job),
+        }
+        None
+    }
+}
+
 /// What came of a job.
 pub(super) enum Written {
     Nothing,
@@ -193,6 +206,9 @@ impl Claims {
     /// holds up nothing else. Returns the jobs that are not done.
     pub(super) fn leave_to_writer(&self, job: Job, write: impl FnOnce() + Send + 'static) -> Vec<Job> {
         let mut writer = lock(&self.writer);
+        let Some(job) = writer.waiting.iter_mut().fold(Some(job), |job, waiting| waiting.merge(job?)) else {
+            return Vec::new();
+        };
         if writer.waiting.len() >= WAITING {
             return vec![job];
         }
@@ -308,4 +324,26 @@ fn has_key(ring: &KeyRing, obeyed: &KeptObeyed) -> bool {
         tracing::info!(manager = obeyed.manager.name(), "a stored claim does not count: the keys are other ones");
     }
     has
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn claims_to_be_raised_wait_as_one_job_and_keep_nothing_out() {
+        let claims = Claims::new(None, TakeOver::No, false);
+        let above = |term| Claim { term, claimant: 0 };
+        for term in [3, 1, 7, 2] {
+            for job in [Job::Raise(above(term)), Job::Lead(above(term)), Job::Heard(above(term))] {
+                assert!(claims.leave_to_writer(job, || ()).is_empty());
+            }
+        }
+        let waiting = &lock(&claims.writer).waiting;
+        let highest = above(7);
+        assert!(
+            matches!(&waiting[..], [Job::Raise(raise), Job::Lead(lead), Job::Heard(heard)] if [raise, lead, heard] == [&highest; 3]),
+            "{waiting:?}"
+        );
+    }
 }

@@ -185,20 +185,29 @@ impl<T: Send + 'static> Engine<T> {
                 self.driver.wake();
             }
             Written::Obeyed => self.links.look_at_orders(),
-            Written::Raised(claim, revision) if self.leadership.claimed(self.now(), revision) => {
+            Written::Raised(claim, revision)
+                if self.leadership.revision(self.now()) == Some(revision) && self.announce_claim(claim) =>
+            {
                 tracing::warn!(%claim, "this manager has raised its claim");
-                self.announce_claim(claim);
+                // Only now: whoever hears that it leads finds the claim in use.
+                self.leadership.claimed(self.now(), revision);
                 self.notify(UnitEvent::Raised { claim });
                 self.broadcast();
             }
             Written::Raised(..) | Written::Failed(Job::Raise(_)) => self.hub.lock().hub.node.not_raised(self.now()),
             Written::Leads(claim, revision) if self.leadership.claimed(self.now(), revision) => self.lead(claim),
-            Written::Leads(..) | Written::Failed(Job::Lead(_)) => {
-                self.hub.lock().hub.node.stand_by(self.now());
-                self.driver.wake();
-            }
+            Written::Leads(..) | Written::Failed(Job::Lead(_)) => self.stand_by_further(),
             Written::Failed(Job::Heard(_)) | Written::Nothing => {}
         }
+    }
+
+    /// This standby does not command yet. One that commands by now goes on: it was asked for twice.
+    fn stand_by_further(&self) {
+        let node = &mut self.hub.lock().hub.node;
+        if node.is_standby() {
+            node.stand_by(self.now());
+        }
+        self.driver.wake();
     }
 
     /// The claim of this standby is stored: it commands, unless somebody has answered meanwhile.
@@ -206,7 +215,7 @@ impl<T: Send + 'static> Engine<T> {
         let (identity, _) = self.hub.lock().identity();
         let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else {
             // The key with itself was taken away meanwhile.
-            return self.hub.lock().hub.node.stand_by(self.now());
+            return self.stand_by_further();
         };
         if self.is_stopping() || !self.hub.lock().hub.node.lead(self.now(), tagged) {
             return;
@@ -216,12 +225,20 @@ impl<T: Send + 'static> Engine<T> {
         self.driver.wake();
     }
 
-    /// Tells all peers this manager's claim, with a tag of the keys as they are now.
-    fn announce_claim(&self, claim: Claim) {
+    /// Tells all peers this manager's claim, with a tag of the keys as they are now. `false` where it has no key with itself any
+    /// more, or stands by.
+    fn announce_claim(&self, claim: Claim) -> bool {
         let (identity, _) = self.hub.lock().identity();
-        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return };
-        self.hub.lock().hub.node.set_claim(tagged);
+        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return false };
+        {
+            let node = &mut self.hub.lock().hub.node;
+            if node.is_standby() {
+                return false;
+            }
+            node.set_claim(tagged);
+        }
         self.on_each_link(|session, cx| session.announce_claim(cx));
+        true
     }
 
     /// A live manager of this identity has a higher claim. Stopping ends the links, and with them all that this one ordered. What

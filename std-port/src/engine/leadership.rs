@@ -1,6 +1,7 @@
 //! Whether this manager leads: its authority has given it the key, the key's time is not over by this unit's clock, and the
 //! manager's claim was made under that key. Its loss ends no link and no order.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Condvar, Mutex, PoisonError, Weak};
 
 use cara_core::distribution::claim::Claim;
@@ -19,6 +20,8 @@ const RETRY: Duration = Duration::from_millis(250);
 const SOONEST: Duration = Duration::from_millis(10);
 /// While the key is not wanted, from one look to the next.
 const IDLE: Duration = Duration::from_secs(1);
+/// A stop waits at most so long for the key to be given back; everything else has ended by then.
+const RELEASE: std::time::Duration = std::time::Duration::from_millis(500);
 /// A start waits at most so long for the first answer.
 const ANSWER: std::time::Duration = std::time::Duration::from_secs(5);
 
@@ -37,6 +40,8 @@ struct State {
     wanted: bool,
     /// The thread looks at once.
     woken: bool,
+    /// It runs.
+    asks: bool,
     /// What the start waits for: the first answer.
     answered: bool,
     key: Option<Held>,
@@ -114,7 +119,15 @@ impl Leadership {
 
     fn give_back(&self, authority: &mut dyn Authority) {
         lock(&self.state).key = None;
-        authority.release();
+        if catch_unwind(AssertUnwindSafe(|| authority.release())).is_err() {
+            tracing::error!("the authority has panicked: its key stays taken until its time is over");
+        }
+    }
+
+    /// Waits a moment until the key is given back, so that another manager gets it at once where this process ends.
+    pub(super) fn await_release(&self) {
+        let state = lock(&self.state);
+        drop(self.changed.wait_timeout_while(state, RELEASE, |state| state.asks));
     }
 
     /// What came of a question that was asked then. Returns when to ask again.
@@ -124,7 +137,8 @@ impl Leadership {
         answer: Result<Option<Key>, Box<dyn std::error::Error + Send + Sync>>,
     ) -> Instant {
         let mut state = lock(&self.state);
-        state.answered = true;
+        // A first question that failed is asked again: etcd's next member may answer.
+        state.answered |= answer.is_ok();
         let (again, refused) = match answer {
             Ok(Some(Key { revision, lasts })) => {
                 let lasts = lasts.as_micros();
@@ -186,28 +200,37 @@ impl<T: Send + 'static> Engine<T> {
         until.unwrap_or(Instant::FAR_FUTURE)
     }
 
-    /// From here on the key is asked for while this m_unit commands, or is to command. Returns the revision above which it claims;
-    /// 0 without an authority, and for a standby, which claims later.
-    pub(super) fn seek_key(&self) -> Result<u64, StartError> {
+    /// From here on the key is asked for while this m_unit commands, or is to command.
+    pub(super) fn want_key(&self) -> Result<(), StartError> {
         if !self.leadership.has_authority {
-            return Ok(0);
+            return Ok(());
         }
         self.leadership.want(true);
         if let Some(authority) = lock(&self.leadership.authority).take() {
             let (me, leadership) = (self.me.clone(), self.leadership.clone());
+            lock(&leadership.state).asks = true;
             let keep = move || keep_key(&me, &leadership, authority);
             let spawned = std::thread::Builder::new().name("cara-authority".into()).spawn(keep);
-            spawned.map_err(|error| self.no_authority(error.to_string()))?;
+            spawned.map_err(|error| {
+                lock(&self.leadership.state).asks = false;
+                self.no_authority(error.to_string())
+            })?;
         }
-        if self.claims.stands_by() {
+        Ok(())
+    }
+
+    /// As [`Self::want_key`], and waits for it. Returns the revision above which this manager claims; 0 without an authority.
+    pub(super) fn seek_key(&self) -> Result<u64, StartError> {
+        if !self.leadership.has_authority {
             return Ok(0);
         }
+        self.want_key()?;
         self.leadership.first_answer(|| self.now()).map_err(|why| self.no_authority(why))
     }
 
     /// A manager starts with a claim above this revision.
     pub(super) fn started_under(&self, revision: u64) -> Result<(), StartError> {
-        if self.claims.stands_by() || self.leadership.claimed(self.now(), revision) {
+        if self.leadership.claimed(self.now(), revision) {
             return Ok(());
         }
         Err(self.no_authority("the key was lost meanwhile".to_owned()))
@@ -228,14 +251,15 @@ impl<T: Send + 'static> Engine<T> {
         let state = lock(&self.leadership.state);
         let (key, claimed) = (state.revision(self.now()), state.claimed);
         drop(state);
-        let (starts, is_standby) = {
+        // A manager that knows of a higher claim raises its own once nobody is heard under that one, with the key or without.
+        let (starts, waits) = {
             let node = &self.hub.lock().hub.node;
-            (node.starts_above(), node.is_standby())
+            (node.starts_above(), node.is_standby() || node.has_rival())
         };
         match (key, starts) {
             (None, _) => {}
             (Some(_), Some(above)) => self.leave_to_writer(Job::Lead(above)),
-            (Some(_), None) if is_standby || claimed.is_none() || claimed == key => {}
+            (Some(_), None) if waits || claimed.is_none() || claimed == key => {}
             (Some(_), None) => self.leave_to_writer(Job::Raise(Claim::NONE)),
         }
         self.driver.wake();
@@ -258,7 +282,8 @@ fn keep_key<T: Send + 'static>(me: &Weak<Engine<T>>, leadership: &Leadership, mu
         let pause = if is_to_command && leadership.is_wanted() {
             has_asked = true;
             let asked = clock.now();
-            let again = leadership.answered(asked, authority.hold(&identity, fleet));
+            let answer = catch_unwind(AssertUnwindSafe(|| authority.hold(&identity, fleet)));
+            let again = leadership.answered(asked, answer.unwrap_or_else(|_| Err("the authority has panicked".into())));
             if let Some(engine) = running() {
                 engine.key_answered();
             }
@@ -272,6 +297,8 @@ fn keep_key<T: Send + 'static>(me: &Weak<Engine<T>>, leadership: &Leadership, mu
         leadership.sleep(pause);
     }
     leadership.give_back(&mut *authority);
+    lock(&leadership.state).asks = false;
+    leadership.changed.notify_all();
 }
 
 #[cfg(test)]

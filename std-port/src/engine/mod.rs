@@ -432,8 +432,12 @@ impl<T: Send + 'static> Engine<T> {
         Ok(())
     }
 
-    /// With an authority only once that has given the key.
+    /// With an authority only once that has given the key, which a standby asks for later.
     fn claim(&self, heard: Claim) -> Result<(), StartError> {
+        if self.claims.stands_by() {
+            self.claims.claim(&self.hub, self.keys(), self.driver.clock(), heard)?;
+            return self.want_key();
+        }
         let revision = self.seek_key()?;
         let above = heard.max(claims::above_revision(revision));
         self.claims.claim(&self.hub, self.keys(), self.driver.clock(), above)?;
@@ -472,6 +476,7 @@ impl<T: Send + 'static> Engine<T> {
             let peers: Vec<_> = self.nodes.read().all().cloned().collect();
             peers.iter().for_each(|peer| peer.streams.wake_tasks());
         }
+        self.leadership.await_release();
     }
 
     pub(crate) fn now(&self) -> Instant {

@@ -24,6 +24,9 @@ struct Shared {
     holder: Option<(usize, u64, Instant)>,
     revision: u64,
     is_down: bool,
+    /// It fails so many times more, and then panics so many times.
+    fails: usize,
+    panics: usize,
     /// An answer comes only when this is open.
     hangs: Option<Arc<Gate>>,
 }
@@ -81,8 +84,14 @@ impl Authority for Fake {
             gate.pass();
         }
         let mut shared = self.shared.lock().unwrap();
-        if shared.is_down {
+        if shared.is_down || shared.fails > 0 {
+            shared.fails = shared.fails.saturating_sub(1);
             return Err("it is down".into());
+        }
+        if shared.panics > 0 {
+            shared.panics -= 1;
+            drop(shared);
+            panic!("as an authority with a bug");
         }
         let now = Instant::now();
         let revision = match shared.holder.filter(|(.., until)| now < *until) {
@@ -211,6 +220,22 @@ fn the_loss_of_the_authority_ends_no_link_and_no_order_but_calls_that_are_for_a_
 }
 
 #[test]
+fn an_authority_that_fails_or_panics_is_asked_again() {
+    let (fleet, folder, authority) = (fleet(), tempfile::tempdir().unwrap(), Fake::new());
+    authority.shared.lock().unwrap().fails = 2;
+    let depot = manager(fleet, folder.path()).authority(authority.clone()).build().unwrap();
+    let events = depot.events();
+    depot.start().unwrap();
+    let claim = leading(&events);
+    // Longer than the key lasts.
+    authority.shared.lock().unwrap().panics = 4;
+    not_leading(&events);
+    assert!(leading(&events) > claim, "under a new key");
+    depot.stop();
+    assert_eq!(authority.holder(), None, "given back by the time that the stop returns");
+}
+
+#[test]
 fn a_key_is_lost_by_the_clock_of_its_holder_while_the_authority_hangs_and_a_stop_waits_for_nothing() {
     let (fleet, folder, authority) = (fleet(), tempfile::tempdir().unwrap(), Fake::new());
     let depot = manager(fleet, folder.path()).authority(authority.clone()).build().unwrap();
@@ -243,18 +268,22 @@ fn a_manager_raises_its_claim_above_a_vehicle_only_with_the_key() {
         until("it has moved under it", || exclusive(&offering(&manager)).is_ok());
         assert_eq!(agv.claim().term, 1002);
     }
-    let depot = manager(fleet, &depot).take_over(true).authority(authority.clone()).build().unwrap();
+    let depot = manager(fleet, &depot).authority(authority.clone()).build().unwrap();
     let events = depot.events();
     depot.start().unwrap();
     assert_eq!(leading(&events).term, 102);
     authority.set_down(true);
     not_leading(&events);
+    let heard = Instant::now();
     let (agv, _) = vehicle(fleet, &board);
     until("it is fenced", || counter(&depot.counters(), "Fenced") > 0);
     authority.was_asked(3);
     assert_eq!((depot.claim().term, agv.claim().term), (102, 1002), "it does not raise its claim");
+    // Its next key is above all claims.
+    authority.shared.lock().unwrap().revision = 2000;
     authority.set_down(false);
     until("it has raised its claim", || agv.claim() == depot.claim() && depot.claim().term > 1002);
+    assert!(heard.elapsed() >= Duration::from_secs(3), "the key alone is no sign that nobody hears the other manager");
     until("it leads", || depot.is_leading());
 }
 

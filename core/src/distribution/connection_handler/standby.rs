@@ -35,6 +35,11 @@ impl<P: Port> Node<P> {
         P::MANAGES && P::STANDS_BY && self.claims.stage != Stage::Commands
     }
 
+    /// Whether this m_unit has heard of a genuine claim above its own.
+    pub const fn has_rival(&self) -> bool {
+        self.claims.rival.is_some()
+    }
+
     /// The claim above which this standby is to command: that of the last [`ClaimEvent::Lead`], or a higher one that was heard since.
     /// `None` once somebody has answered.
     pub fn starts_above(&self) -> Option<Claim> {
