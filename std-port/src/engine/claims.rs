@@ -206,7 +206,7 @@ impl Claims {
     /// holds up nothing else. Returns the jobs that are not done.
     pub(super) fn leave_to_writer(&self, job: Job, write: impl FnOnce() + Send + 'static) -> Vec<Job> {
         let mut writer = lock(&self.writer);
-        let Some(job) = writer.waiting.iter_mut().fold(Some(job), |job, waiting| waiting.merge(job?)) else {
+        let Some(job) = writer.waiting.iter_mut().try_fold(job, |job, waiting| waiting.merge(job)) else {
             return Vec::new();
         };
         if writer.waiting.len() >= WAITING {

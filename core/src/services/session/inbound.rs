@@ -140,6 +140,7 @@ impl<P: Port> Session<P> {
         // A frame of a later version is no sign of life, since this unit cannot read it; a session body is judged once decoded.
         if !matches!(inbound, Inbound::Skipped | Inbound::Session(_)) {
             self.wire.heard(cx.now);
+            self.granting.obedience.note_silence(&self.wire, cx);
         }
         let is_emergency = matches!(inbound, Inbound::Message(Priority::Emergency, _));
         // Begin a call only if no bytes follow it, else queue it: an emergency further back in these bytes comes first.
@@ -291,6 +292,7 @@ impl<P: Port> Session<P> {
                 Way::Datagram => {}
             }
             self.wire.due.set(Part::Liveness, self.wire.liveness.deadline());
+            self.granting.obedience.note_silence(&self.wire, cx);
         }
         match body {
             Some(SessionBody::KeepAlive { stamp, report }) => {

@@ -83,6 +83,26 @@ fn a_vehicle_knows_when_it_last_heard_its_manager() {
     assert_eq!(since(&pair), before);
 }
 
+/// A question may be answered before the session is polled.
+#[test]
+fn a_manager_that_is_heard_again_was_heard_just_now() {
+    let tagged = TaggedClaim { claim: Claim { term: 5, claimant: 1 }, ..TaggedClaim::NONE };
+    let mut pair = Pair::prepared(&Setup::default(), |pair| pair.manager.hub.hub.node.set_claim(tagged));
+    let manager = pair.manager.hub.hub.node.identity().clone();
+    let since = |pair: &Pair| pair.agv.hub.hub.node.obeyed_report(pair.agv.now, &manager).map(|report| report.since);
+    pair.run(Duration::from_secs(10));
+    pair.manager.net.datagrams = Datagrams::Lost;
+    pair.manager.net.frozen = true;
+    pair.run(Duration::from_millis(2_000));
+    assert!(since(&pair).is_some_and(|since| since >= 900));
+    pair.manager.net.frozen = false;
+    let (bytes, _) = pair.manager.net.deliver();
+    assert!(!bytes.is_empty(), "the answers to the vehicle's pings");
+    pair.agv.inbox.extend(bytes);
+    pair.agv.read();
+    assert_eq!(since(&pair), Some(0));
+}
+
 fn lose_datagrams(pair: &mut Pair) {
     pair.manager.net.datagrams = Datagrams::Lost;
     pair.agv.net.datagrams = Datagrams::Lost;

@@ -201,7 +201,8 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.run_calls();
     }
 
-    fn read(&mut self) -> bool {
+    /// Takes what has come in the stream, and nothing else.
+    pub(super) fn read(&mut self) -> bool {
         let mut worked = false;
         let mut arguments: Arguments = Box::default();
         if self.holds_back {
