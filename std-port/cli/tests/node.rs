@@ -2,6 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
+use std::os::unix::net::UnixDatagram;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::Arc;
@@ -288,6 +289,7 @@ impl Node {
 
     fn run(folder: TempDir, fleet: u32, keys: Arc<KeyFolder>, options: &[&str]) -> Self {
         let script = r#"cd "$1"; cara=$2; export CARA_CONTROL_DIR="$1/control" CARA_KEYS="$3"; shift 3; echo $$ > pid
+            if [ -S notify ]; then export NOTIFY_SOCKET="$PWD/notify" WATCHDOG_USEC=40000; fi
             exec "$cara" node plant.toml "$@" 2>>log"#;
         let arguments = ["-c", script, "sh"].map(PathBuf::from).into_iter();
         let arguments = arguments.chain([folder.path(), cara(), keys.path()].map(Path::to_owned));
@@ -511,6 +513,36 @@ fn the_end_of_the_node_makes_safe_once() {
     assert_eq!(call(&manager, "go", 1), Ok(1));
     assert!(node.process.terminate(PATIENCE).unwrap().success());
     assert_eq!(motion(&node), "going\nstopped\n");
+}
+
+#[test]
+fn a_service_manager_hears_that_the_node_is_up_that_it_lives_and_that_it_ends() {
+    let folder = TempDir::new().unwrap();
+    let socket = UnixDatagram::bind(folder.path().join("notify")).unwrap();
+    socket.set_read_timeout(Some(PATIENCE)).unwrap();
+    let fleet = random_fleet();
+    let file = format!("name = \"plant\"\nid = 1\nfleet = {fleet}\ninterfaces = \"lo\"\n");
+    std::fs::write(folder.path().join("plant.toml"), file).unwrap();
+    let keys = KeyFolder::draw(fleet, &["plant/1@m_unit"]).unwrap();
+    let mut node = Node::run(folder, fleet, keys.into(), &[]);
+    let heard = || {
+        let mut buffer = [0; 64];
+        let count = socket.recv(&mut buffer).unwrap();
+        text(&buffer[..count]).trim().to_owned()
+    };
+    assert_eq!([heard(), heard(), heard()], ["READY=1", "WATCHDOG=1", "WATCHDOG=1"]);
+    node.signal(Signal::STOP);
+    // As a process that hangs: nothing comes behind what was said before.
+    socket.set_nonblocking(true).unwrap();
+    until("it is silent", || {
+        while socket.recv(&mut [0; 64]).is_ok() {}
+        std::thread::sleep(Duration::from_millis(200));
+        socket.recv(&mut [0; 64]).is_err()
+    });
+    socket.set_nonblocking(false).unwrap();
+    node.signal(Signal::CONT);
+    assert!(node.process.terminate(PATIENCE).unwrap().success());
+    while heard() != "STOPPING=1" {}
 }
 
 #[test]

@@ -12,6 +12,7 @@ mod offer;
 mod places;
 mod program;
 mod running;
+mod service;
 mod settings;
 mod unit;
 mod values;

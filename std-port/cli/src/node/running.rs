@@ -17,7 +17,7 @@ use super::offer::offer;
 use super::program::Programs;
 use super::settings::{Overrides, Placed, Settings};
 use super::unit::{Node, NotBuilt};
-use super::{events, http, wrong};
+use super::{events, http, service, wrong};
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
 use cara_tools::output;
@@ -51,6 +51,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     if let Err(error) = report_up(&settings, &node, served, global) {
         tracing::warn!(%error, "the line that the node is up could not be written");
     }
+    service::up(&node);
     let mut settings = settings;
     for signal in signals.forever() {
         tracing::info!(signal = signal_hook::low_level::signal_name(signal), "signal");
@@ -59,6 +60,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
         }
         reload(&mut settings, over, &node, logging);
     }
+    service::ends();
     // Programs first, so that what makes safe is the last one to act; stopping ends the leases that are live.
     programs.end_calls();
     node.stop();

@@ -158,6 +158,20 @@ impl Node {
         }
     }
 
+    /// Whether the unit is there; does not return where it hangs, and holds none alive.
+    pub(super) fn lives(&self) -> Box<dyn Fn() -> bool + Send> {
+        match self {
+            Self::Manager(system) => {
+                let system = system.downgrade();
+                Box::new(move || system.upgrade().map(|system| system.claim()).is_some())
+            }
+            Self::Vehicle(unit) => {
+                let unit = unit.downgrade();
+                Box::new(move || unit.upgrade().map(|unit| unit.claim()).is_some())
+            }
+        }
+    }
+
     /// What is served as metrics; holds no unit alive.
     pub(super) fn metrics(&self) -> Metrics {
         match self {

@@ -1,0 +1,38 @@
+//! What a service manager hears (`sd_notify(3)`): that the node is up, that it lives, that it ends. Where there is none, nothing.
+
+use std::time::Duration;
+
+use sd_notify::NotifyState;
+
+use super::unit::Node;
+
+/// The node is up. Where a watchdog is asked for, it hears of the unit twice in its time.
+pub(super) fn up(node: &Node) {
+    say(NotifyState::Ready);
+    let Some(limit) = sd_notify::watchdog_enabled() else { return };
+    let (lives, pause) = (node.lives(), limit / 2);
+    let watch = move || {
+        // A unit that hangs keeps this thread waiting, so that nothing is said.
+        while lives() {
+            say(NotifyState::Watchdog);
+            std::thread::sleep(pause.max(SHORTEST));
+        }
+    };
+    if let Err(error) = std::thread::Builder::new().name("cara-watchdog".into()).spawn(watch) {
+        tracing::error!(%error, "no thread is left to serve the watchdog with: the service manager will restart this node");
+    }
+}
+
+/// A watchdog whose time is 0 would otherwise keep a processor busy.
+const SHORTEST: Duration = Duration::from_millis(10);
+
+/// The node ends.
+pub(super) fn ends() {
+    say(NotifyState::Stopping);
+}
+
+fn say(state: NotifyState<'_>) {
+    if let Err(error) = sd_notify::notify(&[state]) {
+        tracing::warn!(%error, "the service manager (NOTIFY_SOCKET) does not hear this node");
+    }
+}
