@@ -7,7 +7,8 @@ use anyhow::{Result, bail};
 use crate::command::Run;
 use crate::{
     bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, later, layers,
-    licences, links, manifests, msrv, names, orders, packages, panic_free, paper, planted, security, workspace,
+    licences, links, manifests, msrv, names, orders, packages, panic_free, paper, planted, release, security,
+    workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -41,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 29] = [
+pub(crate) const GROUPS: [Group; 30] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -293,6 +294,15 @@ pub(crate) const GROUPS: [Group; 29] = [
         by_default: false,
         waits: false,
         run: |_| packages::check().into(),
+    },
+    Group {
+        name: "release",
+        what: "the files of a release, and its Debian package installed, run, upgraded, removed and purged in a clean root; before a release",
+        budget: 900,
+        quick: None,
+        by_default: false,
+        waits: false,
+        run: |_| release::check().into(),
     },
     Group {
         name: "etcd",

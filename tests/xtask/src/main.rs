@@ -34,6 +34,7 @@ mod panic_free;
 mod paper;
 mod peers;
 mod planted;
+mod release;
 mod runner;
 mod sanitize;
 mod security;
@@ -99,6 +100,8 @@ enum Task {
         #[arg(long)]
         write: bool,
     },
+    /// Makes Debian packages, static archives, checksums and lists of components in target/release-files.
+    Release,
     /// Counts what there is to read and to learn: lines, ways to call, public items, conditions, circles, words.
     House {
         /// Also writes the figures here.
@@ -161,6 +164,7 @@ fn main() -> ExitCode {
         Task::Sizes { board, json, write } => firmware::sizes(board.as_deref(), json.as_deref(), write),
         Task::Versions { revisions } => later::versions(&revisions).map(|()| ExitCode::SUCCESS),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
+        Task::Release => release::make().map(|_| ExitCode::SUCCESS),
         Task::House { json } => house::run(json.as_deref()),
         Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),

@@ -1,0 +1,224 @@
+//! What a release consists of beside the crates: a static `cara`, Debian packages, checksums and lists of components.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+
+use crate::command::Run;
+use crate::install;
+use crate::workspace;
+
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// Where it is put together.
+const FOLDER: &str = "release-files";
+const SHELLS: [(&str, &str); 3] = [
+    ("bash", "share/bash-completion/completions/cara"),
+    ("zsh", "share/zsh/vendor-completions/_cara"),
+    ("fish", "share/fish/vendor_completions.d/cara.fish"),
+];
+
+/// A kind of processor: as Debian and as Rust call it, the C compiler for what is not Rust, and what links.
+#[derive(Clone, Copy)]
+struct Processor {
+    debian: &'static str,
+    target: &'static str,
+    compiler: &'static str,
+    package: &'static str,
+    linker: &'static str,
+}
+
+const PROCESSORS: [Processor; 2] = [
+    Processor {
+        debian: "amd64",
+        target: "x86_64-unknown-linux-musl",
+        compiler: "musl-gcc",
+        package: "musl-tools",
+        linker: "cc",
+    },
+    Processor {
+        debian: "arm64",
+        target: "aarch64-unknown-linux-musl",
+        compiler: "aarch64-linux-gnu-gcc",
+        package: "gcc-aarch64-linux-gnu",
+        linker: "aarch64-linux-gnu-gcc",
+    },
+];
+
+/// Makes all files of a release; returns their folder.
+pub(crate) fn make() -> Result<PathBuf> {
+    let folder = workspace::target().join(FOLDER);
+    empty(&folder)?;
+    let native = PROCESSORS.iter().find(|processor| processor.target.starts_with(std::env::consts::ARCH));
+    let native = build(*native.context("releases are made on amd64 or arm64")?)?;
+    for processor in PROCESSORS {
+        let program = build(processor)?;
+        let tree = folder.join(processor.debian);
+        stage(&tree.join("usr"), &program, &native)?;
+        archive(&folder, &tree, processor)?;
+        package(&folder, &tree, processor)?;
+        fs::remove_dir_all(&tree)?;
+    }
+    components(&folder)?;
+    checksums(&folder)?;
+    println!("{}", folder.display());
+    Ok(folder)
+}
+
+fn empty(folder: &Path) -> Result<()> {
+    match fs::remove_dir_all(folder) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error.into()),
+        _ => Ok(fs::create_dir_all(folder)?),
+    }
+}
+
+/// One static program, which runs on every distribution, is in the archive and in the Debian package.
+fn build(processor: Processor) -> Result<PathBuf> {
+    let Processor { target, compiler, package, linker, .. } = processor;
+    install::rust_target(target).and_then(|()| install::program(compiler, package)).map_err(anyhow::Error::msg)?;
+    let folder = workspace::target().join("packages");
+    let name = target.replace('-', "_");
+    Run::cargo()
+        .args(["build", "--release", "--locked", "--package", "cara-cli", "--target", target, "--target-dir"])
+        .args([&folder])
+        .env("CARGO_PROFILE_RELEASE_STRIP", "symbols")
+        .env(&format!("CC_{name}"), compiler)
+        .env(&format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), linker)
+        .stream()?;
+    Ok(folder.join(target).join("release/cara"))
+}
+
+/// Puts what is installed under `usr`. The program of this host prints the texts.
+fn stage(usr: &Path, program: &Path, native: &Path) -> Result<()> {
+    place(&fs::read(program)?, &usr.join("bin/cara"), 0o755)?;
+    let native = native.to_string_lossy();
+    let manuals = usr.join("share/man/man1");
+    Run::new(&native).args(["man", "--dir"]).args([&manuals]).text()?;
+    for page in fs::read_dir(&manuals)? {
+        Run::new("gzip").args(["-9n"]).args([page?.path()]).stream()?;
+    }
+    for (shell, path) in SHELLS {
+        place(Run::new(&native).args(["completions", shell]).text()?.as_bytes(), &usr.join(path), 0o644)?;
+    }
+    let documents = usr.join("share/doc/cara");
+    for file in ["README.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"] {
+        place(workspace::read(Path::new(file))?.as_bytes(), &documents.join(file), 0o644)?;
+    }
+    let example = Run::new(&native).args(["node", "--example"]).text()?;
+    place(example.as_bytes(), &documents.join("node.toml"), 0o644)
+}
+
+fn place(content: &[u8], path: &Path, mode: u32) -> Result<()> {
+    fs::create_dir_all(path.parent().context("a file lies in a folder")?)?;
+    fs::write(path, content).with_context(|| path.display().to_string())?;
+    Ok(fs::set_permissions(path, fs::Permissions::from_mode(mode))?)
+}
+
+/// For distributions without Debian's packages.
+fn archive(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
+    let name = format!("cara-{VERSION}-{}.tar.gz", processor.target);
+    Run::new("tar")
+        .args(["--create", "--gzip", "--owner=0", "--group=0", "--sort=name", "--mtime=@0", "--file"])
+        .args([&folder.join(name)])
+        .args(["--directory"])
+        .args([&tree.join("usr")])
+        .args(["bin", "share"])
+        .stream()
+}
+
+fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
+    let unit = workspace::read(Path::new("packaging/systemd/cara@.service"))?;
+    let sysusers = workspace::read(Path::new("packaging/systemd/sysusers.conf"))?;
+    place(unit.as_bytes(), &tree.join("usr/lib/systemd/system/cara@.service"), 0o644)?;
+    // A standby is the same node, started otherwise.
+    place(unit.as_bytes(), &tree.join("usr/lib/systemd/system/cara-standby@.service"), 0o644)?;
+    let standby = workspace::read(Path::new("packaging/systemd/standby.conf"))?;
+    place(standby.as_bytes(), &tree.join("usr/lib/systemd/system/cara-standby@.service.d/standby.conf"), 0o644)?;
+    place(sysusers.as_bytes(), &tree.join("usr/lib/sysusers.d/cara.conf"), 0o644)?;
+    fs::create_dir_all(tree.join("etc/cara"))?;
+    let size = Run::new("du").args(["--summarize", "--block-size=1024"]).args([tree]).text()?;
+    let size = size.split_whitespace().next().unwrap_or_default().to_owned();
+    let control = format!(
+        "Package: cara\nVersion: {VERSION}\nArchitecture: {}\nMaintainer: {}\nInstalled-Size: {size}\nDepends: systemd\n\
+         Section: net\nPriority: optional\nDescription: {}\n Managers of automated guided vehicles, and the command that asks, starts and\n \
+         diagnoses them.\n",
+        processor.debian,
+        env!("CARGO_PKG_AUTHORS"),
+        "nodes of the Communication Architecture for Robotic Applications",
+    );
+    place(control.as_bytes(), &tree.join("DEBIAN/control"), 0o644)?;
+    for script in ["postinst", "prerm", "postrm"] {
+        let text = workspace::read(&Path::new("packaging/debian").join(script))?;
+        place(text.as_bytes(), &tree.join("DEBIAN").join(script), 0o755)?;
+    }
+    let file = folder.join(format!("cara_{VERSION}_{}.deb", processor.debian));
+    Run::new("dpkg-deb").args(["--root-owner-group", "--build"]).args([tree, &file]).stream()
+}
+
+/// CycloneDX lists of what is in `cara` and in the firmware.
+fn components(folder: &Path) -> Result<()> {
+    let tools = workspace::target().join("tools");
+    if !tools.join("bin/cargo-cyclonedx").is_file() {
+        Run::cargo()
+            .args(["install", "--quiet", "--locked", "cargo-cyclonedx@0.5.9", "--root"])
+            .args([&tools])
+            .stream()?;
+    }
+    let tool = tools.join("bin/cargo-cyclonedx");
+    let images = fs::read_dir(workspace::root().join("examples/firmware"))?.collect::<Result<Vec<_>, _>>()?;
+    let images = images.into_iter().map(|image| image.path().join("Cargo.toml")).filter(|path| path.is_file());
+    let images = images.filter(|path| path.with_file_name("Cargo.lock").is_file());
+    for manifest in images.chain([workspace::root().join("std-port/cli/Cargo.toml")]) {
+        let name = format!("cara-components-{}", folder_name(&manifest));
+        Run::new(&tool.to_string_lossy())
+            .args(["cyclonedx", "--format", "json", "--spec-version", "1.5", "--override-filename", &name])
+            .args(["--manifest-path"])
+            .args([&manifest])
+            .env("SOURCE_DATE_EPOCH", "0")
+            .stream()?;
+        collect(&manifest, &format!("{name}.json"), folder)?;
+    }
+    Ok(())
+}
+
+fn folder_name(manifest: &Path) -> String {
+    let folder = manifest.parent().and_then(Path::file_name).unwrap_or_default();
+    folder.to_string_lossy().into_owned()
+}
+
+/// The tool writes a list beside each manifest of the workspace; the one of this package stays.
+fn collect(manifest: &Path, name: &str, folder: &Path) -> Result<()> {
+    let wanted = manifest.with_file_name(name);
+    ensure!(wanted.is_file(), "there is no {}", wanted.display());
+    fs::copy(&wanted, folder.join(name))?;
+    let written = Run::new("git").args(["ls-files", "--others", "--", &format!("*{name}")]).text()?;
+    written.lines().try_for_each(|path| Ok(fs::remove_file(workspace::root().join(path))?))
+}
+
+fn checksums(folder: &Path) -> Result<()> {
+    let mut names = fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name())).collect::<Result<Vec<_>>>()?;
+    names.sort();
+    let sums = Run::new("sha256sum").args(["--binary", "--"]).args(&names).within(folder).text()?;
+    Ok(fs::write(folder.join("SHA256SUMS"), sums)?)
+}
+
+/// Makes a release, and installs, runs, upgrades, removes and purges its package in a clean root.
+pub(crate) fn check() -> Result<()> {
+    let folder = make()?;
+    install::program("mmdebstrap", "mmdebstrap").map_err(anyhow::Error::msg)?;
+    let root = workspace::target().join("release-root");
+    empty(&root)?;
+    let packages = "--include=systemd,man-db";
+    Run::new("mmdebstrap").args(["--variant=minbase", packages, "bookworm"]).args([&root]).stream()?;
+    let processor = PROCESSORS.iter().find(|processor| processor.target.starts_with(std::env::consts::ARCH));
+    let package = format!("cara_{VERSION}_{}.deb", processor.context("amd64 or arm64")?.debian);
+    fs::copy(folder.join(&package), root.join("cara.deb"))?;
+    place(workspace::read(Path::new("tests/packages/in-root.sh"))?.as_bytes(), &root.join("check.sh"), 0o755)?;
+    // With a network of its own, in which there is loopback only.
+    let arguments = ["--net", "--mount", "--pid", "--fork", "--kill-child", "chroot"];
+    let printed = Run::new("unshare").args(arguments).args([&root]).args(["/check.sh"]).text()?;
+    print!("{printed}");
+    ensure!(printed.lines().last() == Some("all well"), "the check in the clean root did not come to its end");
+    Run::new("sha256sum").args(["--check", "--quiet", "SHA256SUMS"]).within(&folder).stream()
+}
