@@ -226,9 +226,11 @@ impl<P: Port> Node<P> {
         self.claims.rival = self.claims.rival.filter(|rival| rival.claim > tagged.claim);
     }
 
-    /// This m_unit may not claim now, so that a [`ClaimEvent::Raise`] was not done: it comes again, as if for the first time.
+    /// This m_unit may not claim now, so that a [`ClaimEvent::Raise`] was not done: it comes again, as if for the first time,
+    /// once new questions to its own identity and to the vehicles have brought no sign of the other manager.
     pub fn not_raised(&mut self, now: Instant) {
-        (self.claims.next_raise, self.claims.pause) = (now, FIRST_PAUSE);
+        (self.claims.next_raise, self.claims.pause) = (now + UNHEARD, FIRST_PAUSE);
+        (self.claims.questions.unanswered, self.claims.questions.asked_vehicles) = (0, false);
     }
 
     /// This m_unit starts beside a live one, or to take over from one that hangs: it raises its claim above all genuine ones until

@@ -62,7 +62,7 @@ impl Obedience {
     }
 
     /// Tells the hub when the peer was last heard, once it misses a keep-alive: a standby that asks counts from then, and not
-    /// from the end of the link. Once the peer is heard again the hub hears that at once, before it is asked.
+    /// from the end of the link. To be called as soon as the peer is heard again, before anything can end the link.
     pub(super) fn note_silence<P: Port>(&mut self, wire: &Wire<P>, cx: &mut Context<'_, P>) {
         let is_silent = wire.liveness.is_silent();
         if core::mem::replace(&mut self.is_silent, is_silent) != is_silent

@@ -212,6 +212,45 @@ fn a_manager_raises_its_claim_when_nobody_has_heard_the_other_one() {
     assert_eq!(watch(&mut node, at(56_100), at(110_000)).0, vec![], "storing failed, and a minute is not over");
 }
 
+/// What vehicles said before the port found that it may not claim, they may say no longer: they are asked again first.
+#[test]
+fn a_claim_that_could_not_be_raised_is_raised_on_new_evidence_only() {
+    let mut node = managed(5);
+    assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 60_000))), FENCED);
+    let raised = |node: &mut Node<InMemory>, start: u64| {
+        let mut outbox = Outbox::default();
+        let mut asked = (0, 0);
+        for now in (start..start + 10_000).step_by(50) {
+            while node.poll(at(now), &mut outbox, &Keyed).is_some() {}
+            for bytes in core::mem::take(&mut outbox.broadcasts) {
+                match Datagram::decode(&bytes, FLEET, &Keyed) {
+                    Ok(Datagram::WhoHas(WhoHas { wanted: Some(_), .. })) => asked.0 += 1,
+                    Ok(Datagram::WhoHas(_)) => asked.1 += 1,
+                    _ => {}
+                }
+            }
+            if let Some(event) = node.take_claim_event() {
+                assert_eq!(event, ClaimEvent::Raise(claim(7)));
+                return (now, asked);
+            }
+        }
+        panic!("it raises no claim");
+    };
+    let (mut now, _) = raised(&mut node, 1_000);
+    for _ in 0..5 {
+        node.not_raised(at(now));
+        let (next, (own, vehicles)) = raised(&mut node, now);
+        assert!((3_000..=6_000).contains(&(next - now)) && own >= 3 && vehicles > 0, "{now} {next} {own} {vehicles}");
+        now = next;
+    }
+    // A vehicle has heard the other manager meanwhile.
+    node.not_raised(at(now));
+    for second in now / 1_000..now / 1_000 + 20 {
+        assert_eq!(admit_at(&mut node, at(second * 1_000), 0, &agv(2, report(claim(7), 200))), FENCED);
+        assert_eq!(watch(&mut node, at(second * 1_000), at(second * 1_000 + 990)).0, vec![]);
+    }
+}
+
 /// Its vehicles report that it lives, whenever they hear this manager's search.
 #[test]
 fn a_manager_that_is_heard_by_a_vehicle_is_not_raised_above() {

@@ -201,8 +201,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
         self.run_calls();
     }
 
-    /// Takes what has come in the stream, and nothing else.
-    pub(super) fn read(&mut self) -> bool {
+    fn read(&mut self) -> bool {
         let mut worked = false;
         let mut arguments: Arguments = Box::default();
         if self.holds_back {
