@@ -86,6 +86,7 @@ impl<P: Port> Node<P> {
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
+        let was_missing = known.is_missing;
         let restarted = known.limits.is_some() && known.epoch != epoch;
         known.dialed = known.dialing.take_if(|dialing| *dialing == link).is_some();
         if known.dialed {
@@ -97,6 +98,7 @@ impl<P: Port> Node<P> {
         (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
         (known.under, known.is_missing) = (None, false);
         let offered = known.offered.take().filter(|(offered, _)| *offered > claim_of(claim.as_ref()));
+        let is_back = identity.role() == Role::SUnit && (was_missing || self.table.joined() == 0);
         // Cancel a dial that is planned or under way: a second link of the same node would only be refused.
         self.table.cancel(place);
         self.table.set_state(place, NodeState::Joined(link));
@@ -113,6 +115,9 @@ impl<P: Port> Node<P> {
             self.obey(identity, claim.as_ref());
         }
         self.was_obeyed();
+        if P::MANAGES && is_back {
+            self.found_again(now);
+        }
         debug!("link {} joins", link.0);
         Admission::Accept
     }

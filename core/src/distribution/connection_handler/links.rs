@@ -74,6 +74,7 @@ impl<P: Port> Node<P> {
 
     /// The link of a connected node has ended.
     fn part(&mut self, now: Instant, place: usize, reason: CloseReason) {
+        let was_full = P::MANAGES && self.is_full();
         self.table.set_state(place, NodeState::Away);
         self.table.cancel(place);
         let Some(known) = self.table.node_mut(place) else { return };
@@ -97,6 +98,9 @@ impl<P: Port> Node<P> {
         let is_orderly = matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere);
         if P::MANAGES && !is_orderly {
             self.miss(now, place);
+        }
+        if was_full {
+            self.place_is_free(now);
         }
         match self.config.target {
             _ if is_followed => {}

@@ -251,7 +251,11 @@ impl<P: Port> Node<P> {
 
     /// Changes the constraints. A lower maximum of nodes disconnects none, but the next is refused.
     pub fn set_constraints(&mut self, constraints: Constraints) {
+        let was_full = P::MANAGES && self.is_full();
         self.config.constraints = constraints;
+        if was_full {
+            self.place_is_free(Instant::START);
+        }
     }
 
     /// Moves to longer tables for a higher maximum of nodes. Does nothing if one is shorter. The findings keep their slots.

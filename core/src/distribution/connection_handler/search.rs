@@ -183,6 +183,9 @@ impl<P: Port> Node<P> {
         if !P::MANAGES || self.role() != Role::MUnit {
             return false;
         }
+        if self.is_full() {
+            return false;
+        }
         let has_fewer = self.known_nodes != u16::MAX && self.table.joined() < self.known_nodes;
         let is_missing = || has_fewer || self.table.iter().any(|known| known.is_missing);
         P::STANDS_BY && self.claims.has_stood_by || self.search.attempt < MISSING_SEARCHES && is_missing()
@@ -191,14 +194,39 @@ impl<P: Port> Node<P> {
     /// The link of a node has ended in no orderly way. If it is an s_unit, its manager searches until it is back; of m_units one
     /// dials the other.
     pub(super) fn miss(&mut self, now: Instant, place: usize) {
-        let misses_others = self.misses_nodes();
         let s_unit = self.table.node_mut(place).filter(|known| known.identity.role() == Role::SUnit);
         let Some(known) = s_unit else { return };
+        // The node counts as away by now, so that some are missing even if no search is planned.
+        let searches = self.search.next != Instant::FAR_FUTURE;
         known.is_missing = true;
-        if !misses_others {
-            self.search.attempt = 0;
-            self.search.next = now + self.random.jitter(FIRST_SEARCH);
+        if searches && self.misses_nodes() {
+            // The pause may be one of a search that missed nobody.
+            self.search.attempt = self.search.attempt.min(MISSING_BACK_OFF_AFTER);
+            self.search.next = self.search.next.min(now + back_off(MISSING_BACK_OFF_AFTER));
+        } else {
+            self.search_soon(now);
         }
+    }
+
+    /// A full manager has a free place again: whoever it has refused is to come soon.
+    pub(super) fn place_is_free(&mut self, now: Instant) {
+        if self.config.target == Target::Everybody && !self.is_full() {
+            self.search_soon(now);
+        }
+    }
+
+    /// A node is back that was away against its will. Others may be, too, for which the search has ended by now.
+    pub(super) fn found_again(&mut self, now: Instant) {
+        let has_ended = self.search.attempt >= MISSING_SEARCHES;
+        self.search.attempt = self.search.attempt.min(MISSING_SEARCHES / 2);
+        if has_ended && self.misses_nodes() {
+            self.search.next = self.search.next.min(now + self.random.jitter(FIRST_SEARCH));
+        }
+    }
+
+    fn search_soon(&mut self, now: Instant) {
+        self.search.attempt = 0;
+        self.search.next = now + self.random.jitter(FIRST_SEARCH);
     }
 
     /// Searches again after a loss: an s_unit listens for this long first. `None`: the link was lost at once.
@@ -229,9 +257,11 @@ impl<P: Port> Node<P> {
     /// Searches a few times, as after the start, even while nodes are connected. Only m_units do: one of them may have
     /// moved.
     pub(super) fn look_around(&mut self, now: Instant) {
-        if self.config.target == Target::Everybody && !self.is_searching() {
-            self.search.attempt = 0;
-            self.search.next = now + self.random.jitter(FIRST_SEARCH);
+        if self.config.target != Target::Everybody {
+            return;
+        }
+        if self.search.next == Instant::FAR_FUTURE || !self.is_searching() {
+            self.search_soon(now);
         }
     }
 

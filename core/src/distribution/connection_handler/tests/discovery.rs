@@ -75,6 +75,94 @@ fn an_m_unit_that_misses_an_s_unit_searches_until_it_is_back_or_for_a_minute() {
     assert_eq!(count, usize::from(search::MISSING_SEARCHES));
 }
 
+/// A manager with no spare keys, all of whose vehicles were there.
+#[test]
+fn a_manager_of_a_whole_fleet_searches_for_the_first_that_is_lost() {
+    let agvs = [s_unit("agv", 1), s_unit("agv", 2)];
+    let whole = || {
+        let mut node = depot();
+        node.expect(2);
+        for (link, agv) in agvs.iter().enumerate() {
+            join(&mut node, at(1), link as u16, agv);
+        }
+        node
+    };
+    // Also while the last of its first searches is planned, after a longer pause than one that misses a node makes.
+    for millis in [300, 1_000, 3_000, 100_000] {
+        let mut node = whole();
+        search_times(&mut node, at(millis));
+        node.left(at(millis), LinkId(0), CloseReason::Silent);
+        let searches = search_times(&mut node, at(millis + 300_000));
+        let pauses = searches.windows(2).map(|pair| pair[1].since(pair[0]));
+        assert!(searches[0] <= at(millis + 1_000), "{millis} {searches:?}");
+        assert!(pauses.max() <= Some(Duration::from_secs(2)), "{millis} {searches:?}");
+        assert!((28..=30).contains(&searches.len()), "{millis} {searches:?}");
+    }
+    // One that is lost towards the end of the search for another one is searched for as long.
+    let mut node = whole();
+    node.left(at(100_000), LinkId(0), CloseReason::Silent);
+    search_times(&mut node, at(130_000));
+    node.left(at(130_000), LinkId(1), CloseReason::Silent);
+    join(&mut node, at(130_100), 2, &agvs[1]);
+    assert!(search_times(&mut node, at(300_000)).len() >= 28);
+}
+
+#[test]
+fn a_full_manager_searches_when_a_place_is_free_and_not_before() {
+    let excess = s_unit("agv", 3);
+    let full = || {
+        let mut node = depot();
+        node.expect(3);
+        node.set_maximum_nodes(2);
+        join(&mut node, at(1), 0, &s_unit("agv", 1));
+        join(&mut node, at(1), 1, &s_unit("agv", 2));
+        assert!(search_times(&mut node, at(30_000)).len() <= 4);
+        assert_eq!(search_times(&mut node, at(100_000)), []);
+        let refused = node.admit(at(100_000), LinkId(2), address(3, 40_000), &hello_of(&excess));
+        assert_eq!(refused, Admission::Refuse(Refusal::Full));
+        node
+    };
+    for reason in [CloseReason::Stopped, CloseReason::Silent, CloseReason::Reset] {
+        let mut node = full();
+        node.left(at(100_000), LinkId(0), reason);
+        assert!(search_times(&mut node, at(101_000)).first().is_some_and(|first| *first <= at(100_300)), "{reason}");
+        join(&mut node, at(101_000), 2, &excess);
+        // Of the first four, which look for managers as well, those that are left.
+        assert!(search_times(&mut node, at(200_000)).len() < 4, "it is full again");
+    }
+    // Also a higher maximum makes places free.
+    let mut node = full();
+    node.set_constraints(Constraints { maximum_nodes: 3, ..Constraints::M_UNIT });
+    assert!(search_times(&mut node, at(101_000)).len() > 1);
+}
+
+/// Its search has ended by the time that the network is back.
+#[test]
+fn after_a_long_outage_the_first_that_is_back_makes_a_manager_search_for_the_others() {
+    let agvs = [s_unit("agv", 1), s_unit("agv", 2), s_unit("agv", 3)];
+    for stays in [0, 1] {
+        let mut node = depot();
+        for (link, agv) in agvs.iter().enumerate() {
+            join(&mut node, at(1), link as u16, agv);
+        }
+        search_times(&mut node, at(100_000));
+        for link in stays..3 {
+            node.left(at(100_000), LinkId(link), CloseReason::Silent);
+        }
+        search_times(&mut node, at(900_000));
+        join(&mut node, at(900_000), 3, &agvs[1]);
+        let searches = search_times(&mut node, at(920_000));
+        let pauses = searches.windows(2).map(|pair| pair[1].since(pair[0]));
+        assert!(searches.first().is_some_and(|first| *first <= at(900_300)), "{stays} {searches:?}");
+        assert!(pauses.max() <= Some(Duration::from_secs(2)), "{stays} {searches:?}");
+        join(&mut node, at(920_000), 4, &agvs[2]);
+        if stays == 0 {
+            join(&mut node, at(920_000), 5, &agvs[0]);
+        }
+        assert_eq!(search_times(&mut node, at(999_000)), []);
+    }
+}
+
 #[test]
 fn a_broadcast_that_is_asked_for_goes_out_at_once_or_when_the_budget_allows() {
     let mut node = depot();
@@ -554,7 +642,15 @@ fn a_manager_that_has_moved_is_asked_for_soon_however_long_it_was_away() {
 
 #[test]
 fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
+    // With as many nodes as it knows of it has nothing planned when it loses one.
+    for known_nodes in [u16::MAX, 2] {
+        asks_where_its_peer_is(known_nodes);
+    }
+}
+
+fn asks_where_its_peer_is(known_nodes: u16) {
     let mut node = node(m_unit("a", 1));
+    node.expect(known_nodes);
     let peer = m_unit("b", 2);
     join(
         &mut node,
@@ -577,7 +673,8 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
         }
         searches.extend(outbox.broadcasts.iter().map(|_| now));
     }
-    assert_eq!(searches.len(), 4, "{searches:?}");
+    let count = if known_nodes == 2 { usize::from(search::MISSING_SEARCHES) } else { 4 };
+    assert_eq!(searches.len(), count, "{searches:?}");
     let moved = announce_of(&peer, 2, node.search.nonce);
     node.hear(at(200_000), address(3, 7_001), &announce_bytes(&moved));
     let actions = run(&mut node, at(200_001), &mut Outbox::default());
