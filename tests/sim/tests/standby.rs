@@ -234,6 +234,27 @@ fn a_manager_that_freezes_is_replaced_within_five_seconds() {
     assert!(took.iter().all(|took| *took <= Duration::from_secs(5)), "{took:?}");
 }
 
+/// It has as many keys as vehicles, and all were there. By the time that the network is whole again, a vehicle that was cut off
+/// searches seldom: its manager searches for it.
+#[test]
+fn a_vehicle_that_was_cut_off_is_back_within_five_seconds_in_a_fleet_without_spare_keys() {
+    let has_leader = |fleet: &Fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader));
+    let took = for_each_seed(8, |seed| {
+        let mut fleet = Fleet::new(seed, Size { managers: 1, vehicles: 5, disks_fail: false });
+        let mut random = Random::new(seed);
+        assert!(fleet.until(STARTS, has_leader).is_some());
+        fleet.run(between(&mut random, 0, 20_000));
+        let (manager, lost) = (fleet.managers[0].host(), fleet.vehicles[0].host());
+        fleet.world.network(|network| network.partition(&[manager], &[lost], Direction::Both));
+        assert!(fleet.until(STARTS, |fleet| !has_leader(fleet)).is_some());
+        fleet.run(between(&mut random, 10_000, 40_000));
+        fleet.world.network(|network| network.heal_all());
+        fleet.until(STARTS, has_leader).unwrap_or(STARTS)
+    });
+    println!("back after {took:?}");
+    assert!(took.iter().all(|took| *took <= Duration::from_secs(5)), "{took:?}");
+}
+
 /// Two that start at once, or of which neither hears the other, end with one that commands and one that stands by.
 #[test]
 fn of_two_that_command_the_lower_claim_stands_by_again() {
