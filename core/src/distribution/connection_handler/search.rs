@@ -421,8 +421,9 @@ impl<P: Port> Node<P> {
         }
         if self.obeyed_report(now, &who_has.identity).is_some() && !self.is_connected(&who_has.identity, who_has.epoch)
         {
-            // What this unit has obeyed, a manager of that identity is to know.
-            self.answer_later(now, from, &who_has.identity, who_has.nonce);
+            // What this unit has obeyed, a manager of that identity is to know. It may decide within a second, and a thousand vehicles
+            // that answer at the same moment overflow its socket: half a second at most.
+            self.answer_later(now + delay.divided_by(4), from, &who_has.identity, who_has.nonce);
         }
         if !who_has.standby {
             self.hinted(now, from, &who_has.identity, who_has.epoch, delay);

@@ -1,6 +1,6 @@
 //! Claims: which of two managers of one identity commands; and that nothing a peer says ends more than its own link.
 
-use std::vec;
+use std::{println, vec};
 
 use super::*;
 use crate::distribution::authenticator::{Authenticator, CODE_BYTES};
@@ -77,6 +77,8 @@ fn admit(node: &mut Node<InMemory>, link: u16, hello: &Hello) -> Admission {
 fn admit_at(node: &mut Node<InMemory>, now: Instant, link: u16, hello: &Hello) -> Admission {
     node.admit(now, LinkId(link), address(1, 7_000), hello)
 }
+
+const SOON: u64 = 400;
 
 const FENCED: Admission = Admission::Refuse(Refusal::Fenced);
 
@@ -249,6 +251,39 @@ fn a_claim_that_could_not_be_raised_is_raised_on_new_evidence_only() {
         assert_eq!(admit_at(&mut node, at(second * 1_000), 0, &agv(2, report(claim(7), 200))), FENCED);
         assert_eq!(watch(&mut node, at(second * 1_000), at(second * 1_000 + 990)).0, vec![]);
     }
+}
+
+/// A manager searches for them every 1 to 2 s.
+#[test]
+fn a_thousand_vehicles_do_not_say_at_the_same_moment_what_they_have_obeyed() {
+    let search = WhoHas { expected: 1_000, ..search_of(&m_unit(MANAGER, MANAGER_ID), 1) };
+    let depot = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    let mut bytes = 0;
+    let mut answered: Vec<_> = (1..=1_000)
+        .map(|id| {
+            let mut node = node(s_unit("agv", id));
+            node.keep_obeyed(at(0), &depot, tagged(claim(5)));
+            run(&mut node, at(SOON), &mut Outbox::default());
+            node.hear(at(SOON), address(9, 7_001), &who_has_bytes(&search));
+            let mut outbox = Outbox::default();
+            while outbox.sent.is_empty() {
+                let now = node.next_deadline();
+                while node.poll(now, &mut outbox, &Plain).is_some() {}
+                if !outbox.sent.is_empty() {
+                    assert!(as_announce(&outbox.sent[0].1).obeyed.is_some());
+                    bytes += outbox.sent[0].1.len();
+                    return now;
+                }
+            }
+            at(0)
+        })
+        .collect();
+    answered.sort();
+    let after =
+        |from: Instant| answered.iter().filter(|at| (from..from + Duration::from_millis(10)).contains(at)).count();
+    let most = answered.iter().map(|from| after(*from)).max().unwrap();
+    println!("{bytes} bytes in {:?}, {most} answers within 10 ms", answered[999].since(at(SOON)));
+    assert!(most < 100 && answered[999] <= at(SOON + 500), "{most} {:?}", answered[999]);
 }
 
 /// Its vehicles report that it lives, whenever they hear this manager's search.
