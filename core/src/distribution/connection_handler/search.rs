@@ -194,12 +194,12 @@ impl<P: Port> Node<P> {
     /// The link of a node has ended in no orderly way. If it is an s_unit, its manager searches until it is back; of m_units one
     /// dials the other.
     pub(super) fn miss(&mut self, now: Instant, place: usize) {
+        // The node counts as away by now, so that some may be missing though no search is planned.
+        let searches = self.search.next != Instant::FAR_FUTURE && self.misses_nodes();
         let s_unit = self.table.node_mut(place).filter(|known| known.identity.role() == Role::SUnit);
         let Some(known) = s_unit else { return };
-        // The node counts as away by now, so that some are missing even if no search is planned.
-        let searches = self.search.next != Instant::FAR_FUTURE;
         known.is_missing = true;
-        if searches && self.misses_nodes() {
+        if searches {
             // The pause may be one of a search that missed nobody.
             self.search.attempt = self.search.attempt.min(MISSING_BACK_OFF_AFTER);
             self.search.next = self.search.next.min(now + back_off(MISSING_BACK_OFF_AFTER));
