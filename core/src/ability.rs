@@ -21,6 +21,8 @@ pub use On as Streams;
 pub const STREAMS: bool = Streams::IS_ON;
 /// Failures with text and values, progress of running calls, and cancellation.
 pub const DETAILS: bool = Details::IS_ON;
+/// Hand-over of a vehicle to another manager.
+pub const HAND_OVER: bool = cfg!(feature = "hand-over");
 /// Lists and records.
 pub const NESTED: bool = Nested::IS_ON;
 /// Waiting calls begin by deadline. Without this they begin in order of arrival, whatever the constraints are.

@@ -85,6 +85,8 @@ pub const RENEWAL_TIMEOUT: Duration = Duration::from_secs(60);
 pub const PREVIOUS_KEY_LIFE: Duration = Duration::from_secs(5);
 /// How long an old link has to answer the challenge that distinguishes a restarted peer from a duplicate.
 pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
+/// A vehicle that is handed over to another manager goes back unless it has joined there within this time.
+pub const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Shortest keep-alive interval.
 pub const SHORTEST_KEEP_ALIVE: Duration = Duration::from_millis(1);
 /// Longest keep-alive interval. A unit refuses a longer one of its own, and limits a peer's to this, so that a vanished peer is

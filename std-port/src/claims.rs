@@ -85,7 +85,7 @@ mod tests {
     use cara_core::distribution::claim::{Claim, TaggedClaim};
 
     use super::*;
-    use crate::keys::KeptObeyed;
+    use crate::keys::{KeptHandOver, KeptObeyed};
 
     #[test]
     fn what_is_kept_is_read_and_what_is_damaged_is_none() {
@@ -97,8 +97,10 @@ mod tests {
         let manager = Identity::m_unit("a hall with spaces", 2).unwrap();
         let tagged = TaggedClaim { claim: claim(u64::MAX), tag: [0xA5; 16] };
         let obeyed = KeptObeyed { manager, tagged, key: [7; 6] };
-        let kept = KeptClaims { own: claim(3), obeyed: vec![obeyed.clone(), obeyed] };
-        for kept in [KeptClaims { own: claim(u64::MAX), obeyed: vec![] }, kept] {
+        let kept = KeptClaims { own: claim(3), obeyed: vec![obeyed.clone(), obeyed], handed: None };
+        let handed = KeptHandOver { home: depot.clone(), present: Identity::m_unit("the yard", 3).unwrap() };
+        let moved = KeptClaims { handed: Some(handed), ..kept.clone() };
+        for kept in [KeptClaims { own: claim(u64::MAX), ..KeptClaims::default() }, kept, moved] {
             file.keep(&kept).unwrap();
             assert_eq!(file.read(), kept);
         }

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::message::HandOverRefusal;
 use cara_core::error::Error;
 use cara_core::services::call::{self, CallDetails, Detail};
 
@@ -36,6 +37,17 @@ impl CallDetails for BoxedDetail {
     fn get(&self) -> Option<&Detail> {
         self.0.as_deref()
     }
+}
+
+/// Why a vehicle was not [handed over](crate::Peer::hand_over).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum HandOverError {
+    /// The vehicle stays.
+    #[error(transparent)]
+    Refused(HandOverRefusal),
+    /// It was not asked, or has not answered.
+    #[error(transparent)]
+    Link(#[from] Error),
 }
 
 /// Why a unit does not start.

@@ -123,6 +123,7 @@ pub use cara_core::distribution::failure::Failure;
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec, VariableSpecs};
 pub use cara_core::distribution::hello::{Limits, Manager};
 pub use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+pub use cara_core::distribution::message::HandOverRefusal;
 pub use cara_core::distribution::name::{Shown, is_hidden};
 pub use cara_core::distribution::parameters::{
     Elements, Fields, ListWriter, Parameters, ParametersView, RecordWriter, Type, Value,
@@ -141,7 +142,7 @@ pub use cara_derive::{VariablesStd as Variables, interface_std as interface};
 pub use communication_system::{CallToAll, CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use engine::details::Canceller;
-pub use error::{CallError, StartError};
+pub use error::{CallError, HandOverError, StartError};
 pub use event::{Finding, UnitEvent};
 pub use growing::{CallParameters, GrowingParameters};
 pub use handle::{Handle, MUnit, SUnit, WeakHandle};

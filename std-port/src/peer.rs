@@ -7,7 +7,7 @@ use cara_core::config::Constraints;
 use cara_core::distribution::claim::Claim;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::Function;
-use cara_core::distribution::hello::Limits;
+use cara_core::distribution::hello::{Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
@@ -24,6 +24,7 @@ use crate::control::protocol::{DatagramsInfo, LinkInfo};
 use crate::engine::link::LinkCell;
 use crate::engine::peer_cell::PeerCell;
 use crate::engine::{Engine, pairs};
+use crate::error::HandOverError;
 use crate::growing::{CallParameters, bytes_of_results};
 
 /// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
@@ -207,6 +208,16 @@ impl<T: Send + 'static> Peer<T> {
     /// [`Error::TimedOut`] when no answer comes in time.
     pub fn ping(&self, timeout: impl Into<Duration>) -> Result<Duration, Error> {
         self.engine.ping(&self.link()?, timeout.into())
+    }
+
+    /// Hands this vehicle over to another manager while nothing of it moves: it leaves this one, and is back within about ten seconds
+    /// unless it has joined the other one there. Its latches and last orders stay with it. `Ok`: it has left; where it is now, the other
+    /// manager knows. It stays there until that manager hands it over again, or [`forget_claims`](crate::control::forget_claims).
+    ///
+    /// [`HandOverError::Link`] with [`Error::TimedOut`]: it has not answered in time, or knows no hand-over, as boards do. With
+    /// [`Error::NotConnected`]: it was not there, or left before its answer came, and may be on its way.
+    pub fn hand_over(&self, to: &Manager, timeout: impl Into<Duration>) -> Result<(), HandOverError> {
+        self.engine.hand_over_to(&self.link()?, to, timeout.into())
     }
 
     pub(crate) fn link(&self) -> Result<Arc<LinkCell>, Error> {

@@ -170,6 +170,8 @@ def read_fields(reader, fields):
         elif encoding == "refusal":
             refusal = reader.varint(32)
             value[name] = REFUSALS[refusal] if refusal < len(REFUSALS) else "unknown"
+        elif encoding == "stays":
+            value[name] = min(reader.varint(32), 6)
         elif encoding == "latch":
             reason, by = reader.varint(32), reader.varint(32)
             value[name] = {"by": by, "reason": min(reason - 1, 0xFFFF)} if reason else None
@@ -404,9 +406,11 @@ CONTROLS = {
     8: ("subscribe", [("slot", 16), ("generation", 16), ("interval", 32)]),
     9: ("subscribed", [("slot", 16), ("generation", 16), ("interval", 32), ("bytes", 32), ("refusal", "refusal")]),
     10: ("claimed", CLAIM),
+    11: ("hand_over", [("name", "bytes"), ("id", 32)]),
+    12: ("handed_over", [("refusal", "stays")]),
 }
 # Behind one of these nothing follows in a message.
-LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator", "subscribed")
+LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator", "subscribed", "handed_over")
 REFUSALS = ["none", "unknown", "not_allowed", "full"]
 LEASE_ENDS = ["finished", "expired", "replaced", "stopped", "released"]
 

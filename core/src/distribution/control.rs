@@ -5,7 +5,7 @@ use super::claim::Claim;
 use super::compact::{Reader, Writer};
 use super::hello::ClaimReport;
 use super::items::{Item, Malformed};
-use crate::ability::STREAMS;
+use crate::ability::{HAND_OVER, STREAMS};
 use crate::error::Error;
 
 /// The message kind of control messages.
@@ -107,6 +107,18 @@ controls! {
         /// The new claim.
         report: ClaimReport,
     }
+    /// The reader is to leave the sender, its manager, for another one.
+    11 if HAND_OVER => HandOver {
+        /// The name of the new manager.
+        name: &'b [u8],
+        /// Its ID number.
+        id: u32,
+    }
+    /// The answer to `HandOver`. After consent the sender ends the link.
+    12 if HAND_OVER => HandedOver {
+        /// Why not; `None`: it leaves.
+        refusal: Option<HandOverRefusal>,
+    }
     /// The sender subscribes to a stream of the reader, or ends the subscription.
     8 if STREAMS => Subscribe {
         /// Its slot.
@@ -156,6 +168,51 @@ impl Field<'_> for SubscriptionRefusal {
             2 => Self::NotAllowed,
             3 => Self::Full,
             _ => Self::Unknown,
+        }
+    }
+}
+
+/// Why a vehicle stays with its manager.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+#[repr(u8)]
+#[non_exhaustive]
+pub enum HandOverRefusal {
+    /// Something moves, stops or waits to move.
+    #[error("the vehicle moves: release its orders first")]
+    Moves = 1,
+    /// It has no key for the new manager, or is in plain mode.
+    #[error("the vehicle has no key for that manager: add one with `cara keys`, and try again")]
+    NoKey = 2,
+    /// It dials its manager at a fixed address.
+    #[error("the vehicle dials its manager at a fixed address: change its configuration instead")]
+    Fixed = 3,
+    /// It cannot store to whom it belongs.
+    #[error("the vehicle cannot store to whom it belongs: give it a folder of state, or forget a claim")]
+    NotStored = 4,
+    /// An earlier hand-over has not ended.
+    #[error("an earlier hand-over of the vehicle has not ended: try again later")]
+    Underway = 5,
+    /// Its own manager was named, the name is not valid, or a reason that this version does not know.
+    #[error("the vehicle cannot go to that manager: check the name and id")]
+    Other = 6,
+}
+
+/// 0 for none.
+impl Field<'_> for Option<HandOverRefusal> {
+    fn put(self, writer: &mut Writer<'_>) {
+        writer.number(self.map_or(0, |refusal| refusal as u64));
+    }
+
+    fn take(reader: &mut Reader<'_>) -> Self {
+        use HandOverRefusal::{Fixed, Moves, NoKey, NotStored, Other, Underway};
+        match reader.u32() {
+            0 => None,
+            1 => Some(Moves),
+            2 => Some(NoKey),
+            3 => Some(Fixed),
+            4 => Some(NotStored),
+            5 => Some(Underway),
+            _ => Some(Other),
         }
     }
 }
@@ -403,7 +460,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_read_is_written_again(kind in 0..9_u16, body in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40)) {
+        fn what_is_read_is_written_again(kind in 0..=Control::KINDS, body in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40)) {
             if let Ok(Some(control)) = Control::take(&Item { kind, body: &body }) {
                 let mut out = [0; 80];
                 prop_assert_eq!(read(control.encode(&mut out).unwrap()), Some(control));

@@ -3,8 +3,8 @@
 //! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) are the only code with knowledge of the
 //! encoding, which `docs/wire.md` specifies.
 
-pub use super::control::SubscriptionRefusal;
-pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome, trace_id};
+pub use super::control::{ActuatorState, Control, HandOverRefusal, LastOrder, Latch, LeaseEnd, OrderOutcome};
+pub use super::control::{SubscriptionRefusal, trace_id};
 pub use super::table::NO_SUBSCRIPTION;
 
 use super::block::Put;

@@ -47,7 +47,8 @@ pub fn state_folder() -> Option<PathBuf> {
 }
 
 /// Forgets the claims that a unit with this [folder of state](crate::Builder::state_folder) has obeyed, of one fleet or of all, while
-/// its program does not run: it obeys any manager of these identities again. What the unit itself has claimed stays. A line in the
+/// its program does not run: it obeys any manager of these identities again. A vehicle
+/// that was handed over belongs to its configured manager again. What the unit itself has claimed stays. A line in the
 /// [audit log](crate::Builder::audit) comes first.
 pub fn forget_claims(
     folder: &Path,
@@ -65,6 +66,7 @@ pub fn forget_claims(
             if error.kind() == io::ErrorKind::WouldBlock { ForgetError::Runs(unit.clone()) } else { wrong(error) }
         })?;
         let mut kept = keys::read_claims(&file.path)?.unwrap_or_default();
+        kept.handed = None;
         let obeyed = kept.obeyed.drain(..);
         let forgotten: Vec<_> =
             obeyed.map(|obeyed| Forgotten { fleet: of, manager: obeyed.manager, claim: obeyed.tagged.claim }).collect();
@@ -95,7 +97,7 @@ mod tests {
         let claim = |term| Claim { term, claimant: 3 };
         let obeyed =
             KeptObeyed { manager: manager.clone(), tagged: TaggedClaim { claim: claim(9), tag: [1; 16] }, key: [2; 6] };
-        let kept = KeptClaims { own: claim(4), obeyed: vec![obeyed] };
+        let kept = KeptClaims { own: claim(4), obeyed: vec![obeyed], handed: None };
         let files = ["agv-1-7-s_unit-3", "agv-1-7-m_unit-4", "agv-1-8-s_unit-3", "agv-7-s_unit-3"]
             .map(|name| ClaimFile { path: path(name).with_added_extension("claims") });
         files.iter().for_each(|file| file.keep(&kept).unwrap());
@@ -107,7 +109,7 @@ mod tests {
         drop(runs);
         let forgotten = Forgotten { fleet: 3, manager, claim: claim(9) };
         assert_eq!(forget(Some(3)).unwrap(), std::slice::from_ref(&forgotten));
-        assert_eq!(files[0].read(), KeptClaims { own: claim(4), obeyed: Vec::new() });
+        assert_eq!(files[0].read(), KeptClaims { own: claim(4), ..KeptClaims::default() });
         assert!(files[1..].iter().all(|file| file.read() == kept));
         let lines = std::fs::read_to_string(&audit).unwrap();
         assert!(lines.contains("forget-claim") && lines.contains("agv-1/7") && lines.lines().count() == 1, "{lines}");

@@ -17,7 +17,7 @@ use super::keys::Keys;
 use crate::claims::ClaimFile;
 use crate::clock::Clock;
 use crate::error::StartError;
-use crate::keys::{KeptClaims, KeptObeyed, KeyRing};
+use crate::keys::{KeptClaims, KeptHandOver, KeptObeyed, KeyRing};
 use crate::locks::lock;
 use crate::sys::random;
 
@@ -194,6 +194,11 @@ impl Claims {
             for KeptObeyed { manager, tagged, .. } in &kept.obeyed {
                 cell.hub.node.keep_obeyed(clock.now(), manager, *tagged);
             }
+            if let Some(KeptHandOver { home, present }) =
+                kept.handed.as_ref().filter(|kept| ring.pair(&kept.present).is_some())
+            {
+                cell.hub.node.belong_to(home, present);
+            }
             if file.is_some() {
                 cell.hub.node.store_claims();
             }
@@ -282,12 +287,15 @@ impl Claims {
         let key = ring.as_ref().and_then(|ring| ring.pair(&manager)).map(|key| key.fingerprint());
         let Some(key) = key else { return Written::Failed(Job::Keep(manager, tagged)) };
         let obeyed = KeptObeyed { manager: manager.clone(), tagged, key };
-        if kept.obeyed.contains(&obeyed) {
+        let handed = hub.lock().hub.node.handed_over(&manager);
+        let handed = handed.map(|(home, present)| KeptHandOver { home, present });
+        if kept.obeyed.contains(&obeyed) && kept.handed == handed {
             hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
             return Written::Nothing;
         }
         kept.obeyed.retain(|obeyed| obeyed.manager != manager);
         kept.obeyed.push(obeyed);
+        kept.handed = handed;
         if let Err(error) = self.store(hub, &kept) {
             tracing::error!(%error, "a claim cannot be stored");
             return Written::Failed(Job::Keep(manager, tagged));

@@ -32,6 +32,7 @@ mod clock_thread;
 pub(crate) mod details;
 mod driving;
 mod events;
+mod hand_over;
 mod hub;
 mod inbound;
 mod interfaces;

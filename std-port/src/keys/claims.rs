@@ -21,6 +21,16 @@ pub(crate) struct KeptClaims {
     pub(crate) own: Claim,
     /// The highest of each manager that it has obeyed.
     pub(crate) obeyed: Vec<KeptObeyed>,
+    /// Of a vehicle that was handed over.
+    pub(crate) handed: Option<KeptHandOver>,
+}
+
+/// The manager that a vehicle was handed over to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct KeptHandOver {
+    /// The one that it was configured with: with another one this does not count.
+    pub(crate) home: Identity,
+    pub(crate) present: Identity,
 }
 
 /// A claim that a vehicle has obeyed.
@@ -45,11 +55,20 @@ fn parse(text: &str) -> Result<KeptClaims, FormError> {
     let mut lines = Lines::of(text);
     lines.head(HEAD, "a file with claims begins with `cara-claims`")?;
     let (own, _) = claim(lines.expect("own", "here `own` is expected")?)?;
-    let obeyed = lines.map(|line| match line.word {
-        "obeyed" => parse_obeyed(line),
-        _ => Err(line.wrong("here `obeyed` is expected")),
-    });
-    Ok(KeptClaims { own, obeyed: obeyed.collect::<Result<_, _>>()? })
+    let mut kept = KeptClaims { own, ..KeptClaims::default() };
+    let mut home = None;
+    for line in lines {
+        match line.word {
+            "obeyed" => kept.obeyed.push(parse_obeyed(line)?),
+            "home" => home = Some(line.identity()?),
+            "present" => {
+                let present = line.identity()?;
+                kept.handed = home.take().map(|home| KeptHandOver { home, present });
+            }
+            _ => return Err(line.wrong("here `obeyed`, `home` or `present` is expected")),
+        }
+    }
+    Ok(kept)
 }
 
 fn claim(line: Line<'_>) -> Result<(Claim, Line<'_>), FormError> {
@@ -86,6 +105,13 @@ pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyErro
         let _ = write!(text, "obeyed {term} {claimant} {} {} ", digits(&tagged.tag), digits(key));
         push_identity(&mut text, manager);
         text.push('\n');
+    }
+    if let Some(KeptHandOver { home, present }) = &kept.handed {
+        for (word, manager) in [("home ", home), ("present ", present)] {
+            text.push_str(word);
+            push_identity(&mut text, manager);
+            text.push('\n');
+        }
     }
     push_sum(&mut text);
     if let Some(folder) = path.parent() {

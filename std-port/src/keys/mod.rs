@@ -34,7 +34,7 @@ mod store;
 mod text;
 
 pub use cara_secure::keys::{DeviceSecret, DiscoveryKey, KEY_BYTES, PairKey, RootKey};
-pub(crate) use claims::{KeptClaims, KeptObeyed, read_claims, write_claims};
+pub(crate) use claims::{KeptClaims, KeptHandOver, KeptObeyed, read_claims, write_claims};
 pub use error::{FleetError, KeyError, Owner};
 #[cfg(feature = "access")]
 pub(crate) use file::Mark;

@@ -173,6 +173,10 @@ fn control(control: &Control<'_>) -> Value {
             "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
         }}),
         Control::Claimed { report } => json!({ "claimed": claim(Some(&report)) }),
+        Control::HandOver { name, id } => {
+            json!({ "hand_over": { "name": hex(name), "id": id } })
+        }
+        Control::HandedOver { refusal } => json!({ "handed_over": { "refusal": refusal.map_or(0, |why| why as u8) } }),
         Control::LeaseEnded { call, why } => json!({ "lease_ended": { "call": call, "why": why.word() } }),
         Control::Subscribe { slot, generation, interval } => json!({ "subscribe": {
             "slot": slot, "generation": generation, "interval": interval,

@@ -5,7 +5,7 @@ use cara_core::distribution::claim::Claim;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::message::{
-    Control, LastOrder, Latch, LeaseEnd, Release, Renewal, RequestHeader, SampleHeader, SessionBody,
+    Control, HandOverRefusal, LastOrder, Latch, LeaseEnd, Release, Renewal, RequestHeader, SampleHeader, SessionBody,
     SubscriptionRefusal, encode_failure, encode_progress, encode_reply,
 };
 use cara_core::error::{Error, ServiceError};
@@ -225,7 +225,7 @@ fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
     let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
     let publish = Control::Publish { slot: 300, generation: 2, attributes: &attributes, signature: stop.as_bytes() };
-    let all: [(&'static str, &'static str, Control<'_>, Value); 16] = [
+    let all: [(&'static str, &'static str, Control<'_>, Value); 18] = [
         (
             "publish",
             "a function may be called",
@@ -258,6 +258,18 @@ fn controls() -> Vec<Vector> {
             "the manager has raised its claim",
             Control::Claimed { report: report(u32::MAX) },
             json!({ "claimed": reported(u32::MAX) }),
+        ),
+        (
+            "hand_over",
+            "the manager sends its vehicle to another one",
+            Control::HandOver { name: b"yard", id: 70_000 },
+            json!({ "hand_over": { "name": "79617264", "id": 70_000 } }),
+        ),
+        (
+            "handed_over",
+            "something moves: the vehicle stays",
+            Control::HandedOver { refusal: Some(HandOverRefusal::Moves) },
+            json!({ "handed_over": { "refusal": 1 } }),
         ),
         (
             "lease_ended",

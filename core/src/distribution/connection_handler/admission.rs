@@ -113,6 +113,7 @@ impl<P: Port> Node<P> {
         }
         if identity.role() == Role::MUnit {
             self.obey(identity, claim.as_ref());
+            self.arrived(now, identity);
         }
         self.was_obeyed();
         if P::MANAGES && is_back {

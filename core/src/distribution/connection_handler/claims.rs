@@ -193,6 +193,29 @@ impl Claims {
         self.obeyed.iter_mut().find(|(identity, _)| identity == manager).map(|(_, obeyed)| obeyed)
     }
 
+    /// Whether this unit can store what it obeys of a manager.
+    pub(super) fn can_keep(&self, manager: &Identity) -> bool {
+        self.stores && (self.of(manager).is_some() || !self.obeyed.is_full())
+    }
+
+    /// Has the port store the claim of a manager now, whatever was stored of it before.
+    pub(super) fn want_kept(&mut self, now: Instant, manager: &Identity) {
+        if let Some(obeyed) = self.of_mut(manager) {
+            obeyed.keeping = Keeping::Wanted(now, false);
+            self.questions.next = now;
+        }
+    }
+
+    /// Whether the claim of a manager could not be stored.
+    pub(super) fn has_failed(&self, manager: &Identity) -> bool {
+        self.of(manager).is_some_and(|obeyed| matches!(obeyed.keeping, Keeping::Failed(_)))
+    }
+
+    /// Whether nobody has asked the port to store the claim of a manager.
+    pub(super) fn is_unasked(&self, manager: &Identity) -> bool {
+        self.of(manager).is_some_and(|obeyed| obeyed.keeping == Keeping::Unasked)
+    }
+
     pub(super) fn meet_rival(&mut self, now: Instant, claim: Claim, silent: Duration) {
         let rival = self.rival.get_or_insert(Rival { claim, silent, reported: now });
         let known = rival.silent + now.since(rival.reported);
@@ -260,8 +283,14 @@ impl<P: Port> Node<P> {
     /// What was stored in answer to [`ClaimEvent::Keep`], or could not be.
     pub fn claim_kept(&mut self, manager: &Identity, claim: Claim, kept: bool) {
         let Some(obeyed) = self.claims.of_mut(manager).filter(|obeyed| obeyed.tagged.claim == claim) else { return };
+        let is_target = self.target.as_ref() == Some(manager);
         match (kept, obeyed.keeping) {
-            (true, _) => obeyed.keeping = Keeping::Kept,
+            (true, _) => {
+                obeyed.keeping = Keeping::Kept;
+                if is_target {
+                    self.moving.commit();
+                }
+            }
             (false, Keeping::Failed(_)) => {}
             (false, _) => {
                 obeyed.keeping = Keeping::Failed(false);
@@ -378,6 +407,10 @@ impl<P: Port> Node<P> {
     /// A connected manager has raised its claim.
     pub(crate) fn claim_raised(&mut self, manager: &Identity, claim: &ClaimReport) {
         self.obey(manager, Some(claim));
+        if self.moving.is_underway() {
+            // What is being stored is no longer the claim that is obeyed.
+            self.claims.questions.next = Instant::START;
+        }
     }
 
     /// A connected manager misses keep-alives and was last heard at `heard`; in the far future, it is heard again.
@@ -396,6 +429,9 @@ impl<P: Port> Node<P> {
 
     /// Whether a moving call of this manager may begin: its claim is stored, cannot be, or takes too long.
     pub(crate) fn may_move(&mut self, now: Instant, manager: &Identity) -> bool {
+        if self.moving.is_underway() {
+            return false;
+        }
         if !self.claims.stores {
             return true;
         }

@@ -14,6 +14,7 @@ mod answers;
 mod claims;
 mod counter;
 mod duplicates;
+mod hand_over;
 mod hints;
 mod known;
 mod links;
@@ -44,6 +45,7 @@ use crate::time::Instant;
 use answers::Answers;
 use claims::Claims;
 use duplicates::Duplicates;
+use hand_over::Moving;
 use hints::{Hints, Hosts};
 use search::{Budget, Search};
 use table::Table;
@@ -68,7 +70,7 @@ impl Manager {
     }
 
     /// The manager's identity.
-    fn identity(&self) -> Option<Identity> {
+    pub(crate) fn identity(&self) -> Option<Identity> {
         Identity::m_unit(&self.name, self.id).ok()
     }
 
@@ -178,6 +180,7 @@ pub struct Node<P: Port> {
     answers: Answers<P::Endpoint>,
     duplicates: Duplicates<P::Endpoint>,
     claims: Claims,
+    moving: Moving,
     /// Sequence number of the last search or answer.
     sequence: u32,
     /// The unit's counters.
@@ -205,6 +208,7 @@ impl<P: Port> Node<P> {
             answers: Answers::new(),
             duplicates: Duplicates::new(),
             claims: Claims::new(now),
+            moving: Moving::default(),
             sequence: 0,
             counters: Counters::new(),
             config,
@@ -335,7 +339,7 @@ impl<P: Port> Node<P> {
         if self.is_standby() {
             return self.claims.next();
         }
-        let own = self.claims.next().min(self.table.next_due());
+        let own = self.claims.next().min(self.table.next_due()).min(self.moving.until());
         if P::DISCOVERS { own.min(self.answers.next()).min(self.hints.next()).min(self.search.next()) } else { own }
     }
 
@@ -370,6 +374,9 @@ impl<P: Port> Node<P> {
             if command.is_some() {
                 return command;
             }
+        }
+        if let Some(command) = self.poll_hand_over(now) {
+            return Some(command);
         }
         self.poll_claims(now, mailman, authenticator);
         if P::DISCOVERS {

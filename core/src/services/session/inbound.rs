@@ -9,11 +9,12 @@ use super::publishing::Advertised;
 use super::streaming::StreamsPart;
 use super::timing::sent_at_earliest;
 use super::{Event, Phase, Session, close_reason, proving};
-use crate::ability::{DETAILS, STREAMS};
+use crate::ability::{DETAILS, HAND_OVER, STREAMS};
 use crate::config::{EMERGENCY_BYTES, Mode, Priority};
 use crate::distribution::failure::Failure;
 use crate::distribution::function::{Attributes, Signature, VariableSpecs};
 use crate::distribution::function_list::{Function, Generation, Slot};
+use crate::distribution::hello::Manager;
 use crate::distribution::items::{Items, Malformed};
 use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
@@ -517,6 +518,14 @@ impl<P: Port> Session<P> {
                 self.granting.obedience.claim_arrived(&mut self.wire, cx, &report);
                 None
             }
+            Control::HandOver { name, id } if HAND_OVER => {
+                let to = core::str::from_utf8(name).ok().and_then(|name| Manager::new(name, id).ok());
+                self.granting.hand_over_arrived(&mut self.wire, cx, to);
+                None
+            }
+            Control::HandedOver { refusal } if HAND_OVER && P::CALLS => {
+                self.handing.answered(refusal).then_some(Event::Answered)
+            }
             Control::LeaseEnded { call, why } if P::CALLS => self
                 .calling
                 .stop_renewing(CallId(call))
@@ -524,6 +533,8 @@ impl<P: Port> Session<P> {
             Control::Subscribe { .. }
             | Control::Subscribed { .. }
             | Control::Actuator { .. }
+            | Control::HandOver { .. }
+            | Control::HandedOver { .. }
             | Control::LeaseEnded { .. } => None,
         };
         (left, event)

@@ -20,6 +20,7 @@ mod answering;
 mod details;
 mod due;
 mod granting;
+mod handing;
 mod holding;
 mod inbound;
 mod obeying;
@@ -43,8 +44,9 @@ use crate::config::{Constraints, HELLO_TIMEOUT, LINK_BUFFER_BYTES, Priority};
 use crate::counters::Counters;
 use crate::distribution::connection_handler::{Admission, Directive};
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
-use crate::distribution::hello::Hello;
+use crate::distribution::hello::{Hello, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity};
+use crate::distribution::message::HandOverRefusal;
 use crate::distribution::message::{LONGEST_HEADER_BYTES, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error, Refusal};
@@ -158,7 +160,7 @@ pub enum Event {
     Sample(<Streams as Ability>::Of<Sample>),
     /// The peer granted or ended a subscription to one of its streams; an error ends it.
     Subscribed(Slot, <Streams as Ability>::Of<Result<GrantedStream, Error>>),
-    /// The peer answered a [`Session::ping`].
+    /// The peer answered a [`Session::ping`] or a [`Session::hand_over`].
     Answered,
     /// The link has ended. All calls in flight and all leases have been reported before this event.
     Closed(CloseReason),
@@ -191,6 +193,7 @@ pub struct Session<P: Port> {
     granting: Granting,
     streaming: streaming::StreamsPart,
     details: details::DetailsPart,
+    handing: handing::HandingPart,
 }
 
 impl<P: Port> Session<P> {
@@ -243,6 +246,7 @@ impl<P: Port> Session<P> {
             granting: Granting::new(),
             streaming: State::NEW,
             details: State::NEW,
+            handing: State::NEW,
         }
     }
 
@@ -559,6 +563,21 @@ impl<P: Port> Session<P> {
     /// dialled; the other end follows.
     pub fn renew_every(&mut self, span: Duration) {
         self.renewal.renew_every(span);
+    }
+
+    /// Hands a vehicle over to another manager. [`Event::Answered`] follows, then [`hand_over_answer`](Self::hand_over_answer) has the
+    /// answer; a vehicle that consents ends the link. It is back within about
+    /// [`HAND_OVER_TIMEOUT`](crate::config::HAND_OVER_TIMEOUT) unless it has joined there.
+    ///
+    /// Errors: [`Error::NotConnected`], [`Error::Unsupported`] if the peer is no vehicle, [`Error::Full`] if nothing can be sent now.
+    pub fn hand_over(&mut self, cx: &mut Context<'_, P>, to: &Manager) -> Result<(), Error> {
+        self.handing.ask(&mut self.wire, cx, to)
+    }
+
+    /// What the vehicle answered to the last [`hand_over`](Self::hand_over); `None` before its answer, and from one that knows no
+    /// hand-over.
+    pub fn hand_over_answer(&self) -> Option<Result<(), HandOverRefusal>> {
+        self.handing.answer()
     }
 
     /// Sends this unit's new claim to the peer.

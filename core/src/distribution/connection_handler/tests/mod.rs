@@ -12,6 +12,8 @@ mod chaos;
 mod claims;
 mod discovery;
 mod fleet;
+#[cfg(feature = "hand-over")]
+mod hand_over;
 mod hostile;
 mod invariants;
 mod load;

@@ -16,6 +16,8 @@ mod delivery;
 mod details;
 mod ends;
 mod gathering;
+#[cfg(feature = "hand-over")]
+mod handing;
 mod hearts;
 mod hello;
 mod hostile;

@@ -11,6 +11,7 @@ use super::net::{DATAGRAM_PORT, Net};
 use super::setup::{self, Handler, Run, Setup};
 use crate::config::Priority;
 use crate::distribution::function_list::FunctionList;
+use crate::distribution::hello::Hello;
 use crate::distribution::parameters::Parameters;
 use crate::error::{CloseReason, Error};
 use crate::host::mailman::LinkId;
@@ -18,7 +19,7 @@ use crate::host::secure::Plain;
 use crate::services::access::{Access, Decision, Principal, Rule, Verb, decide};
 use crate::services::hub::{Door, Hub};
 use crate::services::requests::CallId;
-use crate::services::{Context, Port};
+use crate::services::{Context, Keys, Port};
 use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};
 
@@ -58,6 +59,15 @@ impl<const WHOLE: bool> Port for Tested<WHOLE> {
     const CALLS: bool = WHOLE;
     const HAS_ACCESS: bool = WHOLE;
     const TAKES_DATAGRAM_REQUESTS: bool = WHOLE;
+}
+
+/// Whether there is a key for every pair.
+pub(super) struct Paired(pub(super) bool);
+
+impl<const WHOLE: bool> Keys<Tested<WHOLE>> for Paired {
+    fn credentials(&mut self, _: &Hello) -> Option<()> {
+        self.0.then_some(())
+    }
 }
 
 /// A hub whose decisions a test can hold up.
@@ -101,6 +111,8 @@ pub(super) struct Side<const WHOLE: bool = true> {
     unanswered: Vec<(Incoming, Result<Arguments, Error>)>,
     pub(super) buffers: usize,
     pub(super) base: Duration,
+    /// There is a key for every pair.
+    pub(super) paired: bool,
     /// Details of failed calls, and progress.
     #[cfg(feature = "details")]
     pub(super) failures: Vec<crate::distribution::failure::Failure>,
@@ -121,7 +133,7 @@ macro_rules! context {
             functions: &$side.functions,
             access: $side.table.as_ref().map(|table| table as &dyn crate::services::access::Access),
             hub: &mut $side.hub,
-            keys: &mut (),
+            keys: &mut $crate::services::session::tests::side::Paired($side.paired),
         }
     };
 }
@@ -158,6 +170,7 @@ impl<const WHOLE: bool> Side<WHOLE> {
             unanswered: Vec::new(),
             buffers: setup.buffers,
             base,
+            paired: false,
             #[cfg(feature = "details")]
             failures: Vec::new(),
             #[cfg(feature = "details")]

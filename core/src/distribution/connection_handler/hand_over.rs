@@ -1,0 +1,153 @@
+//! Hand-over of a vehicle to another manager. Its manager says so on their link; the vehicle leaves, looks for the new one, and
+//! goes back unless it has joined there in time. What it stores then is the commit: until that is done, nothing moves.
+
+use super::{Command, Directive, Node, Target};
+use crate::ability::HAND_OVER;
+use crate::config::HAND_OVER_TIMEOUT;
+use crate::distribution::hello::Manager;
+use crate::distribution::identity::Identity;
+use crate::distribution::message::HandOverRefusal;
+use crate::error::CloseReason;
+use crate::host::mailman::LinkId;
+use crate::host::port::Port;
+use crate::time::Instant;
+
+/// Where a vehicle is on its way from one manager to another; empty where the build has no hand-over.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Moving([State; HAND_OVER as usize]);
+
+#[derive(Clone, Debug, Default)]
+struct State {
+    /// The manager that the unit was configured with, once it was handed over.
+    home: Option<Manager>,
+    underway: Option<Underway>,
+}
+
+/// A hand-over that is not committed.
+#[derive(Clone, Debug)]
+struct Underway {
+    from: Manager,
+    /// When it goes back; in the far future once it has joined the new manager, and its claim is being stored.
+    until: Instant,
+}
+
+impl Underway {
+    fn has_arrived(&self) -> bool {
+        self.until == Instant::FAR_FUTURE
+    }
+}
+
+impl Moving {
+    fn underway(&self) -> Option<&Underway> {
+        self.0.first()?.underway.as_ref()
+    }
+
+    pub(super) fn is_underway(&self) -> bool {
+        self.underway().is_some()
+    }
+
+    pub(super) fn until(&self) -> Instant {
+        self.underway().map_or(Instant::FAR_FUTURE, |underway| underway.until)
+    }
+
+    /// The claim of the new manager is stored, if it is on its way.
+    pub(super) fn commit(&mut self) {
+        if let Some(state) = self.0.first_mut() {
+            state.underway.take_if(|underway| underway.has_arrived());
+        }
+    }
+}
+
+impl<P: Port> Node<P> {
+    /// The manager that this unit was configured with and the one that it belongs to, if they differ, once a claim of `storing` is
+    /// stored: the port stores them with it in one write, and passes them to [`belong_to`](Self::belong_to) at the next start. A claim
+    /// of another manager than the new one commits no hand-over.
+    pub fn handed_over(&self, storing: &Identity) -> Option<(Identity, Identity)> {
+        let state = self.moving.0.first()?;
+        let present = match &state.underway {
+            Some(underway) if !(underway.has_arrived() && self.target.as_ref() == Some(storing)) => {
+                underway.from.identity()
+            }
+            _ => self.target.clone(),
+        };
+        let pair = (state.home.as_ref()?.identity()?, present?);
+        (pair.0 != pair.1).then_some(pair)
+    }
+
+    /// This unit was handed over to `present` in an earlier life. Has no effect on one that is now configured with another manager than
+    /// `home`, or with a fixed address.
+    pub fn belong_to(&mut self, home: &Identity, present: &Identity) {
+        if let Target::Manager(configured) = &self.config.target
+            && configured.is(home)
+            && let Ok(manager) = Manager::new(present.name(), present.id())
+            && let Some(state) = self.moving.0.first_mut()
+        {
+            state.home = Some(configured.clone());
+            self.turn_to(manager);
+        }
+    }
+
+    fn turn_to(&mut self, manager: Manager) {
+        self.target = manager.identity();
+        self.config.target = Target::Manager(manager);
+    }
+
+    /// The manager on this link hands the unit over to another one. From here on it looks for that one, and the session ends the link.
+    pub(crate) fn hand_over(&mut self, now: Instant, link: LinkId, to: Manager) -> Result<(), HandOverRefusal> {
+        let from = match &self.config.target {
+            Target::Manager(from) => from.clone(),
+            Target::Fixed(..) => return Err(HandOverRefusal::Fixed),
+            Target::Everybody => return Err(HandOverRefusal::Other),
+        };
+        let present = self.target.as_ref().and_then(|target| self.node(target)?.link());
+        let Some(identity) = to.identity().filter(|_| to != from && present == Some(link)) else {
+            return Err(HandOverRefusal::Other);
+        };
+        if self.moving.is_underway() {
+            return Err(HandOverRefusal::Underway);
+        }
+        if !self.claims.can_keep(&identity) {
+            return Err(HandOverRefusal::NotStored);
+        }
+        let Some(state) = self.moving.0.first_mut() else { return Err(HandOverRefusal::Other) };
+        state.home.get_or_insert_with(|| from.clone());
+        state.underway = Some(Underway { from, until: now + HAND_OVER_TIMEOUT });
+        self.turn_to(to);
+        Ok(())
+    }
+
+    /// This manager has been joined: if the unit is on its way there, the port is to store that.
+    pub(super) fn arrived(&mut self, now: Instant, manager: &Identity) {
+        if self.target.as_ref() == Some(manager)
+            && let Some(underway) = self.moving.0.first_mut().and_then(|state| state.underway.as_mut())
+        {
+            // Whether it is stored is not known while the disk is slow: from here on only a failure leads back.
+            underway.until = Instant::FAR_FUTURE;
+            self.claims.want_kept(now, manager);
+        }
+    }
+
+    /// Goes back if the new manager was not found in time, or could not be stored.
+    pub(super) fn poll_hand_over(&mut self, now: Instant) -> Option<Command<P::Endpoint>> {
+        let underway = self.moving.underway()?;
+        let target = self.target.clone()?;
+        let has_arrived = underway.has_arrived();
+        if has_arrived && self.claims.is_unasked(&target) {
+            // It has raised its claim meanwhile.
+            self.claims.want_kept(now, &target);
+        }
+        if now < underway.until && !(has_arrived && self.claims.has_failed(&target)) {
+            return None;
+        }
+        let Underway { from, .. } = self.moving.0.first_mut()?.underway.take()?;
+        self.turn_to(from);
+        self.search_again(now, None);
+        let place = self.table.find(&target)?;
+        let known = self.table.node(place)?;
+        let link = known.link().or(known.dialing);
+        if link.is_none() {
+            self.table.cancel(place);
+        }
+        link.map(|link| Command::Notify(link, Directive::Close(CloseReason::StoppedHere)))
+    }
+}

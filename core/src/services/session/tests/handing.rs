@@ -1,0 +1,101 @@
+//! Hand-over on a link: what a vehicle refuses, and what stays with it.
+
+use super::super::Event;
+use super::none;
+use super::pair::Pair;
+use super::side::context;
+use crate::config::Priority;
+use crate::distribution::function::Attributes;
+use crate::distribution::hello::Manager;
+use crate::distribution::message::HandOverRefusal;
+use crate::error::{CloseReason, Error};
+use crate::host::mailman::LinkId;
+use crate::services::Context;
+use crate::services::lease::{Latch, LeaseEnd, Service as _};
+use crate::time::Duration;
+
+const LEASE: Duration = Duration::from_millis(500);
+const STOP: Attributes =
+    Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::NORMAL };
+
+fn other() -> Manager {
+    Manager::new("other", 2).unwrap()
+}
+
+/// A vehicle that can be handed over: it has keys, and stores claims.
+fn vehicle() -> Pair {
+    let mut pair = Pair::live();
+    pair.agv.offer_leased("go()", LEASE);
+    pair.agv.offer_control("halt()", STOP, None);
+    pair.publish();
+    pair.agv.paired = true;
+    pair.agv.hub.hub.node.store_claims();
+    pair
+}
+
+fn hand_over(pair: &mut Pair, to: &Manager) -> Option<Result<(), HandOverRefusal>> {
+    pair.manager.session.hand_over(context!(pair.manager), to).unwrap();
+    pair.settle();
+    pair.manager.session.hand_over_answer()
+}
+
+#[test]
+fn a_vehicle_leaves_at_once_and_keeps_latch_and_last_order() {
+    let mut pair = vehicle();
+    let go = pair.agv.functions.find("go").unwrap();
+    for function in ["go", "halt"] {
+        pair.manager.call(function, &none()).unwrap();
+        pair.settle();
+    }
+    pair.run(Duration::from_millis(50));
+    // Both are the vehicle's: no link holds them.
+    let kept = |pair: &Pair| pair.agv.functions.function(go).unwrap().handler.lease().unwrap().state();
+    let before = kept(&pair);
+    assert_eq!(before.latch, Some(Latch { by: 1, reason: 0 }));
+    assert_eq!(before.last.and_then(|last| last.end), Some(LeaseEnd::Stopped));
+    assert_eq!(hand_over(&mut pair, &other()), Some(Ok(())));
+    assert!(pair.manager.has(&Event::Answered) && pair.manager.has(&Event::Closed(CloseReason::Stopped)));
+    assert!(pair.agv.has(&Event::Closed(CloseReason::StoppedHere)));
+    let hello = pair.agv.hub.hub.node.hello(pair.agv.now, LinkId(3), 9);
+    assert_eq!(hello.wanted, Some(other()));
+    assert_eq!(kept(&pair), before);
+}
+
+#[test]
+fn a_vehicle_that_cannot_go_says_why_and_stays() {
+    let own = Manager::new("manager", 1).unwrap();
+    let cases: [(HandOverRefusal, &Manager, fn(&mut Pair)); 4] = [
+        (HandOverRefusal::NoKey, &other(), |pair| pair.agv.paired = false),
+        (HandOverRefusal::Other, &own, |_| ()),
+        (HandOverRefusal::Moves, &other(), |pair| {
+            pair.manager.call("go", &none()).unwrap();
+        }),
+        (HandOverRefusal::NotStored, &other(), |pair| {
+            let fresh = super::setup::hub(true, "manager", *pair.agv.session.constraints(), true);
+            pair.agv.hub.hub = fresh;
+            let (now, hello) = (pair.agv.now, pair.agv.session.hello().unwrap().clone());
+            let (link, from) = (LinkId(2), pair.agv.session.address());
+            pair.agv.hub.hub.node.admit(now, link, from, &hello);
+        }),
+    ];
+    for (refusal, to, arrange) in cases {
+        let mut pair = vehicle();
+        arrange(&mut pair);
+        pair.settle();
+        assert_eq!(hand_over(&mut pair, to), Some(Err(refusal)));
+        assert!(pair.agv.session.is_live() && pair.manager.session.is_live(), "{refusal:?}");
+        let hello = pair.agv.hub.hub.node.hello(pair.agv.now, LinkId(3), 9);
+        assert_eq!(hello.wanted.as_ref(), Some(&own), "{refusal:?}");
+    }
+}
+
+#[test]
+fn only_a_vehicle_is_handed_over_and_only_by_its_manager() {
+    let mut pair = vehicle();
+    let asked = pair.agv.session.hand_over(context!(pair.agv), &other());
+    assert_eq!(asked, Err(Error::Unsupported), "a manager is not asked");
+    pair.cut();
+    pair.settle();
+    let asked = pair.manager.session.hand_over(context!(pair.manager), &other());
+    assert_eq!(asked, Err(Error::NotConnected));
+}
