@@ -18,6 +18,9 @@ const LEASE: Duration = Duration::from_millis(500);
 const STOP: Attributes =
     Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::NORMAL };
 
+/// Makes something stand against it.
+type Arrange = fn(&mut Pair);
+
 fn other() -> Manager {
     Manager::new("other", 2).unwrap()
 }
@@ -64,7 +67,7 @@ fn a_vehicle_leaves_at_once_and_keeps_latch_and_last_order() {
 #[test]
 fn a_vehicle_that_cannot_go_says_why_and_stays() {
     let own = Manager::new("manager", 1).unwrap();
-    let cases: [(HandOverRefusal, &Manager, fn(&mut Pair)); 4] = [
+    let cases: [(HandOverRefusal, &Manager, Arrange); 4] = [
         (HandOverRefusal::NoKey, &other(), |pair| pair.agv.paired = false),
         (HandOverRefusal::Other, &own, |_| ()),
         (HandOverRefusal::Moves, &other(), |pair| {
