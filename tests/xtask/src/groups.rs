@@ -298,7 +298,7 @@ pub(crate) const GROUPS: [Group; 30] = [
     Group {
         name: "release",
         what: "the files of a release, and its Debian package installed, run, upgraded, removed and purged in a clean root; before a release",
-        budget: 900,
+        budget: 1_200,
         quick: None,
         by_default: false,
         waits: false,

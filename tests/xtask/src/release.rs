@@ -140,7 +140,7 @@ fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
     let size = Run::new("du").args(["--summarize", "--block-size=1024"]).args([tree]).text()?;
     let size = size.split_whitespace().next().unwrap_or_default().to_owned();
     let control = format!(
-        "Package: cara\nVersion: {VERSION}\nArchitecture: {}\nMaintainer: {}\nInstalled-Size: {size}\nDepends: systemd\n\
+        "Package: cara\nVersion: {VERSION}\nArchitecture: {}\nMaintainer: {}\nInstalled-Size: {size}\nDepends: procps, systemd\n\
          Section: net\nPriority: optional\nDescription: {}\n Managers of automated guided vehicles, and the command that asks, starts and\n \
          diagnoses them.\n",
         processor.debian,
@@ -209,7 +209,7 @@ pub(crate) fn check() -> Result<()> {
     install::program("mmdebstrap", "mmdebstrap").map_err(anyhow::Error::msg)?;
     let root = workspace::target().join("release-root");
     empty(&root)?;
-    let packages = "--include=systemd,man-db";
+    let packages = "--include=systemd,man-db,procps";
     Run::new("mmdebstrap").args(["--variant=minbase", packages, "bookworm"]).args([&root]).stream()?;
     let processor = PROCESSORS.iter().find(|processor| processor.target.starts_with(std::env::consts::ARCH));
     let package = format!("cara_{VERSION}_{}.deb", processor.context("amd64 or arm64")?.debian);
