@@ -190,7 +190,7 @@ pub(crate) const GROUPS: [Group; 30] = [
     Group {
         name: "security",
         what: "attackers on the simulator, a board in QEMU (not quick) and Linux units: none of them comes to anything",
-        budget: 320,
+        budget: 300,
         quick: Some(90),
         by_default: true,
         waits: true,
@@ -204,6 +204,15 @@ pub(crate) const GROUPS: [Group; 30] = [
         by_default: true,
         waits: false,
         run: |extent| fleet::check(extent).into(),
+    },
+    Group {
+        name: "counts",
+        what: "a blocking round trip takes no more system calls, switches and wake-ups at either end than it may",
+        budget: 12,
+        quick: Some(12),
+        by_default: true,
+        waits: false,
+        run: |_| needing(counted_by_perf(), || binaries::debug("cara-bench")?.args(["counts"]).stream()),
     },
     Group {
         name: "demo",
@@ -409,6 +418,16 @@ fn scenarios(extent: Extent) -> Result<()> {
 
 fn guide() -> Result<()> {
     binaries::debug("cara-guide")?.args(["docs/guide.md"]).stream()
+}
+
+/// Tracepoints are for root alone where the system is as it comes.
+fn counted_by_perf() -> Result<(), String> {
+    install::program("perf", "linux-perf")?;
+    let (counts, _, errors) = Run::new("perf")
+        .args(["stat", "--event", "sched:sched_waking", "true"])
+        .captured()
+        .map_err(|error| format!("{error:#}"))?;
+    if counts { Ok(()) } else { Err(format!("perf counts no tracepoints here: {}", errors.trim())) }
 }
 
 fn web() -> Outcome {

@@ -161,6 +161,11 @@ impl Handle {
         self.answer()
     }
 
+    /// The id of its process.
+    pub(crate) fn id(&self) -> u32 {
+        self.process.id()
+    }
+
     /// There will be no more questions, so it ends.
     pub(crate) fn dismiss(&mut self) {
         drop(self.questions.take());

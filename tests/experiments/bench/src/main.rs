@@ -9,6 +9,7 @@
 
 mod child;
 mod counted;
+mod counts;
 mod deadlines;
 mod experiments;
 mod lanes;
@@ -52,6 +53,8 @@ enum Command {
         /// Where the figure goes.
         folder: Option<PathBuf>,
     },
+    /// Counts what each end of a round trip asks of the kernel; an error where that has grown.
+    Counts,
     /// The process that answers; started by the others.
     #[command(hide = true)]
     Serve(End),
@@ -86,6 +89,7 @@ fn main() -> Result<()> {
             print!("{}", deadlines::table(&shares));
             folder.map_or(Ok(()), |folder| plots::draw_deadlines(&shares, &folder))
         }
+        Command::Counts => counts::check(),
         Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),
         Command::Call(end) => child::call(&end),
         Command::Further(end) => further(&*peers::named(&end.peer)?, &end),

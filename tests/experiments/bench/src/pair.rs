@@ -96,6 +96,11 @@ impl Pair {
         Ok(Self { peer: peer.to_owned(), server, clients, further, _cable: cable })
     }
 
+    /// The ids of the processes of the first client and of the server.
+    pub(crate) fn processes(&self) -> [u32; 2] {
+        [self.clients.first().unwrap_or(&self.server), &self.server].map(Handle::id)
+    }
+
     /// One block of echo calls.
     pub(crate) fn block(&mut self, order: &Order) -> Result<Turn> {
         let used = self.begin_blocks(std::slice::from_ref(order))?;

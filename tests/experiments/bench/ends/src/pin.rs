@@ -4,6 +4,7 @@ use std::fmt;
 
 use anyhow::{Result, ensure};
 use clap::ValueEnum;
+use rustix::process::Pid;
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde::{Deserialize, Serialize};
 
@@ -46,9 +47,22 @@ pub fn cpus(pin: Pin) -> Result<[Option<usize>; 2]> {
 
 /// Keeps this thread, and those that it starts from now on, on `cpu`.
 pub fn stay_on(cpu: Option<usize>) -> Result<()> {
+    cpu.map_or(Ok(()), |cpu| keep(None, cpu))
+}
+
+/// Moves all threads of another process to `cpu`.
+pub fn move_to(process: u32, cpu: Option<usize>) -> Result<()> {
     let Some(cpu) = cpu else { return Ok(()) };
+    for thread in std::fs::read_dir(format!("/proc/{process}/task"))? {
+        let thread = thread?.file_name().to_string_lossy().parse()?;
+        keep(Pid::from_raw(thread), cpu)?;
+    }
+    Ok(())
+}
+
+fn keep(thread: Option<Pid>, cpu: usize) -> Result<()> {
     ensure!(cpu < CpuSet::MAX_CPU, "there is no CPU {cpu}");
     let mut set = CpuSet::new();
     set.set(cpu);
-    Ok(sched_setaffinity(None, &set)?)
+    Ok(sched_setaffinity(thread, &set)?)
 }
