@@ -209,7 +209,7 @@ pub(crate) const GROUPS: [Group; 30] = [
         name: "counts",
         what: "a blocking round trip takes no more system calls, switches and wake-ups at either end than it may",
         budget: 12,
-        quick: Some(12),
+        quick: None,
         by_default: true,
         waits: false,
         run: |_| needing(counted_by_perf(), || binaries::debug("cara-bench")?.args(["counts"]).stream()),
