@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 30] = [
+pub(crate) const GROUPS: [Group; 31] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -212,7 +212,7 @@ pub(crate) const GROUPS: [Group; 30] = [
         quick: None,
         by_default: true,
         waits: false,
-        run: |_| needing(counted_by_perf(), || binaries::debug("cara-bench")?.args(["counts"]).stream()),
+        run: |_| counts().into(),
     },
     Group {
         name: "demo",
@@ -418,6 +418,17 @@ fn scenarios(extent: Extent) -> Result<()> {
 
 fn guide() -> Result<()> {
     binaries::debug("cara-guide")?.args(["docs/guide.md"]).stream()
+}
+
+/// A kernel that lets nobody count fails nothing: it says nothing about CARA.
+fn counts() -> Result<()> {
+    match counted_by_perf() {
+        Ok(()) => binaries::debug("cara-bench")?.args(["counts"]).stream(),
+        Err(reason) => {
+            println!("nothing was counted: {reason}");
+            Ok(())
+        }
+    }
 }
 
 /// Tracepoints are for root alone where the system is as it comes.
