@@ -22,13 +22,13 @@ as_unit() {
         env CARA_CONTROL_DIR=/run/cara STATE_DIRECTORY=/var/lib/cara "$@"
 }
 as_unit cara node --check /etc/cara/plant.toml
-as_unit cara node /etc/cara/plant.toml > /tmp/node.log 2>&1 &
+as_unit cara node /etc/cara/plant.toml > /node.log 2>&1 &
 node=$!
 for _ in $(seq 300); do
     as_unit cara orders > /dev/null 2>&1 && break
     sleep 0.1
 done
-as_unit cara orders > /dev/null || { cat /tmp/node.log; exit 1; }
+as_unit cara orders > /dev/null || { cat /node.log; exit 1; }
 
 # An upgrade leaves the running node, its settings and its claims alone.
 chmod 755 /etc/cara
