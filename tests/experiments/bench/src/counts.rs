@@ -23,7 +23,7 @@ const ENDS: [&str; 2] = ["client", "server"];
 const WARM_UP: u32 = 200;
 const CALLS: u32 = 2_000;
 /// Turns that a cell has to stay within its bounds: what else the machine does only adds.
-const TURNS: usize = 6;
+const TURNS: usize = 12;
 
 /// Calls that are alike, and the most that each of [`EVENTS`] may be of one at each end, in hundredths.
 struct Cell {
