@@ -177,6 +177,7 @@ entry!(session_connected, {
     session().connected(context());
     keep(session().direct(context(), *unknown()));
     keep((session().ping(context()), session().round_trip()));
+    keep((session().hand_over(context(), unknown()), session().hand_over_answer()));
     session().writable(context());
 });
 
