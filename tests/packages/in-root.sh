@@ -17,24 +17,21 @@ printf 'name = "plant"\nid = 1\nfleet = 7\ninterfaces = "lo"\n' > /etc/cara/plan
 chmod 700 /run/cara /var/lib/cara
 chown --recursive cara:cara /etc/cara/keys /run/cara /var/lib/cara
 
-as_unit() {
-    setpriv --reuid=cara --regid=cara --init-groups --no-new-privs \
-        env CARA_CONTROL_DIR=/run/cara STATE_DIRECTORY=/var/lib/cara "$@"
-}
-as_unit cara node --check /etc/cara/plant.toml
-as_unit cara node /etc/cara/plant.toml > /node.log 2>&1 &
+as_unit="setpriv --reuid=cara --regid=cara --init-groups --no-new-privs env CARA_CONTROL_DIR=/run/cara STATE_DIRECTORY=/var/lib/cara"
+$as_unit cara node --check /etc/cara/plant.toml
+$as_unit cara node /etc/cara/plant.toml > /node.log 2>&1 &
 node=$!
 for _ in $(seq 300); do
-    as_unit cara orders > /dev/null 2>&1 && break
+    $as_unit cara orders > /dev/null 2>&1 && break
     sleep 0.1
 done
-as_unit cara orders > /dev/null || { cat /node.log; exit 1; }
+$as_unit cara orders > /dev/null || { cat /node.log; exit 1; }
 
 # An upgrade leaves the running node, its settings and its claims alone.
 chmod 755 /etc/cara
 before=$(sha256sum /etc/cara/plant.toml /var/lib/cara/*)
 dpkg --install /cara.deb
-as_unit cara orders > /dev/null
+$as_unit cara orders > /dev/null
 [ "$(stat --format=%a /etc/cara)" = 755 ]
 [ "$before" = "$(sha256sum /etc/cara/plant.toml /var/lib/cara/*)" ]
 kill "$node"
