@@ -192,8 +192,12 @@ fn collect(manifest: &Path, name: &str, folder: &Path) -> Result<()> {
     let wanted = manifest.with_file_name(name);
     ensure!(wanted.is_file(), "there is no {}", wanted.display());
     fs::copy(&wanted, folder.join(name))?;
-    let written = Run::new("git").args(["ls-files", "--others", "--", &format!("*{name}")]).text()?;
-    written.lines().try_for_each(|path| Ok(fs::remove_file(workspace::root().join(path))?))
+    let written =
+        Run::new("git").args(["ls-files", "--others", "--exclude-standard", "--", &format!("*{name}")]).text()?;
+    written.lines().try_for_each(|path| fs::remove_file(workspace::root().join(path)))?;
+    let list: serde_json::Value = serde_json::from_slice(&fs::read(folder.join(name))?)?;
+    ensure!(list["components"].as_array().is_some_and(|components| !components.is_empty()), "{name} lists nothing");
+    Ok(())
 }
 
 fn checksums(folder: &Path) -> Result<()> {
