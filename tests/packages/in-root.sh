@@ -28,11 +28,12 @@ done
 $as_unit cara orders > /dev/null || { cat /node.log; exit 1; }
 
 # An upgrade leaves the running node, its settings and its claims alone.
+chown root:root /etc/cara
 chmod 755 /etc/cara
 before=$(sha256sum /etc/cara/plant.toml /var/lib/cara/*)
 dpkg --install /cara.deb
 $as_unit cara orders > /dev/null
-[ "$(stat --format=%a /etc/cara)" = 755 ]
+[ "$(stat --format=%U:%G:%a /etc/cara)" = root:root:755 ]
 [ "$before" = "$(sha256sum /etc/cara/plant.toml /var/lib/cara/*)" ]
 kill "$node"
 wait "$node"

@@ -3,6 +3,7 @@
 //! own link. The states are in `docs/wire.md`, "Claims".
 
 use super::{Node, NodeCounter};
+use crate::ability::HAND_OVER;
 use crate::config::OBEYED_MANAGERS;
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::claim::{Claim, TaggedClaim};
@@ -429,7 +430,9 @@ impl<P: Port> Node<P> {
 
     /// Whether a moving call of this manager may begin: its claim is stored, cannot be, or takes too long.
     pub(crate) fn may_move(&mut self, now: Instant, manager: &Identity) -> bool {
-        if self.moving.is_underway() {
+        // One that was left, or turned back from, commands nothing more, though its link may not have ended yet.
+        let is_left = || self.target.as_ref().is_some_and(|target| target != manager);
+        if HAND_OVER && (self.moving.is_underway() || is_left()) {
             return false;
         }
         if !self.claims.stores {

@@ -1,6 +1,7 @@
 //! Hand-over of a vehicle to another manager. Its manager says so on their link; the vehicle leaves, looks for the new one, and
 //! goes back unless it has joined there in time. What it stores then is the commit: until that is done, nothing moves.
 
+use super::search::FIRST_LISTENING;
 use super::{Command, Directive, Node, Target};
 use crate::ability::HAND_OVER;
 use crate::config::HAND_OVER_TIMEOUT;
@@ -103,7 +104,10 @@ impl<P: Port> Node<P> {
         let Some(identity) = to.identity().filter(|_| to != from && present == Some(link)) else {
             return Err(HandOverRefusal::Other);
         };
-        if self.moving.is_underway() {
+        // Another link of the same manager that waits for this one to end would take its place.
+        let known = self.target.as_ref().and_then(|target| self.node(target));
+        let is_followed = known.is_some_and(|known| known.newcomer.is_some() || known.task.is_some());
+        if self.moving.is_underway() || is_followed {
             return Err(HandOverRefusal::Underway);
         }
         if !self.claims.can_keep(&identity) {
@@ -113,6 +117,8 @@ impl<P: Port> Node<P> {
         state.home.get_or_insert_with(|| from.clone());
         state.underway = Some(Underway { from, until: now + HAND_OVER_TIMEOUT });
         self.turn_to(to);
+        // Its last search may have been a long one.
+        self.search.attempt = 0;
         Ok(())
     }
 
@@ -141,7 +147,9 @@ impl<P: Port> Node<P> {
         }
         let Underway { from, .. } = self.moving.0.first_mut()?.underway.take()?;
         self.turn_to(from);
-        self.search_again(now, None);
+        // At once: nobody commands it meanwhile. Where a link is still to end, that searches again.
+        self.search.attempt = 0;
+        self.search_again(now, Some(FIRST_LISTENING));
         let place = self.table.find(&target)?;
         let known = self.table.node(place)?;
         let link = known.link().or(known.dialing);

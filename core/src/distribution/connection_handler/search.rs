@@ -19,7 +19,7 @@ use crate::time::{Duration, Instant};
 pub(super) const FIRST_DELAY: Duration = Duration::from_millis(50);
 /// First searches of s_units wait a random part of this, mostly a late one: of a fleet that is switched on within seconds
 /// most hear a manager's answer to another one first.
-const FIRST_LISTENING: Duration = Duration::from_millis(400);
+pub(super) const FIRST_LISTENING: Duration = Duration::from_millis(400);
 /// The same after the loss of a manager: each unit of a fleet detects it at another time, within seconds; and a node
 /// that has just left takes a moment to return.
 pub(super) const LOST_LISTENING: Duration = Duration::from_millis(800);

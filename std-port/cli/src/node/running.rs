@@ -60,10 +60,11 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
         }
         reload(&mut settings, over, &node, logging);
     }
-    service::ends();
     // Programs first, so that what makes safe is the last one to act; stopping ends the leases that are live.
     programs.end_calls();
     node.stop();
+    // Only now, since a service manager that hangs may hold this up.
+    service::ends();
     programs.finish();
     match fenced.get() {
         None => Ok(()),

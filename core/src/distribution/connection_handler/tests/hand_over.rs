@@ -76,6 +76,7 @@ fn without_the_new_manager_it_goes_back_in_time() {
     let mut node = leaving();
     let until = at(ASKED) + HAND_OVER_TIMEOUT;
     assert!(node.next_deadline() <= until);
+    (1_100..10_950).step_by(50).for_each(|millis| drop(poll(&mut node, millis)));
     poll(&mut node, 10_999);
     assert!(belongs_to(&node, &other()));
     assert_eq!(node.handed_over(&identity(&other())), None, "it has not joined there");
@@ -85,6 +86,7 @@ fn without_the_new_manager_it_goes_back_in_time() {
     );
     poll(&mut node, 11_000);
     assert!(belongs_to(&node, &manager()) && node.handed_over(&identity(&manager())).is_none());
+    assert!(node.searches_at() <= at(11_400), "soon, however long it searched for the other one");
     assert_eq!(
         node.admit(at(11_100), NEW, address(2, 7_000), &hello(&other(), 5)),
         Admission::Refuse(Refusal::WrongManager)
@@ -118,6 +120,7 @@ fn a_hand_over_that_cannot_be_stored_leads_back() {
     node.claim_kept(&identity(&other()), claim(5), false);
     let close = Command::Notify(NEW, Directive::Close(CloseReason::StoppedHere));
     assert_eq!(poll(&mut node, 2_200).0, Some(close));
+    assert!(!node.may_move(at(2_200), &identity(&other())), "though its link has not ended yet");
     assert!(belongs_to(&node, &manager()) && node.handed_over(&identity(&manager())).is_none());
     node.left(at(2_200), NEW, CloseReason::StoppedHere);
     assert_eq!(node.admit(at(2_300), OLD, address(1, 7_000), &hello(&manager(), 3)), Admission::Accept);
@@ -180,6 +183,10 @@ fn what_stands_against_a_hand_over() {
     let mut forgetful = node(s_unit("agv", 1));
     assert_eq!(forgetful.admit(at(0), OLD, address(1, 7_000), &hello(&manager(), 3)), Admission::Accept);
     assert_eq!(asked(&mut forgetful, OLD, other()), Err(HandOverRefusal::NotStored));
+    let mut followed = vehicle();
+    let again = followed.admit(at(ASKED), NEW, address(1, 41_000), &hello(&manager(), 3));
+    assert_eq!(again, Admission::Wait, "it would take the place of the link that ends");
+    assert_eq!(asked(&mut followed, OLD, other()), Err(HandOverRefusal::Underway));
     let mut full = vehicle();
     (20..23).for_each(|id| full.keep_obeyed(at(0), &Identity::m_unit("old", id).unwrap(), tagged(claim(1))));
     assert_eq!(asked(&mut full, OLD, other()), Err(HandOverRefusal::NotStored), "no place for one more claim");
