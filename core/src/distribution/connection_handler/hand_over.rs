@@ -100,12 +100,12 @@ impl<P: Port> Node<P> {
             Target::Fixed(..) => return Err(HandOverRefusal::Fixed),
             Target::Everybody => return Err(HandOverRefusal::Other),
         };
-        let present = self.target.as_ref().and_then(|target| self.node(target)?.link());
+        let known = self.target.as_ref().and_then(|target| self.node(target));
+        let present = known.and_then(|known| known.link());
         let Some(identity) = to.identity().filter(|_| to != from && present == Some(link)) else {
             return Err(HandOverRefusal::Other);
         };
         // Another link of the same manager that waits for this one to end would take its place.
-        let known = self.target.as_ref().and_then(|target| self.node(target));
         let is_followed = known.is_some_and(|known| known.newcomer.is_some() || known.task.is_some());
         if self.moving.is_underway() || is_followed {
             return Err(HandOverRefusal::Underway);
