@@ -57,6 +57,8 @@ struct Writer {
     kept: KeptClaims,
     waiting: Vec<Job>,
     runs: bool,
+    /// Storing has failed since: what the file says is not known.
+    is_unsure: bool,
     /// The unit steps down.
     ends: bool,
 }
@@ -117,7 +119,10 @@ impl Claims {
     }
 
     fn store(&self, hub: &SharedHub, kept: &KeptClaims) -> Result<(), String> {
-        self.file(hub).map_or(Ok(()), |file| file.keep(kept).map_err(|error| error.to_string()))
+        let result = self.file(hub).map_or(Ok(()), |file| file.keep(kept).map_err(|error| error.to_string()));
+        // It may have failed when the new file was in its place already.
+        lock(&self.writer).is_unsure = result.is_err();
+        result
     }
 
     /// A live manager of this identity was found before the start: whether this one starts all the same.
@@ -289,7 +294,7 @@ impl Claims {
         let obeyed = KeptObeyed { manager: manager.clone(), tagged, key };
         let handed = hub.lock().hub.node.handed_over(&manager);
         let handed = handed.map(|(home, present)| KeptHandOver { home, present });
-        if kept.obeyed.contains(&obeyed) && kept.handed == handed {
+        if kept.obeyed.contains(&obeyed) && kept.handed == handed && !lock(&self.writer).is_unsure {
             hub.lock().hub.node.claim_kept(&manager, tagged.claim, true);
             return Written::Nothing;
         }

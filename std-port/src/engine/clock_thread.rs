@@ -125,11 +125,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn watch_keys(&self) -> Instant {
         let (ring, due) = self.key_watch.look(self.now());
         if let Some(ring) = ring {
-            let claim = {
-                let mut cell = self.hub.lock();
-                cell.hub.node.expect(ring.nodes());
-                cell.hub.node.claim()
-            };
+            self.hub.lock().hub.node.expect(ring.nodes());
             // A peer that was revoked loses its link.
             for link in self.links.all() {
                 let mut state = link.lock();
@@ -139,8 +135,8 @@ impl<T: Send + 'static> Engine<T> {
                 self.settle(&link, state);
             }
             // Its tag was made with the previous keys.
-            if self.hub.lock().identity().0.role() == Role::MUnit && claim != Claim::NONE {
-                self.announce_claim(claim);
+            if self.hub.lock().identity().0.role() == Role::MUnit {
+                self.announce_claim(Claim::NONE);
             }
         }
         due
@@ -158,7 +154,7 @@ impl<T: Send + 'static> Engine<T> {
                 Some(ClaimEvent::Lead(_)) if self.leadership.has_authority() => self.leadership.wake(),
                 Some(ClaimEvent::Lead(above)) => self.leave_to_writer(Job::Lead(above)),
                 Some(ClaimEvent::Unkept(peer, claim)) => {
-                    tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored");
+                    tracing::error!(%claim, manager = peer.name(), "a claim is obeyed until this unit ends, and is not stored; after a hand-over nothing moves until it is");
                     self.notify(UnitEvent::ClaimNotKept { peer, claim });
                 }
                 Some(ClaimEvent::StepDown(by)) => self.step_down(by.claim),
@@ -212,27 +208,33 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The claim of this standby is stored: it commands, unless somebody has answered meanwhile.
     fn lead(&self, claim: Claim) {
-        let (identity, _) = self.hub.lock().identity();
-        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else {
-            // The key with itself was taken away meanwhile.
-            return self.stand_by_further();
+        let leads = {
+            let mut cell = self.hub.lock();
+            let (identity, _) = cell.identity();
+            let tagged = claim.tagged(&identity, &self.keys().codes());
+            tagged.map(|tagged| !self.is_stopping() && cell.hub.node.lead(self.now(), tagged))
         };
-        if self.is_stopping() || !self.hub.lock().hub.node.lead(self.now(), tagged) {
-            return;
+        match leads {
+            // The key with itself was taken away meanwhile.
+            None => return self.stand_by_further(),
+            Some(false) => return,
+            Some(true) => {}
         }
         tracing::warn!(%claim, "no manager of this name and id is there any more: this standby commands");
         self.notify(UnitEvent::TookCommand { claim });
         self.driver.wake();
     }
 
-    /// Tells all peers this manager's claim, with a tag of the keys as they are now. `false` where it has no key with itself any
-    /// more, or stands by.
+    /// Tells all peers this manager's claim, this one or the higher one that it has, with a tag of the keys as they are now. `false`
+    /// where it has no key with itself any more, or stands by.
     fn announce_claim(&self, claim: Claim) -> bool {
-        let (identity, _) = self.hub.lock().identity();
-        let Some(tagged) = claim.tagged(&identity, &self.keys().codes()) else { return false };
         {
-            let node = &mut self.hub.lock().hub.node;
-            if node.is_standby() {
+            // At once: whichever of a raise and a look at the keys comes last has the higher claim and the newer keys.
+            let mut cell = self.hub.lock();
+            let (identity, _) = cell.identity();
+            let node = &mut cell.hub.node;
+            let Some(tagged) = claim.max(node.claim()).tagged(&identity, &self.keys().codes()) else { return false };
+            if node.is_standby() || tagged.claim == Claim::NONE {
                 return false;
             }
             node.set_claim(tagged);

@@ -13,7 +13,7 @@ use super::driving::Driver;
 use super::link::Linux;
 use crate::locks::{Locked, Rank};
 
-/// What the hub's lock protects. Nothing is locked under it.
+/// What the hub's lock protects. Nothing is locked under it but the ring of keys, for a moment.
 pub(crate) struct HubCell {
     pub(crate) hub: Hub<Linux>,
     serial: u32,

@@ -65,7 +65,8 @@ fn parse(text: &str) -> Result<KeptClaims, FormError> {
                 let present = line.identity()?;
                 kept.handed = home.take().map(|home| KeptHandOver { home, present });
             }
-            _ => return Err(line.wrong("here `obeyed`, `home` or `present` is expected")),
+            // Of a newer version: what is known counts all the same.
+            _ => {}
         }
     }
     Ok(kept)
@@ -118,4 +119,17 @@ pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyErro
         file::make_folder(folder)?;
     }
     file::write_private(path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_newer_version_adds_is_skipped() {
+        let mut text = format!("{HEAD} {FORM}\nown 3 4\nlater 5 six\n");
+        push_sum(&mut text);
+        let own = Claim { term: 3, claimant: 4 };
+        assert_eq!(parse(&text).unwrap(), KeptClaims { own, ..KeptClaims::default() });
+    }
 }

@@ -3,7 +3,6 @@
 //! own link. The states are in `docs/wire.md`, "Claims".
 
 use super::{Node, NodeCounter};
-use crate::ability::HAND_OVER;
 use crate::config::OBEYED_MANAGERS;
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::claim::{Claim, TaggedClaim};
@@ -29,7 +28,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(3_600);
 /// Between two raises of a manager that takes over.
 const TAKE_OVER_PAUSE: Duration = Duration::from_millis(100);
 /// A moving call waits at most so long until the claim that it is made under is stored.
-const STORING: Duration = Duration::from_secs(2);
+pub(super) const STORING: Duration = Duration::from_secs(2);
 /// Fences that are kept until the node is polled, which follows at once.
 const FENCES: usize = 4;
 
@@ -41,7 +40,8 @@ pub enum ClaimEvent {
     /// This claim of this manager is to be stored with the fingerprint of the pair key, unless both are stored already; a moving call
     /// may wait for it. The port answers with [`Node::claim_kept`], and then polls its sessions. A board stores while nothing moves.
     Keep(Identity, TaggedClaim),
-    /// This claim is obeyed until this unit's next start: it could not be stored, or not in time.
+    /// This claim is obeyed until this unit's next start: it could not be stored, or not in time. Under that of a manager that the
+    /// unit was handed over to nothing moves meanwhile.
     Unkept(Identity, Claim),
     /// This m_unit is to claim the one above: the port draws a claimant, stores, calls [`Node::set_claim`], and has each session
     /// announce it. Where storing fails it does nothing; where it may not claim now it calls [`Node::not_raised`].
@@ -76,6 +76,16 @@ enum Keeping {
     KeptBefore,
     /// Too late, or it failed; whether the port has been told.
     Failed(bool),
+}
+
+/// Whether a moving call of a manager may begin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum MayMove {
+    Yes,
+    /// Once its claim is stored, or it has taken too long.
+    Waits,
+    /// The unit belongs to another manager, or is on its way to one.
+    No,
 }
 
 /// The highest claim of a manager that this unit has obeyed.
@@ -196,7 +206,7 @@ impl Claims {
 
     /// Whether this unit can store what it obeys of a manager.
     pub(super) fn can_keep(&self, manager: &Identity) -> bool {
-        self.stores && (self.of(manager).is_some() || !self.obeyed.is_full())
+        self.stores && (self.knows(manager) || !self.obeyed.is_full())
     }
 
     /// Has the port store the claim of a manager now, whatever was stored of it before.
@@ -210,6 +220,11 @@ impl Claims {
     /// Whether the claim of a manager could not be stored.
     pub(super) fn has_failed(&self, manager: &Identity) -> bool {
         self.of(manager).is_some_and(|obeyed| matches!(obeyed.keeping, Keeping::Failed(_)))
+    }
+
+    /// Whether this unit has obeyed a manager by a claim.
+    pub(super) fn knows(&self, manager: &Identity) -> bool {
+        self.of(manager).is_some()
     }
 
     /// Whether nobody has asked the port to store the claim of a manager.
@@ -244,8 +259,11 @@ impl<P: Port> Node<P> {
     }
 
     /// This m_unit's own claim, which the port has stored: what hellos and answers say from here on. Links that there are stay as
-    /// they are; the port has their sessions announce it.
+    /// they are; the port has their sessions announce it. A lower one than it has is not taken.
     pub fn set_claim(&mut self, tagged: TaggedClaim) {
+        if tagged.claim < self.claims.own.claim {
+            return;
+        }
         self.claims.own = tagged;
         self.claims.rival = self.claims.rival.filter(|rival| rival.claim > tagged.claim);
     }
@@ -306,6 +324,9 @@ impl<P: Port> Node<P> {
             && let Some(event) = self.claims.event.take()
         {
             return Some(event);
+        }
+        if let Some(manager) = self.target.as_ref().filter(|_| self.moving.take_lateness()) {
+            return Some(ClaimEvent::Unkept(manager.clone(), self.obeyed(manager)));
         }
         self.claims.obeyed.iter_mut().find_map(|(manager, obeyed)| match obeyed.keeping {
             Keeping::KeptBefore => {
@@ -429,29 +450,27 @@ impl<P: Port> Node<P> {
     }
 
     /// Whether a moving call of this manager may begin: its claim is stored, cannot be, or takes too long.
-    pub(crate) fn may_move(&mut self, now: Instant, manager: &Identity) -> bool {
-        // One that was left, or turned back from, commands nothing more, though its link may not have ended yet.
-        let is_left = || self.target.as_ref().is_some_and(|target| target != manager);
-        if HAND_OVER && (self.moving.is_underway() || is_left()) {
-            return false;
+    pub(crate) fn may_move(&mut self, now: Instant, manager: &Identity) -> MayMove {
+        if let Some(may) = self.may_move_on_the_way(manager) {
+            return may;
         }
         if !self.claims.stores {
-            return true;
+            return MayMove::Yes;
         }
-        let Some(obeyed) = self.claims.of_mut(manager) else { return true };
+        let Some(obeyed) = self.claims.of_mut(manager) else { return MayMove::Yes };
         match obeyed.keeping {
-            Keeping::Kept | Keeping::KeptBefore | Keeping::Failed(_) => return true,
+            Keeping::Kept | Keeping::KeptBefore | Keeping::Failed(_) => return MayMove::Yes,
             Keeping::Unasked => obeyed.keeping = Keeping::Wanted(now, false),
             Keeping::Wanted(since, _) if now < since + STORING => {}
             Keeping::Wanted(..) => {
                 obeyed.keeping = Keeping::Failed(false);
                 self.counters.count(NodeCounter::ClaimsNotKept);
-                return true;
+                return MayMove::Yes;
             }
         }
         // The port is asked to store it.
         self.claims.questions.next = self.claims.questions.next.min(now);
-        false
+        MayMove::Waits
     }
 
     /// Another m_unit with this one's identity has answered, to be heard only if it answers a question of this one.

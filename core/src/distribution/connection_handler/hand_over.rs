@@ -1,8 +1,9 @@
 //! Hand-over of a vehicle to another manager. Its manager says so on their link; the vehicle leaves, looks for the new one, and
 //! goes back unless it has joined there in time. What it stores then is the commit: until that is done, nothing moves.
 
+use super::claims::{MayMove, STORING};
 use super::search::FIRST_LISTENING;
-use super::{Command, Directive, Node, Target};
+use super::{Command, Directive, Node, NodeCounter, Target};
 use crate::ability::HAND_OVER;
 use crate::config::HAND_OVER_TIMEOUT;
 use crate::distribution::hello::Manager;
@@ -28,13 +29,25 @@ struct State {
 #[derive(Clone, Debug)]
 struct Underway {
     from: Manager,
-    /// When it goes back; in the far future once it has joined the new manager, and its claim is being stored.
+    stage: Stage,
+    /// When its stage ends by itself.
     until: Instant,
+}
+
+/// How far a hand-over has got.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stage {
+    /// The unit looks for its new manager.
+    Looks,
+    /// It has joined there, and the claim is being stored. Whether it is stored already is not known: only a failure leads back.
+    Stores,
+    /// The same, for longer than calls wait; whether the port has been told.
+    StoresLate(bool),
 }
 
 impl Underway {
     fn has_arrived(&self) -> bool {
-        self.until == Instant::FAR_FUTURE
+        self.stage != Stage::Looks
     }
 }
 
@@ -49,6 +62,16 @@ impl Moving {
 
     pub(super) fn until(&self) -> Instant {
         self.underway().map_or(Instant::FAR_FUTURE, |underway| underway.until)
+    }
+
+    /// Whether storing takes too long; once.
+    pub(super) fn take_lateness(&mut self) -> bool {
+        let underway = self.0.first_mut().and_then(|state| state.underway.as_mut());
+        let Some(underway) = underway.filter(|underway| underway.stage == Stage::StoresLate(false)) else {
+            return false;
+        };
+        underway.stage = Stage::StoresLate(true);
+        true
     }
 
     /// The claim of the new manager is stored, if it is on its way.
@@ -115,22 +138,34 @@ impl<P: Port> Node<P> {
         }
         let Some(state) = self.moving.0.first_mut() else { return Err(HandOverRefusal::Other) };
         state.home.get_or_insert_with(|| from.clone());
-        state.underway = Some(Underway { from, until: now + HAND_OVER_TIMEOUT });
+        state.underway = Some(Underway { from, stage: Stage::Looks, until: now + HAND_OVER_TIMEOUT });
         self.turn_to(to);
         // Its last search may have been a long one.
         self.search.attempt = 0;
         Ok(())
     }
 
-    /// This manager has been joined: if the unit is on its way there, the port is to store that.
+    /// This manager has been joined: if the unit is on its way there, the port is to store that. One without a claim, by which it
+    /// could be stored, is left again when the time is over.
     pub(super) fn arrived(&mut self, now: Instant, manager: &Identity) {
         if self.target.as_ref() == Some(manager)
+            && self.claims.knows(manager)
             && let Some(underway) = self.moving.0.first_mut().and_then(|state| state.underway.as_mut())
+            && underway.stage == Stage::Looks
         {
-            // Whether it is stored is not known while the disk is slow: from here on only a failure leads back.
-            underway.until = Instant::FAR_FUTURE;
+            (underway.stage, underway.until) = (Stage::Stores, now + STORING);
             self.claims.want_kept(now, manager);
         }
+    }
+
+    /// What a hand-over says about a moving call of this manager.
+    pub(super) fn may_move_on_the_way(&self, manager: &Identity) -> Option<MayMove> {
+        // One that was left, or turned back from, commands nothing more, though its link may not have ended yet.
+        if HAND_OVER && self.target.as_ref().is_some_and(|target| target != manager) {
+            return Some(MayMove::No);
+        }
+        let underway = self.moving.underway()?;
+        Some(if underway.stage == Stage::Stores { MayMove::Waits } else { MayMove::No })
     }
 
     /// Goes back if the new manager was not found in time, or could not be stored.
@@ -142,10 +177,21 @@ impl<P: Port> Node<P> {
             // It has raised its claim meanwhile.
             self.claims.want_kept(now, &target);
         }
-        if now < underway.until && !(has_arrived && self.claims.has_failed(&target)) {
+        let has_failed = has_arrived && self.claims.has_failed(&target);
+        if now < underway.until && !has_failed {
+            return None;
+        }
+        let underway = self.moving.0.first_mut()?.underway.as_mut()?;
+        if has_arrived && !has_failed {
+            (underway.stage, underway.until) = (Stage::StoresLate(false), Instant::FAR_FUTURE);
+            self.counters.count(NodeCounter::ClaimsNotKept);
             return None;
         }
         let Underway { from, .. } = self.moving.0.first_mut()?.underway.take()?;
+        if let Some(back) = from.identity().filter(|_| has_failed) {
+            // The file may say that it belongs to the other one all the same.
+            self.claims.want_kept(now, &back);
+        }
         self.turn_to(from);
         // At once: nobody commands it meanwhile. Where a link is still to end, that searches again.
         self.search.attempt = 0;

@@ -26,6 +26,7 @@ mod views;
 
 pub(crate) use admission::Admission;
 pub use claims::ClaimEvent;
+pub(crate) use claims::MayMove;
 pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;

@@ -11,15 +11,15 @@ use crate::distribution::message::{Control, HandOverRefusal};
 use crate::error::{CloseReason, Error, Limit};
 use crate::services::{Context, Port};
 
-/// What was asked of the peer.
+/// What was asked of the peer. It answers in the order of the questions: only the answer to the last one counts.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Asked {
-    waits: bool,
+    open: u8,
     answer: Option<Result<(), HandOverRefusal>>,
 }
 
 impl Begins for Asked {
-    const BEGIN: &'static Self = &Self { waits: false, answer: None };
+    const BEGIN: &'static Self = &Self { open: 0, answer: None };
 }
 
 pub(super) type HandingPart = State<Asked, { HAND_OVER as usize }>;
@@ -36,19 +36,22 @@ impl HandingPart {
         }
         let asked = self.get_mut().filter(|_| wire.identity().is_some_and(|peer| peer.role() == Role::SUnit));
         let asked = asked.ok_or(Error::Unsupported)?;
+        // So many that nobody answers: the peer does not understand them.
+        let open = asked.open.checked_add(1).ok_or(Error::Unsupported)?;
         if !wire.send_control(cx, &Control::HandOver { name: to.name.as_bytes(), id: to.id }) {
             return Err(Error::Full(Limit::SendQueue));
         }
         wire.flush(cx);
-        *asked = Asked { waits: true, answer: None };
+        *asked = Asked { open, answer: None };
         Ok(())
     }
 
-    /// Returns whether this unit waits for an answer.
+    /// Returns whether this unit waits for this answer.
     pub(super) fn answered(&mut self, refusal: Option<HandOverRefusal>) -> bool {
-        let Some(asked) = self.get_mut().filter(|asked| asked.waits) else { return false };
-        *asked = Asked { waits: false, answer: Some(refusal.map_or(Ok(()), Err)) };
-        true
+        let Some(asked) = self.get_mut() else { return false };
+        let Some(open) = asked.open.checked_sub(1) else { return false };
+        *asked = Asked { open, answer: (open == 0).then_some(refusal.map_or(Ok(()), Err)) };
+        open == 0
     }
 
     pub(super) fn answer(&self) -> Option<Result<(), HandOverRefusal>> {

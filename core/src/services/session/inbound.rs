@@ -564,7 +564,8 @@ impl<P: Port> Session<P> {
             // handler. A moving call waits until its claim is stored.
             let waits = function.attributes.stop && Granting::awaits_hook(cx, header.slot, header.generation)
                 || function.attributes.lease.is_some()
-                    && self.granting.obedience.may_move(&mut self.wire, cx).is_none();
+                    && self.granting.obedience.may_move(&mut self.wire, cx).is_none()
+                    && self.granting.obedience.waits;
             let arguments = arguments.filter(|_| !waits && self.calls.is_idle(priority));
             let bytes = self.wire.link.view(block, lent);
             match arguments {

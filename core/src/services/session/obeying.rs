@@ -6,6 +6,7 @@ use super::due::Part;
 use super::wire::Wire;
 use crate::config::CHALLENGE_TIMEOUT;
 use crate::distribution::claim::Claim;
+use crate::distribution::connection_handler::MayMove;
 use crate::distribution::hello::ClaimReport;
 use crate::distribution::message::Control;
 use crate::services::{Context, Port};
@@ -73,15 +74,17 @@ impl Obedience {
         }
     }
 
-    /// The claim under which a moving call of the peer may begin. `None` makes the call wait until the port has stored the claim.
+    /// The claim under which a moving call of the peer may begin. `None` makes the call wait until the port has stored the claim, if
+    /// this unit then [`waits`](Self::waits); else nothing of this peer may move.
     pub(super) fn may_move<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) -> Option<Claim> {
         if self.may_move.is_none()
             && let Some(remote) = &wire.remote
         {
-            let (now, peer, mut may) = (cx.now, &remote.hello.identity, None);
-            cx.hub.enter(&mut |hub| may = hub.node.may_move(now, peer).then(|| hub.node.obeyed(peer)));
-            (self.may_move, self.waits) = (may, may.is_none());
-            if may.is_none() {
+            let (now, peer) = (cx.now, &remote.hello.identity);
+            let (mut may, mut under) = (MayMove::No, Claim::NONE);
+            cx.hub.enter(&mut |hub| (may, under) = (hub.node.may_move(now, peer), hub.node.obeyed(peer)));
+            (self.may_move, self.waits) = ((may == MayMove::Yes).then_some(under), may == MayMove::Waits);
+            if self.waits {
                 wire.due.set(Part::Claims, now + LOOK);
             }
         }

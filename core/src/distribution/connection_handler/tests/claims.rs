@@ -134,35 +134,35 @@ fn a_claim_is_stored_before_the_first_moving_call() {
         let mut node = vehicle(claim(5));
         assert_eq!(admit(&mut node, 0, &of_claim(claim(6))), Admission::Accept);
         assert_eq!(node.take_claim_event(), None, "it has only joined");
-        assert!(!node.may_move(at(2_000), &manager) && !node.may_move(at(2_010), &manager));
+        [2_000, 2_010].map(|millis| assert_eq!(node.may_move(at(millis), &manager), MayMove::Waits));
         let keep = ClaimEvent::Keep(manager.clone(), tagged(claim(6)));
         assert_eq!((node.take_claim_event(), node.take_claim_event()), (Some(keep), None), "asked once");
         node
     };
     let mut stored = joined();
     stored.claim_kept(&manager, claim(6), true);
-    assert!(stored.may_move(at(2_020), &manager) && stored.take_claim_event().is_none());
+    assert_eq!((stored.may_move(at(2_020), &manager), stored.take_claim_event()), (MayMove::Yes, None));
     let unkept = Some(ClaimEvent::Unkept(manager.clone(), claim(6)));
     let mut failed = joined();
     failed.claim_kept(&manager, claim(6), false);
-    assert!(failed.may_move(at(2_020), &manager));
+    assert_eq!(failed.may_move(at(2_020), &manager), MayMove::Yes);
     assert_eq!((failed.take_claim_event(), failed.take_claim_event()), (unkept.clone(), None));
     let mut late = joined();
-    assert!(!late.may_move(at(3_999), &manager) && late.may_move(at(4_000), &manager));
+    assert_eq!([3_999, 4_000].map(|millis| late.may_move(at(millis), &manager)), [MayMove::Waits, MayMove::Yes]);
     assert_eq!((late.take_claim_event(), late.counters.value(NodeCounter::ClaimsNotKept)), (unkept, 1));
     // A claim stored in an earlier boot need not be stored again, and a unit that stores none does not wait.
     let mut kept = vehicle(claim(5));
     assert_eq!(admit(&mut kept, 0, &of_claim(claim(5))), Admission::Accept);
     // Its port checks whether the pair key has changed: now, and whenever the peer has authenticated itself again.
     let keep = || Some(ClaimEvent::Keep(manager.clone(), tagged(claim(5))));
-    assert!(kept.may_move(at(2_000), &manager));
+    assert_eq!(kept.may_move(at(2_000), &manager), MayMove::Yes);
     assert_eq!((kept.take_claim_event(), kept.take_claim_event()), (keep(), None));
     kept.proven_anew(&manager);
-    assert!(kept.may_move(at(2_000), &manager));
+    assert_eq!(kept.may_move(at(2_000), &manager), MayMove::Yes);
     assert_eq!((kept.take_claim_event(), kept.take_claim_event()), (keep(), None));
     let mut forgetful = node(s_unit("agv", 1));
     assert_eq!(admit(&mut forgetful, 0, &of_claim(claim(5))), Admission::Accept);
-    assert!(forgetful.may_move(at(2_000), &manager));
+    assert_eq!(forgetful.may_move(at(2_000), &manager), MayMove::Yes);
 }
 
 /// With a vehicle's key, or by mistake: whatever claim it says it has obeyed, the manager loses only that vehicle.

@@ -1,5 +1,6 @@
 //! Hand-over of a vehicle to another manager: it belongs to one of the two at each step, whatever dies.
 
+use super::super::claims::{MayMove, STORING};
 use super::claims::{Keyed, claim, report, tagged};
 use super::*;
 use crate::config::HAND_OVER_TIMEOUT;
@@ -61,14 +62,47 @@ fn what_is_stored_on_joining_is_the_commit() {
     let both = Some((identity(&manager()), identity(&other())));
     assert_eq!(node.handed_over(&identity(&other())), both, "stored with the claim");
     assert_eq!(node.handed_over(&identity(&manager())), None, "a late claim of the old manager is no commit");
-    assert!(!node.may_move(at(2_100), &identity(&other())), "nothing moves before");
-    assert!(!node.may_move(at(30_000), &identity(&other())), "however long the disk takes");
+    assert_eq!(node.may_move(at(2_100), &identity(&other())), MayMove::Waits, "nothing moves before");
     node.claim_kept(&identity(&other()), claim(5), true);
-    assert!(node.may_move(at(30_100), &identity(&other())));
+    assert_eq!(node.may_move(at(2_200), &identity(&other())), MayMove::Yes);
     assert_eq!(node.handed_over(&identity(&manager())), both);
     node.left(at(31_000), NEW, CloseReason::Silent);
     poll(&mut node, 60_000);
     assert!(belongs_to(&node, &other()), "it waits for its new manager");
+}
+
+/// Moving calls are refused then, so that what is behind them in the queue goes on.
+#[test]
+fn a_disk_that_hangs_keeps_it_still_and_is_reported_once() {
+    let (mut node, _) = arrived();
+    let late_from = 2_000 + STORING.as_millis();
+    assert!(node.next_deadline() <= at(late_from));
+    let reported = |node: &mut Node<InMemory>, millis| {
+        let event = poll(node, millis).1;
+        (event, node.may_move(at(millis), &identity(&other())), node.counters.value(NodeCounter::ClaimsNotKept))
+    };
+    assert_eq!(reported(&mut node, late_from - 1), (None, MayMove::Waits, 0));
+    let unkept = Some(ClaimEvent::Unkept(identity(&other()), claim(5)));
+    assert_eq!(reported(&mut node, late_from), (unkept, MayMove::No, 1));
+    // A link that is lost and opened again changes nothing.
+    node.left(at(5_000), NEW, CloseReason::Silent);
+    assert_eq!(node.admit(at(6_000), LinkId(2), address(2, 7_000), &hello(&other(), 5)), Admission::Accept);
+    assert_eq!(reported(&mut node, 60_000), (None, MayMove::No, 1));
+    node.claim_kept(&identity(&other()), claim(5), true);
+    assert_eq!(reported(&mut node, 60_100), (None, MayMove::Yes, 1));
+    assert!(belongs_to(&node, &other()));
+}
+
+/// As a program without claims answers: there is nothing to store the hand-over with.
+#[test]
+fn a_new_manager_without_a_claim_is_left_again_in_time() {
+    let mut node = leaving();
+    let unclaimed = Hello { claim: None, ..hello(&other(), 5) };
+    assert_eq!(node.admit(at(2_000), NEW, address(2, 7_000), &unclaimed), Admission::Accept);
+    assert_eq!(node.may_move(at(2_000), &identity(&other())), MayMove::No);
+    let close = Command::Notify(NEW, Directive::Close(CloseReason::StoppedHere));
+    assert_eq!(poll(&mut node, 11_000).0, Some(close));
+    assert!(belongs_to(&node, &manager()));
 }
 
 #[test]
@@ -92,9 +126,9 @@ fn without_the_new_manager_it_goes_back_in_time() {
         Admission::Refuse(Refusal::WrongManager)
     );
     assert_eq!(node.admit(at(11_200), OLD, address(1, 7_000), &hello(&manager(), 3)), Admission::Accept);
-    assert!(!node.may_move(at(11_300), &identity(&manager())), "its claim is stored first, as ever");
+    assert_eq!(node.may_move(at(11_300), &identity(&manager())), MayMove::Waits, "its claim is stored first, as ever");
     node.claim_kept(&identity(&manager()), claim(3), true);
-    assert!(node.may_move(at(11_400), &identity(&manager())));
+    assert_eq!(node.may_move(at(11_400), &identity(&manager())), MayMove::Yes);
 }
 
 /// A link that is being opened when it goes back is closed.
@@ -119,8 +153,9 @@ fn a_hand_over_that_cannot_be_stored_leads_back() {
     let (mut node, _) = arrived();
     node.claim_kept(&identity(&other()), claim(5), false);
     let close = Command::Notify(NEW, Directive::Close(CloseReason::StoppedHere));
-    assert_eq!(poll(&mut node, 2_200).0, Some(close));
-    assert!(!node.may_move(at(2_200), &identity(&other())), "though its link has not ended yet");
+    let keep = ClaimEvent::Keep(identity(&manager()), tagged(claim(3)));
+    assert_eq!(poll(&mut node, 2_200), (Some(close), Some(keep)), "whatever the disk says by now");
+    assert_eq!(node.may_move(at(2_200), &identity(&other())), MayMove::No, "though its link has not ended yet");
     assert!(belongs_to(&node, &manager()) && node.handed_over(&identity(&manager())).is_none());
     node.left(at(2_200), NEW, CloseReason::StoppedHere);
     assert_eq!(node.admit(at(2_300), OLD, address(1, 7_000), &hello(&manager(), 3)), Admission::Accept);

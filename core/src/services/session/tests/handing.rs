@@ -102,3 +102,33 @@ fn only_a_vehicle_is_handed_over_and_only_by_its_manager() {
     let asked = pair.manager.session.hand_over(context!(pair.manager), &other());
     assert_eq!(asked, Err(Error::NotConnected));
 }
+
+/// A vehicle that does not know hand-over answers nothing, and one that is slow answers late.
+#[test]
+fn only_the_answer_to_the_last_question_counts() {
+    let own = Manager::new("manager", 1).unwrap();
+    let mut pair = vehicle();
+    pair.manager.session.hand_over(context!(pair.manager), &own).unwrap();
+    pair.manager.session.hand_over(context!(pair.manager), &other()).unwrap();
+    assert_eq!(pair.manager.session.hand_over_answer(), None);
+    let answered = |pair: &mut Pair, refusal| pair.manager.session.handing.answered(refusal);
+    assert!(!answered(&mut pair, Some(HandOverRefusal::Other)));
+    assert_eq!(pair.manager.session.hand_over_answer(), None, "that of the first");
+    assert!(answered(&mut pair, None));
+    assert_eq!(pair.manager.session.hand_over_answer(), Some(Ok(())));
+    assert!(!answered(&mut pair, Some(HandOverRefusal::Moves)), "nobody asked");
+    assert_eq!(pair.manager.session.hand_over_answer(), Some(Ok(())));
+}
+
+#[test]
+fn a_manager_that_was_left_moves_nothing_and_what_is_behind_its_call_goes_on() {
+    let mut pair = vehicle();
+    let own = pair.agv.session.hello().unwrap().identity.clone();
+    pair.agv.hub.hub.node.belong_to(&own, &other().identity().unwrap());
+    let go = pair.manager.call("go", &none()).unwrap();
+    pair.manager.call("halt", &none()).unwrap();
+    pair.settle();
+    assert_eq!(pair.manager.outcome(go).unwrap().unwrap_err(), Error::Busy);
+    assert_eq!(pair.agv.held.len(), 1);
+    assert!(!pair.agv.session.awaits_claim());
+}
