@@ -241,6 +241,12 @@ impl<T: Send + 'static, R> Handle<T, R> {
         self.owner.stop();
     }
 
+    /// For watchdogs: wakes the thread that ends leases and misses keep-alives, and waits until it has done what is due. `false` if
+    /// that takes longer than this, or the unit does not run.
+    pub fn keeps_time(&self, within: impl Into<Duration>) -> bool {
+        self.engine().driver.goes_round(within.into())
+    }
+
     /// A handle for the unit's own handlers. One that owned a [`Handle`] would keep it running for ever.
     pub fn downgrade(&self) -> WeakHandle<T, R> {
         WeakHandle { owner: Arc::downgrade(&self.owner), role: PhantomData }

@@ -294,7 +294,9 @@ impl<T: Send + 'static> Driven for Engine<T> {
         let look = self.links.look(others, |link, state| self.settle(link, state));
         self.look_at_claims();
         let others = others.min(self.look_at_leadership());
-        self.poll_links().min(others).min(look).min(self.driver.alarms.sound(self.now()))
+        let next = self.poll_links().min(others).min(look).min(self.driver.alarms.sound(self.now()));
+        self.driver.went_round();
+        next
     }
 
     fn look_around(&self) -> Instant {

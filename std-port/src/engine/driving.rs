@@ -1,6 +1,6 @@
 //! The unit among those that its threads drive: what wakes it, when its futures are woken, and how the threads let go of it.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::Waker;
 
@@ -26,6 +26,8 @@ pub(crate) struct Driver {
     /// A manager looks for a live one of its identity before it starts.
     pub(super) asks_for_itself: bool,
     stopping: AtomicBool,
+    /// How often its clock has done what was due.
+    rounds: AtomicUsize,
     /// When the unit was made.
     born: Instant,
     pub(super) alarms: Alarms,
@@ -35,6 +37,8 @@ pub(crate) struct Driver {
 
 /// A unit for which there are no descriptors takes no connections for so long. Its clock goes on.
 const PAUSE: Duration = Duration::from_millis(100);
+/// How often a watchdog looks whether the clock has gone round.
+const LOOK: std::time::Duration = std::time::Duration::from_millis(1);
 
 impl Driver {
     pub(super) fn new(threads: Threads, own_threads: bool, asks_for_itself: bool) -> Self {
@@ -46,6 +50,7 @@ impl Driver {
             unit_number: OnceLock::new(),
             asks_for_itself,
             stopping: AtomicBool::new(false),
+            rounds: AtomicUsize::new(0),
             born: clock.now(),
             alarms: Alarms::default(),
             listens_at: Mutex::new(None),
@@ -95,6 +100,24 @@ impl Driver {
         if let Some(unit_number) = self.unit_number() {
             self.pool().wake_at(unit_number, at);
         }
+    }
+
+    /// The clock has done what was due.
+    pub(super) fn went_round(&self) {
+        self.rounds.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Wakes the clock; whether it has done what is due before this time is over.
+    pub(crate) fn goes_round(&self, within: Duration) -> bool {
+        let (before, until) = (self.rounds.load(Ordering::Relaxed), self.clock.now() + within);
+        self.wake();
+        while self.rounds.load(Ordering::Relaxed) == before {
+            if self.clock.now() >= until {
+                return false;
+            }
+            std::thread::sleep(LOOK);
+        }
+        true
     }
 
     /// Files and interfaces are looked at now.

@@ -321,3 +321,19 @@ fn a_session_datagram_does_not_take_the_hubs_lock() {
         drop(frozen);
     });
 }
+
+#[test]
+fn a_unit_whose_clock_waits_does_not_keep_time() {
+    let pair = Pair::new(Constraints::M_UNIT, |_| {});
+    assert!(pair.manager.keeps_time(PATIENT));
+    std::thread::scope(|scope| {
+        let frozen = pair.manager.engine().hub.freeze();
+        // A round that began before ends.
+        until(|| !pair.manager.keeps_time(Duration::from_millis(20)));
+        let asking = scope.spawn(|| pair.manager.keeps_time(PATIENT));
+        drop(frozen);
+        assert!(asking.join().unwrap());
+    });
+    pair.manager.stop();
+    assert!(!pair.manager.keeps_time(Duration::from_millis(1)));
+}

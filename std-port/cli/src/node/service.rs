@@ -6,15 +6,18 @@ use sd_notify::NotifyState;
 
 use super::unit::Node;
 
-/// The node is up. Where a watchdog is asked for, it hears of the unit twice in its time.
+/// The node is up. Where a watchdog is asked for, it hears of the unit twice in its time at least, as long as that ends leases in time.
 pub(super) fn up(node: &Node) {
     say(NotifyState::Ready);
     let Some(limit) = sd_notify::watchdog_enabled() else { return };
-    let (lives, pause) = (node.lives(), limit / 2);
+    let (lives, pause) = (node.lives(), limit / 4);
     let watch = move || {
-        // A unit that hangs keeps this thread waiting, so that nothing is said.
-        while lives() {
-            say(NotifyState::Watchdog);
+        while let Some(lives) = lives(pause) {
+            if lives {
+                say(NotifyState::Watchdog);
+            } else {
+                tracing::error!("this unit does not keep time: its service manager hears nothing of it");
+            }
             std::thread::sleep(pause.max(SHORTEST));
         }
     };

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
+use std::time::Duration;
 
 use cara_std::access::AccessError;
 use cara_std::{
@@ -158,16 +159,16 @@ impl Node {
         }
     }
 
-    /// Whether the unit is there; does not return where it hangs, and holds none alive.
-    pub(super) fn lives(&self) -> Box<dyn Fn() -> bool + Send> {
+    /// Whether the unit keeps time, asked for at most so long; `None` once it is gone. Holds none alive but meanwhile.
+    pub(super) fn lives(&self) -> Box<dyn Fn(Duration) -> Option<bool> + Send> {
         match self {
             Self::Manager(system) => {
                 let system = system.downgrade();
-                Box::new(move || system.upgrade().map(|system| system.claim()).is_some())
+                Box::new(move |within| Some(system.upgrade()?.keeps_time(within)))
             }
             Self::Vehicle(unit) => {
                 let unit = unit.downgrade();
-                Box::new(move || unit.upgrade().map(|unit| unit.claim()).is_some())
+                Box::new(move |within| Some(unit.upgrade()?.keeps_time(within)))
             }
         }
     }

@@ -134,7 +134,7 @@ fn a_claim_is_stored_before_the_first_moving_call() {
         let mut node = vehicle(claim(5));
         assert_eq!(admit(&mut node, 0, &of_claim(claim(6))), Admission::Accept);
         assert_eq!(node.take_claim_event(), None, "it has only joined");
-        [2_000, 2_010].map(|millis| assert_eq!(node.may_move(at(millis), &manager), MayMove::Waits));
+        assert_eq!([2_000, 2_010].map(|millis| node.may_move(at(millis), &manager)), [MayMove::Waits; 2]);
         let keep = ClaimEvent::Keep(manager.clone(), tagged(claim(6)));
         assert_eq!((node.take_claim_event(), node.take_claim_event()), (Some(keep), None), "asked once");
         node
