@@ -284,12 +284,28 @@ impl ThreadPool {
 
     /// Leaves a link's calls to another thread of the pool.
     pub(crate) fn hand_over(&self, link: u64) {
+        self.note_waiting(link);
+        self.pool_waker.wake();
+    }
+
+    /// The same without waking a thread: the clock does where the call still waits when it looks.
+    pub(crate) fn note_waiting(&self, link: u64) {
         let mut ready = lock(&self.ready);
         if !ready.contains(&link) {
             ready.push_back(link);
         }
-        drop(ready);
-        self.pool_waker.wake();
+    }
+
+    /// Whether calls wait that no thread runs yet.
+    pub(crate) fn has_waiting(&self) -> bool {
+        !lock(&self.ready).is_empty()
+    }
+
+    /// Wakes a thread for calls that wait.
+    pub(crate) fn wake_for_waiting(&self) {
+        if self.has_waiting() {
+            self.pool_waker.wake();
+        }
     }
 
     /// Whether calls of other links wait and no thread of the pool is idle.

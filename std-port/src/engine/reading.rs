@@ -79,6 +79,7 @@ impl Links {
             self.driver.pool().watched.fetch_sub(usize::from(!stays), Ordering::Relaxed);
             stays
         });
+        self.driver.pool().wake_for_waiting();
         if !self.driver.pool().relieve(now, RELIEF) && !again {
             return Instant::FAR_FUTURE;
         }
@@ -95,6 +96,7 @@ impl Links {
         if look >= now + LOOK.divided_by(2)
             || self.driver.pool().watched.load(Ordering::Relaxed) != 1
             || !self.driver.pool().has_idle()
+            || self.driver.pool().has_waiting()
         {
             return;
         }

@@ -132,7 +132,8 @@ impl<T: Send + 'static> Engine<T> {
         tracing::warn!(%unit, function, held_ms = held.as_millis(), "a service held the unit's state for over a second; {advice}");
     }
 
-    /// Takes the next call that may begin on a link; another thread is told if there is one more.
+    /// Takes the next call that may begin on a link. If there is one more, another thread is told, unless handlers are quick:
+    /// then the clock tells one, should this handler take long after all.
     pub(super) fn next_call(
         &self,
         link: &Arc<LinkCell>,
@@ -144,11 +145,19 @@ impl<T: Send + 'static> Engine<T> {
         if state.is_paused() && !state.session.has_next_call() {
             self.feed(self.now(), link, &mut state, &mut [], None, None);
         }
-        if state.session.has_next_call() && self.may_run(state.reading.is_quick()) {
+        let is_quick = state.reading.is_quick();
+        if state.session.has_next_call() && self.may_run(is_quick) {
             next = self.take_call(link, &mut state, worker);
         }
         if state.session.has_next_call() {
-            self.hand_over(link);
+            match next {
+                // This thread comes back for it before another one would have begun.
+                Some(_) if is_quick => {
+                    self.driver.pool().note_waiting(link.token());
+                    self.links.begin_watch();
+                }
+                _ => self.hand_over(link),
+            }
         }
         self.settle(link, state);
         next

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::{Error, Parameters, Peer, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, Unit};
 
@@ -10,8 +10,8 @@ use crate::support::{Gate, PATIENCE, ask, counter, fleet, held, meet, number, se
 
 const LEASE: Duration = Duration::from_millis(300);
 
-/// A vehicle whose handlers are stuck as long as the gate is closed: `held` without the state, `held_state` with it, and
-/// the emergency `held_stop`. `stop` and `go`, with its hook, are sound.
+/// A vehicle whose handlers are stuck as long as the gate is closed: `held` without the state, `held_state` with it, the
+/// emergency `held_stop`, and `held_at_zero` where its number is 0. `stop` and `go`, with its hook, are sound.
 struct Stuck {
     _manager: cara_std::CommunicationSystem,
     agv: Unit<i64>,
@@ -46,6 +46,14 @@ impl Stuck {
             parameters
         };
         list.add_function("held_state", &number(0), with_state).unwrap();
+        let at_gate = gate.clone();
+        let held_at_zero = move |number| {
+            if number == 0 {
+                at_gate.pass();
+            }
+            number
+        };
+        list.add_function("held_at_zero", &number(0), service(held_at_zero)).unwrap();
         let signature = |name: &str| format!("{name}(number: int[1]) -> (number: int[1])").parse().unwrap();
         list.add_service(&signature("held_stop"), emergency(), held(&gate)).unwrap();
         list.add_service(&signature("stop"), emergency(), service(|number| number)).unwrap();
@@ -58,10 +66,15 @@ impl Stuck {
 
     /// Calls without waiting, and without an end that the test could see.
     fn call(&self, function: &str) {
+        self.queue(function, 1);
+        self.peer.flush().unwrap();
+    }
+
+    /// The same; it leaves with what is called next.
+    fn queue(&self, function: &str, with: i64) {
         let options =
             RequestOptions { timeout: Some(PATIENCE.into()), renew: Renew::Never, ..RequestOptions::default() };
-        self.peer.call(function, &mut number(1)).with(options).send().unwrap();
-        self.peer.flush().unwrap();
+        self.peer.call(function, &mut number(with)).with(options).send().unwrap();
     }
 
     fn go(&self) {
@@ -123,6 +136,24 @@ fn a_quick_call_waits_for_none_of_three_slow_ones_before_it() {
     }
     assert_eq!(ask(&stuck.peer, "quick", 7), Ok(7));
     until("the three run side by side", || stuck.gate.came() == 3);
+    stuck.gate.open();
+}
+
+/// While handlers are quick one thread serves what has come; behind one that hangs after all another thread goes on.
+#[test]
+fn a_call_does_not_wait_for_one_whose_handler_was_quick_until_then() {
+    let stuck = Stuck::new();
+    let mut rounds = [1, 2, 3, 4, 5, 6, 7, 8, 9].map(|hung| {
+        (1..=50).for_each(|number| stuck.queue("held_at_zero", number));
+        stuck.queue("held_at_zero", 0);
+        let asked = Instant::now();
+        assert_eq!(ask(&stuck.peer, "quick", 7), Ok(7));
+        until("one more hangs", || stuck.gate.came() == hung);
+        asked.elapsed()
+    });
+    // The next keep-alive, after a second, would have it served as well.
+    rounds.sort();
+    assert!(rounds[4] < Duration::from_millis(500), "{rounds:?}");
     stuck.gate.open();
 }
 
