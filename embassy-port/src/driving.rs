@@ -20,11 +20,12 @@ use cara_core::services::lease::Lease;
 use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
-use core::task::{Context as TaskContext, Poll};
+use core::task::Context as TaskContext;
 
+use crate::connection::Progress;
 use crate::event::{Name, UnitEvent};
-use crate::line::{Progress, address_of};
 use crate::machine::{Machine, Started};
+use crate::net::Socket;
 use crate::port::{Board, LinkSession};
 #[cfg(feature = "streams")]
 use crate::readings::came;
@@ -98,7 +99,7 @@ impl<T> Machine<T> {
             session.hold_back();
             return None;
         }
-        let peeked = mail.lines.get_mut(usize::from(index))?.peek(scratch);
+        let peeked = mail.connections.get_mut(usize::from(index))?.peek(scratch);
         let lent = scratch.get_mut(..peeked)?;
         let access = access.0;
         let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof };
@@ -110,13 +111,13 @@ impl<T> Machine<T> {
             #[cfg(feature = "streams")]
             came(&self.readings, link, now(), event, lent);
         }
-        mail.lines.get_mut(usize::from(index))?.take(receipt.consumed);
+        mail.connections.get_mut(usize::from(index))?.take(receipt.consumed);
         (receipt.consumed > 0 || receipt.event.is_some()).then_some(receipt.event)
     }
 
     /// Whether no link has anything left to read, or a call to begin.
     pub(crate) fn has_read_all(&self) -> bool {
-        self.links.iter().zip(self.mail.lines.iter()).all(|(link, line)| {
+        self.links.iter().zip(self.mail.connections.iter()).all(|(link, line)| {
             let session = link.session.as_ref();
             line.has_been_read() && session.is_none_or(|session| !session.holds_received() && !session.has_next_call())
         })
@@ -129,12 +130,7 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         context: &mut TaskContext<'_>,
     ) -> Option<Option<(u16, Event)>> {
-        let (length, from) = match self.mail.udp.poll_recv_from(scratch, context) {
-            Poll::Pending => return None,
-            Poll::Ready(Err(_)) => return Some(None),
-            Poll::Ready(Ok((length, from))) => (length, from.endpoint),
-        };
-        let Some(from) = address_of(from) else { return Some(None) };
+        let Some((length, from)) = self.mail.net.receive(scratch, context)? else { return Some(None) };
         let bytes = scratch.get_mut(..length).unwrap_or_default();
         let (mode, fleet) = (self.proof.codes().mode(), self.hub.node.fleet());
         if let Some((LinkId(link), nonce, body)) = datagram::for_session(bytes, mode, fleet)
@@ -225,7 +221,7 @@ impl<T> Machine<T> {
     pub(crate) fn look_at_lines(&mut self) {
         let now = now();
         for index in self.indices() {
-            let Some(line) = self.mail.lines.get_mut(usize::from(index)) else { continue };
+            let Some(line) = self.mail.connections.get_mut(usize::from(index)) else { continue };
             match line.progress(now) {
                 Progress::None => {}
                 Progress::Connected => {
@@ -240,7 +236,7 @@ impl<T> Machine<T> {
                     None => self.hang_up(index),
                 },
             }
-            if self.mail.lines.get(usize::from(index)).is_some_and(crate::line::Line::has_ended) {
+            if self.mail.connections.get(usize::from(index)).is_some_and(Socket::has_ended) {
                 self.disconnected(index, CloseReason::Reset);
             }
         }
@@ -256,7 +252,7 @@ impl<T> Machine<T> {
         let mut pending = self.pending();
         let Some(first) = pending.next() else { return };
         let second = pending.next();
-        if second.is_none() && self.mail.lines.iter().any(crate::line::Line::takes_connections) {
+        if second.is_none() && self.mail.connections.iter().any(Socket::takes_connections) {
             return;
         }
         let (since, index) = pending.chain(second).fold(first, core::cmp::min);
@@ -274,7 +270,7 @@ impl<T> Machine<T> {
 
     fn hang_up(&mut self, index: u16) {
         let up = self.address.is_some();
-        if let Some(line) = self.mail.lines.get_mut(usize::from(index)) {
+        if let Some(line) = self.mail.connections.get_mut(usize::from(index)) {
             if up { line.close() } else { line.abort() }
         }
     }
@@ -284,7 +280,7 @@ impl<T> Machine<T> {
         for index in self.indices() {
             let wants =
                 self.link(index).and_then(|link| link.session.as_ref()).is_some_and(LinkSession::wants_to_write);
-            if wants && self.mail.lines.get(usize::from(index)).is_some_and(crate::line::Line::can_write) {
+            if wants && self.mail.connections.get(usize::from(index)).is_some_and(Socket::can_write) {
                 self.with(index, |session, cx| session.writable(cx));
             }
         }
@@ -299,13 +295,11 @@ impl<T> Machine<T> {
             return;
         }
         self.look = now + LOOK;
-        let config = if self.mail.stack.is_link_up() { self.mail.stack.config_v4() } else { None };
-        let address = config.map(|config| config.address);
+        let address = self.mail.net.address();
         if address == self.address {
             return;
         }
         self.address = address;
-        let address = address.map(|address| address.address());
         log!("the address is now {:?}", address.map(|address| address.octets()));
         if address.is_some() {
             self.hub.node.network_changed(now);
@@ -316,7 +310,7 @@ impl<T> Machine<T> {
         }
         for index in self.indices() {
             self.disconnected(index, CloseReason::Reset);
-            if let Some(line) = self.mail.lines.get_mut(usize::from(index)) {
+            if let Some(line) = self.mail.connections.get_mut(usize::from(index)) {
                 line.abort();
             }
         }
@@ -374,7 +368,7 @@ impl<T> Machine<T> {
     #[inline(never)]
     fn dial(&mut self, to: SocketAddrV4, identity: Option<&Identity>) {
         let dialed = self.free_link().filter(|index| {
-            let line = self.mail.lines.get_mut(usize::from(*index));
+            let line = self.mail.connections.get_mut(usize::from(*index));
             line.is_some_and(|line| line.dial(to))
         });
         match dialed {

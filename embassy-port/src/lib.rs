@@ -84,6 +84,7 @@ macro_rules! warning {
 
 mod calls;
 mod config;
+mod connection;
 #[cfg_attr(not(feature = "details"), path = "no_details.rs")]
 mod details;
 mod driving;
@@ -94,10 +95,10 @@ mod handler;
 mod interfaces;
 mod lease;
 mod limits;
-mod line;
 mod link;
 mod machine;
 mod mail;
+mod net;
 mod peer;
 mod port;
 mod publishing;

@@ -13,18 +13,17 @@ use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
 use core::cell::{Cell, RefCell};
-use core::net::SocketAddrV4;
+use core::net::{Ipv4Addr, SocketAddrV4};
 use core::task::Context as TaskContext;
-use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
 use crate::config::Table;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::limits::Limits;
-use crate::line::Line;
 use crate::link::{InFlight, Link};
-use crate::mail::EmbassyMailman;
+use crate::mail::Mail;
+use crate::net::Socket;
 use crate::port::{Board, LinkContext, LinkCounters, LinkSession};
 use crate::replies::ReplyBox;
 use crate::security::Proof;
@@ -97,7 +96,7 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
     pub(crate) links: &'static mut [Link],
-    pub(crate) mail: EmbassyMailman,
+    pub(crate) mail: Mail,
     pub(crate) reply: ReplyBox,
     #[cfg(feature = "streams")]
     pub(crate) readings: crate::readings::Readings,
@@ -112,7 +111,7 @@ pub(crate) struct Machine<T: 'static> {
     /// Where an m_unit listens.
     pub(crate) tcp_port: u16,
     /// The unit's own address; none while the cable is out or no address is known.
-    pub(crate) address: Option<Ipv4Cidr>,
+    pub(crate) address: Option<Ipv4Addr>,
     /// When the cable and the address are looked at again.
     pub(crate) look: Instant,
     /// It has had an address.
@@ -196,7 +195,7 @@ impl<T> Machine<T> {
     /// Lets the node do what is due.
     #[inline(never)]
     pub(crate) fn poll_node(&mut self, context: &mut TaskContext<'_>) -> Option<Command<SocketAddrV4>> {
-        if Board::MANAGES && self.mail.udp.poll_recv_ready(context).is_ready() {
+        if Board::MANAGES && self.mail.net.has_datagram(context) {
             self.hub.node.left_unread();
         }
         self.hub.node.poll(now(), &mut self.mail, self.proof.codes())
@@ -221,10 +220,10 @@ impl<T> Machine<T> {
     /// A link that could dial: one whose socket is idle, if there is any.
     pub(crate) fn free_link(&self) -> Option<u16> {
         let free = |index: &u16| {
-            let line = self.mail.lines.get(usize::from(*index)).is_some_and(|line| !line.is_in_use());
+            let line = self.mail.connections.get(usize::from(*index)).is_some_and(|line| !line.is_in_use());
             line && self.link(*index).is_some_and(|link| link.storage.is_some())
         };
-        let closing = |index: &u16| self.mail.lines.get(usize::from(*index)).is_some_and(Line::is_closing);
+        let closing = |index: &u16| self.mail.connections.get(usize::from(*index)).is_some_and(Socket::is_closing);
         let mut candidates = self.indices().filter(free);
         let first = candidates.next()?;
         if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }
@@ -244,7 +243,7 @@ impl<T> Machine<T> {
     pub(crate) fn listen(&mut self) {
         if Board::MANAGES && self.hub.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
             let port = self.tcp_port;
-            self.mail.lines.iter_mut().for_each(|line| line.listen(port));
+            self.mail.connections.iter_mut().for_each(|line| line.listen(port));
         }
     }
 

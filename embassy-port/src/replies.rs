@@ -9,7 +9,7 @@ use cara_core::distribution::function::Signature;
 use cara_core::error::Error;
 use cara_core::services::session::Event;
 
-use crate::line::copy;
+use crate::connection::copy;
 use crate::link::{InFlight, Link};
 
 /// Room for the results of one call.

@@ -21,7 +21,6 @@ use cara_core::services::{Port, RunningCall};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;
 use embassy_net::Stack;
-use embassy_net::udp::{PacketMetadata, UdpSocket};
 
 use crate::config::Config;
 
@@ -29,11 +28,11 @@ use crate::event::{Events, UnitEvent};
 use crate::handle::Handle;
 use crate::handler::Listed;
 use crate::limits::Limits;
-use crate::line::Line;
 use crate::link::Link;
 use crate::link::Waiter;
 use crate::machine::{Machine, Shared, Started, Unwanted, Wakers};
-use crate::mail::EmbassyMailman;
+use crate::mail::Mail;
+use crate::net::{self, Socket};
 use crate::port::Board;
 use crate::replies::ReplyBox;
 use crate::runner::Runner;
@@ -50,8 +49,6 @@ const OWN_SIGNATURE: usize = if cfg!(feature = "help") { 192 } else { SIGNATURE 
 const EVENTS: usize = 6;
 /// Refusals that are remembered.
 const FINDINGS: usize = 2;
-/// Datagrams that wait to be read or sent.
-const DATAGRAMS: usize = 8;
 
 /// The memory of one unit, of the type that [`resources!`](crate::resources) makes of its [`Limits`].
 ///
@@ -75,9 +72,8 @@ pub struct Resources<
 > {
     shared: MaybeUninit<Shared<T>>,
     links: MaybeUninit<[Link; LINKS]>,
-    lines: MaybeUninit<[Line; LINKS]>,
-    /// For each link, what is received and what is sent.
-    streams: [[MaybeUninit<[u8; STREAM]>; 2]; LINKS],
+    sockets: MaybeUninit<[Socket; LINKS]>,
+    net: net::Memory<LINKS, STREAM, DATAGRAM>,
     sessions: [SessionMemory<OWN, THEIR, CALLS>; LINKS],
     nodes: MaybeUninit<[[Option<Known<SocketAddrV4>>; KNOWN]; LINKS]>,
     order: MaybeUninit<[[Order; KNOWN]; LINKS]>,
@@ -94,9 +90,8 @@ pub struct Resources<
     task_parameters: [MaybeUninit<Parameters<ARGUMENTS>>; TASKS],
     tasks: MaybeUninit<[TaskSlot; TASKS]>,
     events: MaybeUninit<[Option<UnitEvent>; EVENTS]>,
-    /// One that is looked at, those that were received, and those to be sent.
-    datagrams: MaybeUninit<[[u8; DATAGRAM]; 3]>,
-    datagram_heads: MaybeUninit<[[PacketMetadata; DATAGRAMS]; 2]>,
+    /// What has arrived is looked at in here.
+    scratch: MaybeUninit<[u8; DATAGRAM]>,
 }
 
 /// The memory of one link.
@@ -190,8 +185,8 @@ impl<
         Self {
             shared: MaybeUninit::uninit(),
             links: MaybeUninit::uninit(),
-            lines: MaybeUninit::uninit(),
-            streams: [const { [const { MaybeUninit::uninit() }; 2] }; LINKS],
+            sockets: MaybeUninit::uninit(),
+            net: net::Memory::new(),
             sessions: [const { SessionMemory::new() }; LINKS],
             nodes: MaybeUninit::uninit(),
             order: MaybeUninit::uninit(),
@@ -208,8 +203,7 @@ impl<
             task_parameters: [const { MaybeUninit::uninit() }; TASKS],
             tasks: MaybeUninit::uninit(),
             events: MaybeUninit::uninit(),
-            datagrams: MaybeUninit::uninit(),
-            datagram_heads: MaybeUninit::uninit(),
+            scratch: MaybeUninit::uninit(),
         }
     }
 }
@@ -248,72 +242,63 @@ impl<
         if config.security.0.mode() == Mode::Plain {
             warning!("this unit is INSECURE: anybody on the network can read what it says, and can speak as its peers");
         }
-        let [received, sent] = self.datagram_heads.write([[PacketMetadata::EMPTY; DATAGRAMS]; 2]);
-        let [scratch, receive, send] = self.datagrams.write([[0; DATAGRAM]; 3]);
-        let mut udp = UdpSocket::new(stack, received, receive, sent, send);
-        udp.bind(config.node.udp_port).map_err(|_| Error::PortInUse)?;
+        let (net, sockets) = self.net.open(stack, config.node.udp_port)?;
+        let connections = self.sockets.write(sockets);
+        let scratch = self.scratch.write([0; DATAGRAM]);
         let storage = NodeStorage {
             nodes: self.nodes.write([const { [const { None }; KNOWN] }; LINKS]).as_flattened_mut(),
             order: self.order.write(core::array::from_fn(|_| Default::default())).as_flattened_mut(),
             links: self.node_links.write([None; LINKS]).as_mut_slice(),
             findings: self.findings.write([const { None }; FINDINGS]).as_mut_slice(),
         };
-        let (port, tcp_port) = (config.node.udp_port, config.node.tcp_port);
+        let tcp_port = config.node.tcp_port;
         let (seed, manager) = (config.node.seed, config.manager());
         let pool = self.pool.write([const { None }; BUFFERS]);
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
         }
-        let machine =
-            Machine {
-                hub: Hub {
-                    node: node(config.node, storage),
-                    publications: Publications::new(
-                        self.to_all.write([false; OWN]).as_mut_slice(),
-                        self.to_one.write([const { [const { None }; OWN] }; LINKS]).as_flattened_mut(),
-                    ),
-                },
-                proof: config.security.0,
-                access: config.access,
-                store_own: config.store_own,
-                store: config.store,
-                unstored: None,
-                functions: FunctionList::new(
-                    self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
-                    self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
+        let machine = Machine {
+            hub: Hub {
+                node: node(config.node, storage),
+                publications: Publications::new(
+                    self.to_all.write([false; OWN]).as_mut_slice(),
+                    self.to_one.write([const { [const { None }; OWN] }; LINKS]).as_flattened_mut(),
                 ),
-                pool: Pool::new(&mut pool[..]),
-                links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
-                mail: EmbassyMailman {
-                    lines: self.lines.write(self.streams.each_mut().map(|[received, sent]| {
-                        Line::new(stack, received.write([0; STREAM]), sent.write([0; STREAM]))
-                    })),
-                    udp,
-                    port,
-                    stack,
-                },
-                reply: ReplyBox::new(self.reply.write([0; REPLY])),
-                #[cfg(feature = "streams")]
-                readings: crate::readings::Readings::NONE,
-                tasks: self.tasks.write(
-                    self.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized()))),
-                ),
-                events: Events::new(self.events.write([const { None }; EVENTS])),
-                yields: false,
-                lost_hook: None,
-                tcp_port,
-                address: None,
-                look: Instant::START,
-                started: Started::Nothing,
-                started_on: 0,
-                has_started: false,
-                stopped: false,
-                logged: Instant::START,
-                renews_every: HANDSHAKE_LIFE,
-                counters: Counters::new(),
-                limits: const { &Self::LIMITS },
-                wakers: Wakers::new(),
-            };
+            },
+            proof: config.security.0,
+            access: config.access,
+            store_own: config.store_own,
+            store: config.store,
+            unstored: None,
+            functions: FunctionList::new(
+                self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
+                self.signatures.write([[0; OWN_SIGNATURE]; OWN]).as_flattened_mut(),
+            ),
+            pool: Pool::new(&mut pool[..]),
+            links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
+            mail: Mail { net, connections },
+            reply: ReplyBox::new(self.reply.write([0; REPLY])),
+            #[cfg(feature = "streams")]
+            readings: crate::readings::Readings::NONE,
+            tasks: self
+                .tasks
+                .write(self.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized())))),
+            events: Events::new(self.events.write([const { None }; EVENTS])),
+            yields: false,
+            lost_hook: None,
+            tcp_port,
+            address: None,
+            look: Instant::START,
+            started: Started::Nothing,
+            started_on: 0,
+            has_started: false,
+            stopped: false,
+            logged: Instant::START,
+            renews_every: HANDSHAKE_LIFE,
+            counters: Counters::new(),
+            limits: const { &Self::LIMITS },
+            wakers: Wakers::new(),
+        };
         let shared = self.shared.write(Shared {
             machine: RefCell::new(machine),
             state: RefCell::new(state),

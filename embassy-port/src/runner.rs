@@ -145,7 +145,7 @@ impl<T> Runner<T> {
     #[inline(never)]
     fn rest(&mut self, context: &mut Context<'_>) -> bool {
         let machine = &mut *self.shared.machine.borrow_mut();
-        for (link, line) in machine.links.iter().zip(machine.mail.lines.iter()) {
+        for (link, line) in machine.links.iter().zip(machine.mail.connections.iter()) {
             line.wake_on_news(context, link.session.as_ref().is_some_and(LinkSession::wants_to_write));
         }
         self.rested_until = machine.next_look();
@@ -274,7 +274,7 @@ impl<T> Machine<T> {
     fn deadline(&self) -> Instant {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
         let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
-        let lines = self.mail.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
+        let lines = self.mail.connections.iter().map(crate::net::Socket::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let node = if self.stopped { Instant::FAR_FUTURE } else { self.hub.node.next_deadline() };
         let kept = self.reply_deadline().min(self.parked_deadline());
         sessions.min(lines).min(node).min(kept).min(self.look)

@@ -1,17 +1,105 @@
-//! One TCP socket, and what it is doing: embassy-net's `connect` and `accept` cannot be polled once and begun again, so
-//! that state is kept here. Nothing in here waits.
+//! IP: a UDP socket for datagrams, and for each connection a TCP socket with what it is doing, since embassy-net's `connect` and
+//! `accept` cannot be polled once and begun again. Nothing in here waits.
 
 use core::future::Future;
-use core::net::{SocketAddr, SocketAddrV4};
+use core::mem::MaybeUninit;
+use core::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use core::pin::pin;
 use core::task::{Context, Poll, Waker};
 
-use cara_core::error::CloseReason;
+use cara_core::error::{CloseReason, Error};
 use cara_core::time::{Duration, Instant};
 use embassy_net::tcp::{State, TcpSocket};
-use embassy_net::{IpAddress, IpEndpoint, Stack};
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_net::{IpAddress, IpEndpoint, Stack, StaticConfigV4};
 
+use crate::connection::{Progress, copy};
 use crate::time::now;
+
+/// Datagrams that wait to be read or sent.
+const DATAGRAMS: usize = 8;
+
+/// The memory of the sockets.
+pub(crate) struct Memory<const LINKS: usize, const STREAM: usize, const DATAGRAM: usize> {
+    /// For each link, what is received and what is sent.
+    streams: [[MaybeUninit<[u8; STREAM]>; 2]; LINKS],
+    /// Those that were received, and those to be sent.
+    datagrams: MaybeUninit<[[u8; DATAGRAM]; 2]>,
+    datagram_heads: MaybeUninit<[[PacketMetadata; DATAGRAMS]; 2]>,
+}
+
+impl<const LINKS: usize, const STREAM: usize, const DATAGRAM: usize> Memory<LINKS, STREAM, DATAGRAM> {
+    pub(crate) const fn new() -> Self {
+        Self {
+            streams: [const { [const { MaybeUninit::uninit() }; 2] }; LINKS],
+            datagrams: MaybeUninit::uninit(),
+            datagram_heads: MaybeUninit::uninit(),
+        }
+    }
+
+    /// The socket for datagrams at that port of the stack, and those of the links.
+    pub(crate) fn open(&'static mut self, stack: Stack<'static>, port: u16) -> Result<(Net, [Socket; LINKS]), Error> {
+        let [received, sent] = self.datagram_heads.write([[PacketMetadata::EMPTY; DATAGRAMS]; 2]);
+        let [receive, send] = self.datagrams.write([[0; DATAGRAM]; 2]);
+        let mut udp = UdpSocket::new(stack, received, receive, sent, send);
+        udp.bind(port).map_err(|_| Error::PortInUse)?;
+        let streams = self.streams.each_mut();
+        let sockets =
+            streams.map(|[received, sent]| Socket::new(stack, received.write([0; STREAM]), sent.write([0; STREAM])));
+        Ok((Net { stack, udp, port }, sockets))
+    }
+}
+
+/// The network, and the socket for datagrams.
+pub(crate) struct Net {
+    stack: Stack<'static>,
+    udp: UdpSocket<'static>,
+    /// Where units of this mode listen for broadcasts.
+    port: u16,
+}
+
+impl Net {
+    /// The unit's address, if there is one and the cable is plugged in.
+    pub(crate) fn address(&self) -> Option<Ipv4Addr> {
+        self.config().map(|config| config.address.address())
+    }
+
+    fn config(&self) -> Option<StaticConfigV4> {
+        if self.stack.is_link_up() { self.stack.config_v4() } else { None }
+    }
+
+    pub(crate) fn send_to(&mut self, to: SocketAddrV4, datagram: &[u8]) -> bool {
+        let to = IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port());
+        // No task waits for send space on this socket, so the no-op waker displaces none.
+        let sent = self.udp.poll_send_to(datagram, to, &mut Context::from_waker(Waker::noop()));
+        matches!(sent, Poll::Ready(Ok(())))
+    }
+
+    pub(crate) fn broadcast(&mut self, datagram: &[u8]) -> bool {
+        let Some(config) = self.config() else { return false };
+        let all = config.address.broadcast().unwrap_or(Ipv4Addr::BROADCAST);
+        self.send_to(SocketAddrV4::new(all, self.port), datagram)
+    }
+
+    /// Takes a datagram: its length and where it comes from, or that it is dropped. `None` when there is none; the task is then
+    /// woken by the next.
+    pub(crate) fn receive(
+        &mut self,
+        into: &mut [u8],
+        context: &mut Context<'_>,
+    ) -> Option<Option<(usize, SocketAddrV4)>> {
+        match self.udp.poll_recv_from(into, context) {
+            Poll::Pending => None,
+            Poll::Ready(Err(_)) => Some(None),
+            Poll::Ready(Ok((length, from))) => Some(address_of(from.endpoint).map(|from| (length, from))),
+        }
+    }
+
+    /// Whether a datagram waits.
+    pub(crate) fn has_datagram(&mut self, context: &mut Context<'_>) -> bool {
+        self.udp.poll_recv_ready(context).is_ready()
+    }
+}
 
 /// How long a socket may take to say farewell before it is reset.
 const FAREWELL: Duration = Duration::from_millis(500);
@@ -29,27 +117,14 @@ enum Doing {
     },
 }
 
-/// Progress of a socket's operation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Progress {
-    /// Nothing new.
-    None,
-    /// The connection that was dialled is there.
-    Connected,
-    /// A connection was accepted.
-    Accepted(SocketAddrV4),
-    /// The connection that was dialled could not be opened.
-    Broken,
-}
-
 /// One TCP socket.
-pub(crate) struct Line {
+pub(crate) struct Socket {
     socket: TcpSocket<'static>,
     doing: Doing,
 }
 
-impl Line {
-    pub(crate) fn new(stack: Stack<'static>, receive: &'static mut [u8], send: &'static mut [u8]) -> Self {
+impl Socket {
+    fn new(stack: Stack<'static>, receive: &'static mut [u8], send: &'static mut [u8]) -> Self {
         let mut socket = TcpSocket::new(stack, receive, send);
         // A small request must not wait for the acknowledgement of the one before.
         socket.set_nagle_enabled(false);
@@ -226,7 +301,7 @@ impl Line {
 }
 
 /// Units of boards have IPv4 addresses only.
-pub(crate) fn address_of(end: IpEndpoint) -> Option<SocketAddrV4> {
+fn address_of(end: IpEndpoint) -> Option<SocketAddrV4> {
     match SocketAddr::new(end.addr.into(), end.port) {
         SocketAddr::V4(address) => Some(address),
         SocketAddr::V6(_) => None,
@@ -234,18 +309,9 @@ pub(crate) fn address_of(end: IpEndpoint) -> Option<SocketAddrV4> {
 }
 
 /// Polls a future once, and gives it up if it would wait.
-pub(crate) fn poll_once<F: Future>(future: F) -> Option<F::Output> {
+fn poll_once<F: Future>(future: F) -> Option<F::Output> {
     match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(output) => Some(output),
         Poll::Pending => None,
     }
-}
-
-/// Copies as much as both hold.
-pub(crate) fn copy(from: &[u8], to: &mut [u8]) -> usize {
-    let count = from.len().min(to.len());
-    if let (Some(from), Some(to)) = (from.get(..count), to.get_mut(..count)) {
-        to.copy_from_slice(from);
-    }
-    count
 }
