@@ -25,7 +25,7 @@ use core::task::Context as TaskContext;
 use crate::connection::Progress;
 use crate::event::{Name, UnitEvent};
 use crate::machine::{Machine, Started};
-use crate::net::Socket;
+use crate::mail::Connection;
 use crate::port::{Board, LinkSession};
 #[cfg(feature = "streams")]
 use crate::readings::came;
@@ -130,7 +130,7 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         context: &mut TaskContext<'_>,
     ) -> Option<Option<(u16, Event)>> {
-        let Some((length, from)) = self.mail.net.receive(scratch, context)? else { return Some(None) };
+        let Some((length, from)) = self.mail.receive(scratch, context)? else { return Some(None) };
         let bytes = scratch.get_mut(..length).unwrap_or_default();
         let (mode, fleet) = (self.proof.codes().mode(), self.hub.node.fleet());
         if let Some((LinkId(link), nonce, body)) = datagram::for_session(bytes, mode, fleet)
@@ -236,7 +236,7 @@ impl<T> Machine<T> {
                     None => self.hang_up(index),
                 },
             }
-            if self.mail.connections.get(usize::from(index)).is_some_and(Socket::has_ended) {
+            if self.mail.connections.get(usize::from(index)).is_some_and(Connection::has_ended) {
                 self.disconnected(index, CloseReason::Reset);
             }
         }
@@ -252,7 +252,7 @@ impl<T> Machine<T> {
         let mut pending = self.pending();
         let Some(first) = pending.next() else { return };
         let second = pending.next();
-        if second.is_none() && self.mail.connections.iter().any(Socket::takes_connections) {
+        if second.is_none() && self.mail.connections.iter().any(Connection::takes_connections) {
             return;
         }
         let (since, index) = pending.chain(second).fold(first, core::cmp::min);
@@ -280,7 +280,7 @@ impl<T> Machine<T> {
         for index in self.indices() {
             let wants =
                 self.link(index).and_then(|link| link.session.as_ref()).is_some_and(LinkSession::wants_to_write);
-            if wants && self.mail.connections.get(usize::from(index)).is_some_and(Socket::can_write) {
+            if wants && self.mail.connections.get(usize::from(index)).is_some_and(Connection::can_write) {
                 self.with(index, |session, cx| session.writable(cx));
             }
         }
@@ -295,7 +295,7 @@ impl<T> Machine<T> {
             return;
         }
         self.look = now + LOOK;
-        let address = self.mail.net.address();
+        let address = self.mail.address();
         if address == self.address {
             return;
         }

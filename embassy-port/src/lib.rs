@@ -95,9 +95,12 @@ mod handler;
 mod interfaces;
 mod lease;
 mod limits;
+#[cfg(feature = "line")]
+pub mod line;
 mod link;
 mod machine;
 mod mail;
+#[cfg(feature = "net")]
 mod net;
 mod peer;
 mod port;
@@ -138,6 +141,7 @@ pub use handler::{Free, Handler, Hook, Method, Safe, Served, ServiceOptions};
 pub use interfaces::Actuator;
 pub use lease::LeaseWatch;
 pub use limits::Limits;
+pub use mail::Transport;
 pub use peer::{Peer, TheirFunctionList};
 #[cfg(feature = "streams")]
 pub use readings::{SubscriptionCell, SubscriptionInner};

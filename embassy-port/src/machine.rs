@@ -22,8 +22,7 @@ use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::limits::Limits;
 use crate::link::{InFlight, Link};
-use crate::mail::Mail;
-use crate::net::Socket;
+use crate::mail::{Connection, Mail};
 use crate::port::{Board, LinkContext, LinkCounters, LinkSession};
 use crate::replies::ReplyBox;
 use crate::security::Proof;
@@ -195,7 +194,7 @@ impl<T> Machine<T> {
     /// Lets the node do what is due.
     #[inline(never)]
     pub(crate) fn poll_node(&mut self, context: &mut TaskContext<'_>) -> Option<Command<SocketAddrV4>> {
-        if Board::MANAGES && self.mail.net.has_datagram(context) {
+        if Board::MANAGES && self.mail.has_datagram(context) {
             self.hub.node.left_unread();
         }
         self.hub.node.poll(now(), &mut self.mail, self.proof.codes())
@@ -223,7 +222,7 @@ impl<T> Machine<T> {
             let line = self.mail.connections.get(usize::from(*index)).is_some_and(|line| !line.is_in_use());
             line && self.link(*index).is_some_and(|link| link.storage.is_some())
         };
-        let closing = |index: &u16| self.mail.connections.get(usize::from(*index)).is_some_and(Socket::is_closing);
+        let closing = |index: &u16| self.mail.connections.get(usize::from(*index)).is_some_and(Connection::is_closing);
         let mut candidates = self.indices().filter(free);
         let first = candidates.next()?;
         if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }

@@ -20,7 +20,6 @@ use cara_core::services::session::{Publication, SessionStorage};
 use cara_core::services::{Port, RunningCall};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;
-use embassy_net::Stack;
 
 use crate::config::Config;
 
@@ -31,8 +30,7 @@ use crate::limits::Limits;
 use crate::link::Link;
 use crate::link::Waiter;
 use crate::machine::{Machine, Shared, Started, Unwanted, Wakers};
-use crate::mail::Mail;
-use crate::net::{self, Socket};
+use crate::mail::{self, Transport};
 use crate::port::Board;
 use crate::replies::ReplyBox;
 use crate::runner::Runner;
@@ -72,8 +70,7 @@ pub struct Resources<
 > {
     shared: MaybeUninit<Shared<T>>,
     links: MaybeUninit<[Link; LINKS]>,
-    sockets: MaybeUninit<[Socket; LINKS]>,
-    net: net::Memory<LINKS, STREAM, DATAGRAM>,
+    mail: mail::Memory<LINKS, STREAM, DATAGRAM>,
     sessions: [SessionMemory<OWN, THEIR, CALLS>; LINKS],
     nodes: MaybeUninit<[[Option<Known<SocketAddrV4>>; KNOWN]; LINKS]>,
     order: MaybeUninit<[[Order; KNOWN]; LINKS]>,
@@ -108,15 +105,11 @@ struct SessionMemory<const OWN: usize, const THEIR: usize, const CALLS: usize> {
 /// [`Resources`] of any size, for an application whose state is a `T`.
 pub trait Memory<T> {
     #[doc(hidden)]
-    fn unit(
-        &'static mut self,
-        stack: Stack<'static>,
-        config: Config,
-        state: T,
-    ) -> Result<(Handle<T>, Runner<T>), Error>;
+    fn unit(&'static mut self, transport: Transport, config: Config, state: T)
+    -> Result<(Handle<T>, Runner<T>), Error>;
 }
 
-/// Makes a unit on a network stack, with the application's state. It does nothing until the runner runs.
+/// Makes a unit on a network stack or a serial line, with the application's state. It does nothing until the runner runs.
 ///
 /// The stack is the application's: it brings the driver, and an address, fixed or by DHCP. The unit notices when the
 /// cable is pulled or the address changes: its connections end, the hook for the lost manager runs once, and it
@@ -124,17 +117,17 @@ pub trait Memory<T> {
 ///
 /// [`Error::DoesNotFit`] when the memory cannot hold the constraints, [`Error::PortInUse`] when the discovery port
 /// is bound already, [`Error::BadConstraint`] for a unit without its manager's address or with an access table where the feature
-/// `discover` or `access` is off.
+/// `discover` or `access` is off, and for more than one link on a serial line.
 ///
 /// # Panics
 /// In embassy-net, when the stack was made with fewer sockets than [`Limits::sockets`] asks for.
 pub fn new<T>(
-    stack: Stack<'static>,
+    transport: impl Into<Transport>,
     resources: &'static mut impl Memory<T>,
     config: Config,
     state: T,
 ) -> Result<(Handle<T>, Runner<T>), Error> {
-    resources.unit(stack, config, state)
+    resources.unit(transport.into(), config, state)
 }
 
 // There is no memory of a default size.
@@ -185,8 +178,7 @@ impl<
         Self {
             shared: MaybeUninit::uninit(),
             links: MaybeUninit::uninit(),
-            sockets: MaybeUninit::uninit(),
-            net: net::Memory::new(),
+            mail: mail::Memory::new(),
             sessions: [const { SessionMemory::new() }; LINKS],
             nodes: MaybeUninit::uninit(),
             order: MaybeUninit::uninit(),
@@ -229,7 +221,7 @@ impl<
     #[inline(never)]
     fn unit(
         &'static mut self,
-        stack: Stack<'static>,
+        transport: Transport,
         mut config: Config,
         state: T,
     ) -> Result<(Handle<T>, Runner<T>), Error> {
@@ -242,8 +234,7 @@ impl<
         if config.security.0.mode() == Mode::Plain {
             warning!("this unit is INSECURE: anybody on the network can read what it says, and can speak as its peers");
         }
-        let (net, sockets) = self.net.open(stack, config.node.udp_port)?;
-        let connections = self.sockets.write(sockets);
+        let mail = self.mail.open(transport, config.node.udp_port)?;
         let scratch = self.scratch.write([0; DATAGRAM]);
         let storage = NodeStorage {
             nodes: self.nodes.write([const { [const { None }; KNOWN] }; LINKS]).as_flattened_mut(),
@@ -276,7 +267,7 @@ impl<
             ),
             pool: Pool::new(&mut pool[..]),
             links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
-            mail: Mail { net, connections },
+            mail,
             reply: ReplyBox::new(self.reply.write([0; REPLY])),
             #[cfg(feature = "streams")]
             readings: crate::readings::Readings::NONE,

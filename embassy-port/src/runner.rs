@@ -17,6 +17,7 @@ use crate::handler::{Hook, Listed, Served};
 use crate::lease::LeaseWatch;
 use crate::machine::Started;
 use crate::machine::{Machine, Shared};
+use crate::mail::Connection;
 use crate::port::LinkSession;
 use crate::task_slots::Running;
 use crate::time::{now, timer};
@@ -274,7 +275,7 @@ impl<T> Machine<T> {
     fn deadline(&self) -> Instant {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
         let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
-        let lines = self.mail.connections.iter().map(crate::net::Socket::deadline).min().unwrap_or(Instant::FAR_FUTURE);
+        let lines = self.mail.connections.iter().map(Connection::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let node = if self.stopped { Instant::FAR_FUTURE } else { self.hub.node.next_deadline() };
         let kept = self.reply_deadline().min(self.parked_deadline());
         sessions.min(lines).min(node).min(kept).min(self.look)

@@ -194,6 +194,11 @@ impl Line {
         fits
     }
 
+    /// Whether a datagram has come and was not taken.
+    pub const fn has_datagram(&self) -> bool {
+        self.datagrams.has_arrived()
+    }
+
     /// The datagram that has come.
     pub fn next_datagram(&mut self) -> Option<Datagram<'_>> {
         self.datagrams.take()

@@ -1,9 +1,8 @@
 //! The least s_unit: one service, and memory for no more than that. It is how small a unit can be, and what CARA itself
 //! takes of a board when nothing else is there.
 
-use cara_embassy::{Limits, Runner, Security, interface, resources};
+use cara_embassy::{Limits, Runner, Security, Transport, interface, resources};
 use cara_settings::Settings;
-use embassy_net::Stack;
 
 use crate::{VehicleError, unit_config};
 
@@ -44,12 +43,12 @@ impl Add for () {
 
 /// Makes the unit, whose one service adds two numbers.
 pub fn unit(
-    stack: Stack<'static>,
+    transport: impl Into<Transport>,
     resources: &'static mut LeastResources,
     settings: &Settings,
     security: Security,
 ) -> Result<Runner<()>, VehicleError> {
-    let (unit, runner) = cara_embassy::new(stack, resources, unit_config(settings, security)?, ())?;
+    let (unit, runner) = cara_embassy::new(transport, resources, unit_config(settings, security)?, ())?;
     unit.my_function_list().serve(AddServer)?;
     unit.publish_my_function_list()?;
     Ok(runner)

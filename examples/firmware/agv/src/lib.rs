@@ -13,6 +13,7 @@ extern crate std;
 
 #[cfg(feature = "secure")]
 mod claims;
+#[cfg(feature = "net")]
 pub mod echo;
 pub mod least;
 pub mod led;
@@ -40,10 +41,9 @@ use cara_core::error::Error;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::{Latch, Lease, Stage};
 use cara_embassy::{
-    Config, Handle, Handler, Hook, LeaseWatch, Limits, Runner, Security, ServiceOptions, now, resources,
+    Config, Handle, Handler, Hook, LeaseWatch, Limits, Runner, Security, ServiceOptions, Transport, now, resources,
 };
-use cara_settings::{Network, Settings};
-use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
+use cara_settings::Settings;
 use embassy_time::{Duration, Ticker};
 
 /// The vehicle, which keeps the lease of the call that it drives for.
@@ -98,7 +98,10 @@ pub enum VehicleError {
 }
 
 /// How the network stack gets its address.
+#[cfg(feature = "net")]
 pub fn network(settings: &Settings) -> embassy_net::Config {
+    use cara_settings::Network;
+    use embassy_net::{Ipv4Cidr, StaticConfigV4};
     match settings.network {
         Network::Dhcp => embassy_net::Config::dhcpv4(Default::default()),
         Network::Static { address, prefix, gateway } => embassy_net::Config::ipv4_static(StaticConfigV4 {
@@ -120,13 +123,13 @@ pub fn hardware_address(chip: &[u8]) -> [u8; 6] {
 
 /// Makes the AGV that the settings describe; `security` proves its identity.
 pub fn vehicle(
-    stack: Stack<'static>,
+    transport: impl Into<Transport>,
     resources: &'static mut VehicleResources,
     settings: &Settings,
     security: Security,
 ) -> Result<(Vehicle, Runner<Agv>), VehicleError> {
     let config = unit_config(settings, security)?.access(&RULES);
-    let (vehicle, runner) = cara_embassy::new(stack, resources, config, Agv::new([0, 0]))?;
+    let (vehicle, runner) = cara_embassy::new(transport, resources, config, Agv::new([0, 0]))?;
     offer(vehicle)?;
     Ok((vehicle, runner))
 }

@@ -1,10 +1,9 @@
 //! How every board starts its AGV, and the tasks that are the same on all. Those of its network, button, LED and watchdog are the board's own,
 //! because their types are.
 
-use cara_embassy::{Runner, Security};
+use cara_embassy::{Runner, Security, Transport};
 use cara_settings::Settings;
 use embassy_executor::{SpawnError, Spawner};
-use embassy_net::Stack;
 use static_cell::StaticCell;
 
 use crate::{Agv, Vehicle, VehicleResources};
@@ -15,12 +14,12 @@ pub const NO_ROOM: &str = "no room for a task";
 /// Makes the AGV of the settings and starts its tasks. Once per image: its memory is a static here. On an error the text says why.
 pub fn start(
     spawner: Spawner,
-    stack: Stack<'static>,
+    transport: impl Into<Transport>,
     settings: &Settings,
     security: Security,
 ) -> Result<Vehicle, &'static str> {
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    let made = crate::vehicle(stack, RESOURCES.init_with(VehicleResources::new), settings, security);
+    let made = crate::vehicle(transport, RESOURCES.init_with(VehicleResources::new), settings, security);
     let (vehicle, runner) = made.map_err(|_| "the settings are of no vehicle")?;
     crate::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     let has_no_room = |_: SpawnError| NO_ROOM;

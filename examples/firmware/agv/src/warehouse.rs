@@ -16,7 +16,6 @@ use cara_embassy::{
     resources,
 };
 use cara_settings::Settings;
-use embassy_net::Stack;
 use embassy_time::Ticker;
 use static_cell::ConstStaticCell;
 
@@ -99,7 +98,7 @@ impl Agv {
 
 /// Makes the vehicle that the settings describe, which stands in a cell; `security` proves its identity.
 pub fn vehicle(
-    stack: Stack<'static>,
+    transport: impl Into<cara_embassy::Transport>,
     resources: &'static mut VehicleResources,
     settings: &Settings,
     security: Security,
@@ -110,7 +109,7 @@ pub fn vehicle(
     DRIVING.set_ramp(RAMP.into());
     let agv = Agv { vehicle: warehouse::Vehicle::new(at, 100.0), note };
     note(format_args!("enter {at}"));
-    let (vehicle, runner) = cara_embassy::new(stack, resources, config, agv)?;
+    let (vehicle, runner) = cara_embassy::new(transport, resources, config, agv)?;
     offer(vehicle)?;
     Ok((vehicle, runner))
 }

@@ -11,6 +11,7 @@ mod boots;
 pub mod clock;
 #[cfg(feature = "faults")]
 pub mod creep;
+#[cfg(feature = "net")]
 pub mod ethernet;
 pub mod executor;
 pub mod fault;
@@ -22,7 +23,7 @@ pub mod motor;
 mod register;
 pub mod reset;
 pub mod stack;
-#[cfg(feature = "slip")]
+#[cfg(any(feature = "line", feature = "slip"))]
 pub mod uart;
 pub mod watchdog;
 pub mod wiring;

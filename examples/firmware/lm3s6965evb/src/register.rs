@@ -17,12 +17,13 @@ unsafe impl Sync for Register {}
 pub(crate) struct Block(usize);
 
 /// Ethernet controller.
+#[cfg(feature = "net")]
 pub(crate) const ETHERNET: Block = Block(0x4004_8000);
 /// Serial line 0.
-#[cfg(feature = "slip")]
+#[cfg(any(feature = "line", feature = "slip"))]
 pub(crate) const UART_0: Block = Block(0x4000_C000);
 /// General-purpose inputs and outputs, port A.
-#[cfg(feature = "slip")]
+#[cfg(any(feature = "line", feature = "slip"))]
 pub(crate) const PORT_A: Block = Block(0x4000_4000);
 /// General-purpose timer 0.
 pub(crate) const TIMER_0: Block = Block(0x4003_0000);

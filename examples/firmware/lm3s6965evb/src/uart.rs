@@ -42,7 +42,9 @@ const RECEIVED: u32 = 1 << 4 | 1 << 6;
 /// The FIFO for sending has drained.
 const SENT: u32 = 1 << 5;
 
-/// The divisor of 12.5 MHz for 115,200 baud, 12,500,000 / (16 × 115,200), in 64ths.
+/// Bits per second.
+pub const BAUD: u32 = 115_200;
+/// The divisor of 12.5 MHz for that, 12,500,000 / (16 × 115,200), in 64ths.
 const DIVISOR: u32 = 434;
 
 /// Bytes received ahead of their task, 44 ms of the line. What comes beyond them is lost.

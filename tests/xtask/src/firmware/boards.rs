@@ -101,6 +101,8 @@ pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faul
 pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random,lists"), ..AGV };
 /// The AGV of the emulated board on a serial line.
 pub(crate) const SLIP: Image = Image { name: "agv-slip", feature: Some("slip"), ..AGV };
+/// The AGV of the emulated board on a serial line without IP.
+pub(crate) const LINE: Image = Image { name: "agv-line", feature: Some("line"), ..AGV };
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
@@ -154,6 +156,7 @@ impl Board {
             None => [
                 chosen("agv", matches!(image.program, "agv" | "warehouse")),
                 chosen("defmt", image.has_logs),
+                chosen("net", image.feature != LINE.feature),
                 chosen("secure", image.is_secured),
                 image.feature,
             ]

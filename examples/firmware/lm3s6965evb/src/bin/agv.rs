@@ -4,11 +4,10 @@
 #![no_main]
 
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
-use cara_lm3s6965evb::wiring::{self, NO_ROOM};
+use cara_lm3s6965evb::wiring::{self, NO_ROOM, Sockets};
 use cara_lm3s6965evb::{executor, motor, reset, stack, start, watchdog};
 use cara_vehicle::{LIMITS, Vehicle, tasks};
 use embassy_executor::Spawner;
-use embassy_net::StackResources;
 use embassy_time::{Duration, Timer};
 use static_cell::ConstStaticCell;
 
@@ -30,11 +29,11 @@ fn main() -> ! {
 /// Not merged into `main`: what it needs of the stack is free again once the tasks run.
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
+    static SOCKETS: ConstStaticCell<Sockets<{ LIMITS.sockets() }>> = ConstStaticCell::new(Sockets::new());
     let given = arguments::read().map_err(ArgumentError::text)?;
     let (settings, security, noise) = given.security().ok_or("it joins no manager")?;
-    let stack = wiring::network(spawner, &settings, SOCKETS.take(), noise)?;
-    let vehicle = tasks::start(spawner, stack, &settings, security)?;
+    let network = wiring::network(spawner, &settings, SOCKETS.take(), noise)?;
+    let vehicle = tasks::start(spawner, network, &settings, security)?;
     #[cfg(feature = "faults")]
     cara_lm3s6965evb::faults::offer(vehicle).map_err(|_| "no room for the test's functions")?;
     #[cfg(feature = "lists")]

@@ -8,12 +8,11 @@ use core::fmt;
 
 use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
-use cara_lm3s6965evb::wiring::{self, NO_ROOM};
+use cara_lm3s6965evb::wiring::{self, NO_ROOM, Sockets};
 use cara_lm3s6965evb::{executor, motor, stack, start, watchdog};
 use cara_vehicle::LIMITS;
 use cara_vehicle::warehouse::{self, Agv, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
-use embassy_net::StackResources;
 use static_cell::{ConstStaticCell, StaticCell};
 
 #[cortex_m_rt::entry]
@@ -26,14 +25,14 @@ fn main() -> ! {
 /// Not merged into `main`: what it needs of the stack is free again once the tasks run.
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
+    static SOCKETS: ConstStaticCell<Sockets<{ LIMITS.sockets() }>> = ConstStaticCell::new(Sockets::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     let given = arguments::read().map_err(ArgumentError::text)?;
     let at = given.at.ok_or("at=X,Y is not told, the cell in which it stands")?;
     let (settings, security, noise) = given.security().ok_or("it joins no manager")?;
-    let stack = wiring::network(spawner, &settings, SOCKETS.take(), noise)?;
+    let network = wiring::network(spawner, &settings, SOCKETS.take(), noise)?;
     let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = warehouse::vehicle(stack, resources, &settings, security, at, note);
+    let made = warehouse::vehicle(network, resources, &settings, security, at, note);
     let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
     cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
