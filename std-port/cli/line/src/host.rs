@@ -96,10 +96,12 @@ impl Host {
             })?;
         }
         let socket = keep(&mut self.datagrams, PORTS, from, || {
-            let socket = UdpSocket::bind((address, from))?;
-            socket.set_nonblocking(true)?;
-            socket.set_broadcast(true)?;
-            Ok(socket)
+            let socket = socket(SocketType::DGRAM)?;
+            // A board's datagrams come from the discovery port itself, which all units of the host share.
+            sockopt::set_socket_reuseaddr(&socket, true)?;
+            sockopt::set_socket_broadcast(&socket, true)?;
+            bind(&socket, &SocketAddrV4::new(address, from))?;
+            Ok(socket.into())
         })?;
         let to = if to == 0 { (ALL, self.discovery_port) } else { (Ipv4Addr::LOCALHOST, to) };
         // The first attempt may report that an earlier datagram met no reader.
