@@ -59,6 +59,8 @@ impl fmt::Debug for Memory {
 }
 
 /// A line of that rate, and its halves. `seed` should differ from boot to boot.
+// Kept apart: merged into its caller, the line would lie on the stack while the unit is made.
+#[inline(never)]
 pub fn new(memory: &'static mut Memory, bits_per_second: u32, seed: u64) -> (Line, Incoming, Outgoing) {
     let (unit, incoming, outgoing) = (WakerRegistration::new(), WakerRegistration::new(), WakerRegistration::new());
     let line = host::Line::new(bits_per_second, seed);

@@ -1,9 +1,11 @@
-//! The other end of a board's serial line: SLIP (RFC 1055) between the emulator's UART and a TUN device of this network, paced
-//! as the line would be. The emulated UART has no rate of its own: it takes what the board writes at once.
+//! The other end of a board's serial line, paced as the line would be: between the emulator's UART and either a TUN device of this
+//! network, in SLIP (RFC 1055), or a pseudo-terminal with `cara line`. The emulated UART has no rate of its own: it takes what the
+//! board writes at once.
 
 use std::collections::VecDeque;
+use std::fs::File;
 use std::io::{ErrorKind, Read, Write};
-use std::os::fd::AsRawFd;
+use std::os::fd::{AsRawFd, RawFd};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,10 +14,15 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use cara_processes::network;
+use cara_processes::{Process, network};
 use fastrand::Rng;
+use rustix::fs::{OFlags, fcntl_setfl};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use smoltcp::phy::{Device, Medium, RxToken, TunTapInterface, TxToken, wait};
 use smoltcp::time::{Duration as StackDuration, Instant as StackInstant};
+
+use crate::board::{FLEET, LONG};
+use crate::keys::Keys;
 
 /// Its device.
 const DEVICE: &str = "tun0";
@@ -39,6 +46,7 @@ pub(crate) struct Line {
     socket: PathBuf,
     state: Arc<State>,
     thread: Option<JoinHandle<Result<()>>>,
+    _bridge: Option<Process>,
 }
 
 #[derive(Default)]
@@ -53,18 +61,43 @@ struct State {
 }
 
 impl Line {
-    /// Makes the device, and waits for a board at a socket in a folder.
-    pub(crate) fn open(folder: &Path, baud: u32) -> Result<Self> {
+    /// A line with IP at this end.
+    pub(crate) fn slip(keys: &Keys, baud: u32) -> Result<Self> {
         network::run(&format!("ip tuntap add name {DEVICE} mode tun"))?;
         network::run(&format!("ip address add {ADDRESS} dev {DEVICE}"))?;
         network::run(&format!("ip link set {DEVICE} mtu {MTU} txqueuelen {WAITING} up"))?;
-        let socket = folder.join("line");
+        let device = || TunTapInterface::new(DEVICE, Medium::Ip).context("the TUN device cannot be opened");
+        Self::open(keys, baud, move || Ok(End::Slip(device()?, Packet::default())), None)
+    }
+
+    /// A line without IP, and `cara line` at this end.
+    pub(crate) fn native(keys: &Keys, baud: u32) -> Result<Self> {
+        let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
+        grantpt(&terminal)?;
+        unlockpt(&terminal)?;
+        let name = ptsname(&terminal, Vec::new())?.into_string()?;
+        fcntl_setfl(&terminal, OFlags::NONBLOCK)?;
+        let (rate, fleet) = (baud.to_string(), FLEET.to_string());
+        let words = ["line", &name, "--baud", &rate, "--fleet", &fleet];
+        let mut bridge = keys.process("line", &[&words, keys.words()].concat())?;
+        bridge.expect("open", LONG)?;
+        Self::open(keys, baud, || Ok(End::Native(terminal.into())), Some(bridge))
+    }
+
+    /// Waits for a board at a socket in the keys' folder.
+    fn open(
+        keys: &Keys,
+        baud: u32,
+        end: impl FnOnce() -> Result<End> + Send + 'static,
+        bridge: Option<Process>,
+    ) -> Result<Self> {
+        let socket = keys.folder().join("line");
         let listener = UnixListener::bind(&socket).context("the line has no socket")?;
         listener.set_nonblocking(true)?;
         let state = Arc::<State>::default();
         let shared = Arc::clone(&state);
-        let thread = std::thread::spawn(move || carry(&listener, baud, &shared));
-        Ok(Self { socket, state, thread: Some(thread) })
+        let thread = std::thread::spawn(move || carry(&listener, end()?, baud, &shared));
+        Ok(Self { socket, state, thread: Some(thread), _bridge: bridge })
     }
 
     /// Where the emulator's UART connects.
@@ -103,15 +136,59 @@ impl Drop for Line {
     }
 }
 
-/// Passes packets on until the line is dropped.
-fn carry(listener: &UnixListener, baud: u32, state: &State) -> Result<()> {
-    let mut device = TunTapInterface::new(DEVICE, Medium::Ip).context("the TUN device cannot be opened")?;
+/// This computer's end.
+enum End {
+    Slip(TunTapInterface, Packet),
+    Native(File),
+}
+
+impl End {
+    /// What is to be sent next.
+    fn read(&mut self) -> Option<Vec<u8>> {
+        match self {
+            Self::Slip(device, _) => {
+                let (received, _) = device.receive(StackInstant::ZERO)?;
+                Some(received.consume(encoded))
+            }
+            Self::Native(terminal) => {
+                let mut bytes = [0; 4096];
+                let length = terminal.read(&mut bytes).ok()?;
+                bytes.get(..length).map(<[u8]>::to_vec)
+            }
+        }
+    }
+
+    fn write(&mut self, received: Vec<u8>) {
+        match self {
+            Self::Slip(device, packet) => {
+                for whole in received.into_iter().filter_map(|byte| packet.push(byte)) {
+                    if let Some(free) = device.transmit(StackInstant::ZERO) {
+                        free.consume(whole.len(), |bytes| bytes.copy_from_slice(&whole));
+                    }
+                }
+            }
+            // What nobody reads is lost, as on a wire.
+            Self::Native(terminal) => drop(terminal.write(&received)),
+        }
+    }
+}
+
+impl AsRawFd for End {
+    fn as_raw_fd(&self) -> RawFd {
+        match self {
+            Self::Slip(device, _) => device.as_raw_fd(),
+            Self::Native(terminal) => terminal.as_raw_fd(),
+        }
+    }
+}
+
+/// Passes bytes on until the line is dropped.
+fn carry(listener: &UnixListener, mut end: End, baud: u32, state: &State) -> Result<()> {
     let mut board: Option<UnixStream> = None;
     let [mut to_board, mut from_board] = [1, 3].map(|seed| Way::new(baud, seed));
-    let mut packet = Packet::default();
     while !state.is_over.load(Ordering::Relaxed) {
         if to_board.queue.is_empty() {
-            wait(device.as_raw_fd(), Some(StackDuration::from_micros(TICK.as_micros() as u64)))?;
+            wait(end.as_raw_fd(), Some(StackDuration::from_micros(TICK.as_micros() as u64)))?;
         } else {
             std::thread::sleep(TICK);
         }
@@ -120,9 +197,9 @@ fn carry(listener: &UnixListener, baud: u32, state: &State) -> Result<()> {
             board = Some(connected);
         }
         while to_board.queue.is_empty()
-            && let Some((received, _)) = device.receive(StackInstant::ZERO)
+            && let Some(bytes) = end.read()
         {
-            received.consume(|bytes| to_board.add(encoded(bytes)));
+            to_board.add(bytes);
         }
         if let Some(socket) = &mut board {
             let mut bytes = [0; 4096];
@@ -144,11 +221,7 @@ fn carry(listener: &UnixListener, baud: u32, state: &State) -> Result<()> {
             // It does not end the line: the next read says that the board is gone.
             let _ = socket.write_all(&sent);
         }
-        for whole in received.into_iter().filter_map(|byte| packet.push(byte)) {
-            if let Some(free) = device.transmit(StackInstant::ZERO) {
-                free.consume(whole.len(), |bytes| bytes.copy_from_slice(&whole));
-            }
-        }
+        end.write(received);
     }
     Ok(())
 }

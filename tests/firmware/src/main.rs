@@ -105,7 +105,7 @@ enum Part {
     },
     /// Calls a board that publishes values meanwhile; for an image with streams.
     Streams(streams::Streams),
-    /// Runs a board on a serial line; for an image with SLIP.
+    /// Runs a board on a serial line; for an image with SLIP, or with a line without IP.
     Serial(serial::Serial),
     /// Starts a session: a board, its manager and a prompt for `cara`.
     Session(session::Session),

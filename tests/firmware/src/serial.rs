@@ -1,20 +1,24 @@
-//! A board on a serial line, for an image with SLIP: it is found, called and driven there, and loses line and manager.
+//! A board on a serial line, for an image with SLIP or with a line without IP: it is found, called and driven there, and loses line and manager.
 //! What is printed of times and bytes is measured, and judges nothing.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
-use cara_std::UnitEvent;
+use anyhow::{Context, Result, anyhow};
+use cara_std::{Parameters, Peer, UnitEvent};
 use clap::Args;
 
 use crate::board::{Bench, LONG, Who};
 use crate::checks::losses;
 use crate::line::Line;
-use crate::manager::{Manager, arrives, drives, position, sets_out};
+use crate::manager::{Manager, arrives, drives, patiently, position, reset, sets_out};
 
 /// What is measured.
 #[derive(Args)]
 pub(crate) struct Serial {
+    /// The line has no IP.
+    #[arg(long)]
+    native: bool,
     /// Bits a second, each way.
     #[arg(long, default_value_t = 115_200, value_parser = clap::value_parser!(u32).range(1_200..=3_000_000))]
     baud: u32,
@@ -32,8 +36,9 @@ const TIMES: usize = 20;
 const CHANGED: u32 = 5;
 
 /// Runs it and prints what was found.
-pub(crate) fn run(bench: &Bench, Serial { baud, idle, noise }: &Serial) -> Result<()> {
-    let line = Line::open(bench.keys.folder(), *baud)?;
+pub(crate) fn run(bench: &Bench, Serial { native, baud, idle, noise }: &Serial) -> Result<()> {
+    let open = if *native { Line::native } else { Line::slip };
+    let line = open(&bench.keys, *baud)?;
     let who = Who::agv(17);
     let manager = Manager::start(&bench.keys)?;
     let start = Instant::now();
@@ -44,6 +49,10 @@ pub(crate) fn run(bench: &Bench, Serial { baud, idle, noise }: &Serial) -> Resul
     println!("{baud} baud: joined {} ms from power on", joined.as_millis());
     let ping = || agv.ping(cara_std::Duration::from(LONG)).map(drop).context("ping");
     println!("ping {}; call of pos_info {}", each(ping)?, each(|| position(&agv).map(drop))?);
+
+    if *native {
+        println!("stop beside messages of 400 characters {}", stops(&agv)?);
+    }
 
     let [to, from] = line.bytes();
     std::thread::sleep(Duration::from_secs(*idle));
@@ -74,6 +83,28 @@ pub(crate) fn run(bench: &Bench, Serial { baud, idle, noise }: &Serial) -> Resul
         losses::loses_its_manager(bench, &board, &who).context("the manager is killed")?
     );
     Ok(())
+}
+
+/// Stops a vehicle a few times while others call it.
+fn stops(agv: &Peer) -> Result<String> {
+    let mut bulk = Parameters::<512>::sized();
+    bulk.add_string("text", 400)?;
+    bulk.set_value("text", "x".repeat(400).as_str())?;
+    let is_over = AtomicBool::new(false);
+    let took = std::thread::scope(|scope| {
+        let others = scope.spawn(|| {
+            while !is_over.load(Ordering::Relaxed) {
+                patiently(|| agv.block_request("echo", &mut bulk))?;
+            }
+            Ok::<_, anyhow::Error>(())
+        });
+        let took = each(|| patiently(|| agv.block_request("stop", &mut Parameters::<512>::sized())));
+        is_over.store(true, Ordering::Relaxed);
+        others.join().map_err(|_| anyhow!("the calls of others"))??;
+        took
+    })?;
+    reset(agv)?;
+    Ok(took)
 }
 
 /// Does something a few times; median and worst.

@@ -23,6 +23,7 @@ use boards::{BOARDS, Board, Image};
 pub(crate) use boards::{built, find, image_build};
 pub(crate) use faults::{Faults, check as check_faults, faults};
 pub(crate) use flash::flash;
+use image::{Footprint, footprint};
 pub(crate) use session::{SessionOptions, session};
 pub(crate) use sizes::{check as check_sizes, sizes};
 
@@ -88,6 +89,23 @@ fn tested() -> Result<Option<i32>> {
     }
     let slip = boards::find(TESTED)?.build(&boards::SLIP)?;
     tests(&slip)?.args(["serial"]).code()
+}
+
+/// Flash of the least unit on a line without IP, at most: 90 KiB.
+const LEAST_ON_LINE: u64 = 90 * 1024;
+
+/// Runs the emulated board on a serial line without IP, and looks how small a unit is there.
+pub(crate) fn line() -> Outcome {
+    emulated(|| {
+        let board = boards::find(TESTED)?;
+        install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+        let Footprint { flash, static_ram } = footprint(&board.build(&boards::UNIT_LINE)?)?;
+        println!("{}: flash {flash}, static RAM {static_ram}", boards::UNIT_LINE.name);
+        if flash > LEAST_ON_LINE {
+            bail!("that is more than {LEAST_ON_LINE}");
+        }
+        tests(&board.build(&boards::LINE)?)?.args(["serial", "--native"]).code()
+    })
 }
 
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.

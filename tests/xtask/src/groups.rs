@@ -314,6 +314,15 @@ pub(crate) const GROUPS: [Group; 31] = [
         run: |_| release::check().into(),
     },
     Group {
+        name: "line",
+        what: "the emulated board on a serial line without IP, against cara line and the Linux manager, and how small a unit is there",
+        budget: 300,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| firmware::line(),
+    },
+    Group {
         name: "etcd",
         what: "managers that lead by an etcd, which is killed, stopped and cut off; clippy on that crate, which is outside of the workspace",
         budget: 300,

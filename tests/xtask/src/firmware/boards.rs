@@ -103,6 +103,8 @@ pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature:
 pub(crate) const SLIP: Image = Image { name: "agv-slip", feature: Some("slip"), ..AGV };
 /// The AGV of the emulated board on a serial line without IP.
 pub(crate) const LINE: Image = Image { name: "agv-line", feature: Some("line"), ..AGV };
+/// The least unit there, which finds its manager.
+pub(crate) const UNIT_LINE: Image = Image { name: "unit-line-quiet", feature: Some("discover,line"), ..UNIT }.quiet();
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
@@ -156,7 +158,7 @@ impl Board {
             None => [
                 chosen("agv", matches!(image.program, "agv" | "warehouse")),
                 chosen("defmt", image.has_logs),
-                chosen("net", image.feature != LINE.feature),
+                chosen("net", ![LINE.feature, UNIT_LINE.feature].contains(&image.feature)),
                 chosen("secure", image.is_secured),
                 image.feature,
             ]
