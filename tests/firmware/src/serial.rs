@@ -16,8 +16,8 @@ use crate::manager::{Manager, arrives, drives, patiently, position, reset, sets_
 /// What is measured.
 #[derive(Args)]
 pub(crate) struct Serial {
-    /// The line has no IP.
-    #[arg(long)]
+    /// The line has no IP. The image is for one rate.
+    #[arg(long, conflicts_with = "baud")]
     native: bool,
     /// Bits a second, each way.
     #[arg(long, default_value_t = 115_200, value_parser = clap::value_parser!(u32).range(1_200..=3_000_000))]
