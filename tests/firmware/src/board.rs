@@ -1,4 +1,4 @@
-//! Boards in QEMU, each behind a virtual cable to one bridge, and what they log.
+//! Boards in QEMU or rp2040js, each behind a virtual cable to one bridge, and what they log.
 
 use std::cell::Cell;
 use std::io::Read;
@@ -16,6 +16,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use crate::keys::{Keys, MANAGER as DEPOT};
 use crate::line::{self, Line};
+use crate::rp2040::{self, Events, Wire};
 use crate::trace::Trace;
 
 /// Long enough for the slowest machine.
@@ -34,6 +35,8 @@ pub(crate) struct Bench {
     constant: Option<PathBuf>,
     /// The board's clock counts instructions.
     counts: bool,
+    /// Boards are an RP2040 with a W5500.
+    is_rp2040: bool,
     /// How many there are, also of other benches on this bridge.
     cables: Rc<Cell<u8>>,
     /// Of the boards, and of their manager.
@@ -51,7 +54,7 @@ impl Bench {
         network::run(&format!("ip address add {MANAGER} brd + dev bridge0"))?;
         network::run("ip link set bridge0 up")?;
         let (table, image, cables) = (table_of(image)?, image.to_owned(), Rc::default());
-        Ok(Self { image, table, shows_logs, constant: None, counts: false, cables, keys })
+        Ok(Self { image, table, shows_logs, constant: None, counts: false, is_rp2040: false, cables, keys })
     }
 
     /// Times on its boards are counted in instructions, and do not depend on how busy this machine is.
@@ -59,11 +62,16 @@ impl Bench {
         Self { counts: true, ..self }
     }
 
+    /// Its boards are an RP2040 with a W5500.
+    pub(crate) fn rp2040(self) -> Self {
+        Self { is_rp2040: true, ..self }
+    }
+
     /// The same bench for boards that are told other things.
     pub(crate) fn with(&self, keys: Rc<Keys>) -> Self {
         let (image, table, cables) = (self.image.clone(), Arc::clone(&self.table), Rc::clone(&self.cables));
-        let Self { shows_logs, counts, .. } = *self;
-        Self { image, table, shows_logs, constant: self.constant.clone(), counts, cables, keys }
+        let Self { shows_logs, counts, is_rp2040, .. } = *self;
+        Self { image, table, shows_logs, constant: self.constant.clone(), counts, is_rp2040, cables, keys }
     }
 
     /// Has that image beside.
@@ -85,14 +93,23 @@ impl Bench {
         let name = format!("tap{number}");
         network::run(&format!("ip tuntap add name {name} mode tap"))?;
         network::run(&format!("ip link set {name} master bridge0"))?;
-        let cable = Cable { name, number };
+        let wire = self.is_rp2040.then(|| Wire::lay(&name, self.keys.folder())).transpose()?;
+        let cable = Cable { name, number, wire };
         cable.plug_in()?;
         Ok(cable)
     }
 
     /// Puts power on a board.
     pub(crate) fn board(&self, cable: &Cable, who: &Who) -> Result<Board> {
-        self.start(self.emulator(cable, who)?.stderr(Stdio::null()), who)
+        let said = if self.is_rp2040 { Stdio::inherit() } else { Stdio::null() };
+        self.start(self.emulator(cable, who)?.stderr(said), who)
+    }
+
+    /// The same with what happens at the pins of an RP2040.
+    pub(crate) fn watched_board(&self, cable: &Cable, who: &Who) -> Result<(Board, Events)> {
+        let mut board = self.start(self.emulator(cable, who)?.arg("--events").stderr(Stdio::piped()), who)?;
+        let output = board.child.stderr.take().context("the emulator has no standard error")?;
+        Ok((board, Events::read(output)))
     }
 
     /// The same with everything that it executes, instruction by instruction.
@@ -111,20 +128,25 @@ impl Bench {
     }
 
     fn emulator(&self, cable: &Cable, who: &Who) -> Result<Command> {
-        let Cable { name, number } = cable;
+        let Cable { name, number, wire } = cable;
+        let address = format!("{}/24", address(cable));
+        if let Some(wire) = wire {
+            let (settings, flash) = self.keys.reported("rp2040", who, &address)?;
+            let mut command = first("node");
+            command.arg(rp2040::SCRIPTS.to_owned() + "board.mjs").arg(wire.socket()).arg(flash);
+            command.arg(self.image.with_extension("uf2")).arg(settings);
+            return Ok(command);
+        }
         let nic = format!("tap,ifname={name},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}");
-        self.emulator_with(&["-serial", "none", "-nic", &nic], &format!("{}/24", address(cable)), who)
+        self.emulator_with(&["-serial", "none", "-nic", &nic], &address, who)
     }
 
     fn emulator_with(&self, network: &[&str], address: &str, who: &Who) -> Result<Command> {
-        let (reported, boots) = self.keys.reported(who, address)?;
+        let (reported, boots) = self.keys.reported("lm3s6965evb", who, address)?;
         let seed = who.seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
         let reported = format!("file={} boots={}{seed}", reported.display(), boots.display());
-        // Ahead of what else the host runs, where that is allowed: a clock that counts instructions loses the time in which the
-        // emulator has no turn, as no chip does.
-        let mut command = Command::new("nice");
+        let mut command = first("qemu-system-arm");
         command
-            .args(["-n", "-10", "qemu-system-arm"])
             .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none"])
             .arg("-semihosting-config")
             .arg(format!("enable=on,target=native,arg=agv,arg={reported}"))
@@ -148,6 +170,14 @@ impl Bench {
     }
 }
 
+/// A program ahead of what else the host runs, where that is allowed: a clock that counts instructions loses the time in which the
+/// emulator has no turn, as no chip does.
+fn first(program: &str) -> Command {
+    let mut command = Command::new("nice");
+    command.args(["-n", "-10", program]);
+    command
+}
+
 /// How the lines of an image's log are read.
 fn table_of(image: &Path) -> Result<Arc<Table>> {
     let elf = std::fs::read(image).with_context(|| format!("cannot read {}", image.display()))?;
@@ -163,6 +193,8 @@ pub(crate) fn address(cable: &Cable) -> Ipv4Addr {
 pub(crate) struct Cable {
     name: String,
     number: u8,
+    /// To a board that does not open the device by itself.
+    wire: Option<Wire>,
 }
 
 impl Cable {

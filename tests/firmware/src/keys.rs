@@ -132,9 +132,9 @@ impl Keys {
         self.folder.path().join(location::file_name(identity, Fleet(fleet)))
     }
 
-    /// The file with what a board is told, and the one in which it counts its lives. A board that has been told before is
-    /// not told again.
-    pub(crate) fn reported(&self, who: &Who, address: &str) -> Result<(PathBuf, PathBuf)> {
+    /// The file with what a board is told, and the one in which it counts its lives or, of a chip with flash, all of that. A board
+    /// that has been told before is not told again.
+    pub(crate) fn reported(&self, board: &str, who: &Who, address: &str) -> Result<(PathBuf, PathBuf)> {
         let Who { name, id, manager, fleet, manager_address, .. } = who;
         // The image and QEMU split what they are told at blanks and commas, which a name may have.
         let plain: String = name.bytes().map(|byte| format!("{byte:02x}")).take(SHOWN).collect();
@@ -146,7 +146,7 @@ impl Keys {
         }
         let keys = self.file_of(&Identity::s_unit(name, *id)?, *fleet);
         let (id, fleet) = (id.to_string(), fleet.to_string());
-        let mut words: Vec<&OsStr> = ["provision", "lm3s6965evb", "--name", name, "--id", &id, "--manager", manager]
+        let mut words: Vec<&OsStr> = ["provision", board, "--name", name, "--id", &id, "--manager", manager]
             .into_iter()
             .chain(["--fleet", &fleet, "--address", address])
             .chain(manager_address.iter().flat_map(|address| ["--manager-address", address]))
@@ -156,6 +156,11 @@ impl Keys {
         words.extend(["--output".as_ref(), reported.as_os_str()]);
         if self.kind == Kind::Drawn {
             words.extend(["--keys".as_ref(), keys.as_os_str()]);
+        }
+        if board == "rp2040" {
+            words.push("--uf2".as_ref());
+            self.run(words)?;
+            return Ok((reported, boots));
         }
         self.run(words)?;
         // As the file is left when the power goes while the board makes it.

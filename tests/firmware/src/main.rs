@@ -14,6 +14,7 @@ mod line;
 mod load;
 mod manager;
 mod places;
+mod rp2040;
 mod security;
 mod serial;
 mod session;
@@ -30,6 +31,7 @@ use cara_processes::network::{self, Own};
 use clap::{Parser, Subcommand};
 
 use board::Bench;
+use checks::Check;
 use keys::Keys;
 
 /// Runs an image of the board lm3s6965evb in QEMU and checks what it does.
@@ -107,6 +109,8 @@ enum Part {
     Streams(streams::Streams),
     /// Runs a board on a serial line; for an image with SLIP, or with a line without IP.
     Serial(serial::Serial),
+    /// Runs an RP2040 with a W5500 in rp2040js; for its image, in plain mode.
+    Rp2040,
     /// Starts a session: a board, its manager and a prompt for `cara`.
     Session(session::Session),
 }
@@ -134,7 +138,8 @@ fn main() -> ExitCode {
 const SKIPPED: u8 = 77;
 
 fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
-    match network::own(std::env::args_os().skip(1), &["qemu-system-arm"], true)? {
+    let emulator = if matches!(arguments.part, Some(Part::Rp2040)) { "node" } else { "qemu-system-arm" };
+    match network::own(std::env::args_os().skip(1), &[emulator], true)? {
         Own::Inside => inside(arguments).map(|()| ExitCode::SUCCESS),
         Own::Ended(status) if status.success() => after(arguments).map(|()| ExitCode::SUCCESS),
         Own::Ended(status) => bail!("failed: {status}"),
@@ -158,6 +163,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::KeptAway(options)) => kept_away::run(&bench(arguments)?, options),
         Some(Part::Streams(options)) => streams::run(&bench(arguments)?, options),
         Some(Part::Serial(options)) => serial::run(&bench(arguments)?, options),
+        Some(Part::Rp2040) => rp2040::run(arguments),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),
     }
@@ -186,16 +192,22 @@ const SESSION: &str = "an emulator session answers what is typed";
 
 fn run(arguments: &Arguments) -> Result<()> {
     let bench = bench(arguments)?.with_constant(arguments.constant.clone());
-    let mut passed = 0;
-    for check in checks::CHECKS.iter().filter(|check| check.name.contains(&arguments.only)) {
-        let start = Instant::now();
-        let reported = (check.run)(&bench, arguments.restarts).with_context(|| check.name.to_owned())?;
-        println!("{:48} {:6.1} s  {reported}", check.name, start.elapsed().as_secs_f64());
-        passed += 1;
-    }
+    let passed = run_checks(&checks::CHECKS, &bench, arguments)?;
     if passed == 0 && !SESSION.contains(&arguments.only) {
         bail!("no check has `{}` in its name", arguments.only);
     }
     println!("{passed} checks of firmware passed");
     Ok(())
+}
+
+/// Runs those checks that are asked for; how many.
+fn run_checks(checks: &[Check], bench: &Bench, arguments: &Arguments) -> Result<usize> {
+    let chosen = checks.iter().filter(|check| check.name.contains(&arguments.only));
+    chosen.clone().try_for_each(|check| {
+        let start = Instant::now();
+        let reported = (check.run)(bench, arguments.restarts).with_context(|| check.name.to_owned())?;
+        println!("{:48} {:6.1} s  {reported}", check.name, start.elapsed().as_secs_f64());
+        anyhow::Ok(())
+    })?;
+    Ok(chosen.count())
 }
