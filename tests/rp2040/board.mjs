@@ -3,16 +3,19 @@
 // SOCKET takes Ethernet frames as QEMU's `-netdev stream` does, each behind its length in four bytes. FLASH is a file with the
 // flash, made of the UF2 files if it is absent. Standard output has the log as defmt encodes it; with `--events`, standard error has what
 // happens, each with the chip's own time in µs: `pin NUMBER LEVEL`, `flash KIND OFFSET`, and `from` and `to` with the payload's bytes for
-// TCP and UDP. When the other end closes SOCKET, power goes.
+// TCP and UDP. The signal USR2 presses the button. When the other end closes SOCKET, power goes.
 //
 // The chip's clock follows this computer's, and stands still where this computer is too slow or busy for it.
 
 import { existsSync, openSync, readFileSync, writeFileSync, writeSync } from 'node:fs';
 import { createConnection } from 'node:net';
-import { Chip, LED, MOTORS, flashOf } from './chip.mjs';
+import { BUTTON, Chip, LED, MOTORS, flashOf } from './chip.mjs';
 
 /** How far the chip may be behind, and most that it runs before frames are looked for, in ns. */
 const [BEHIND, TURN] = [20e6, 2e6];
+
+/** How long the button is pressed, in ns. */
+const PRESSED = 200e6;
 
 const words = process.argv.slice(2);
 const showsEvents = words.includes('--events');
@@ -36,6 +39,13 @@ chip.onFlash = (kind, offset, length, phase) => {
   writeSync(flash, chip.flash, offset, length, offset);
   happens('flash', kind, offset);
 };
+
+const button = chip.rp.gpio[BUTTON];
+const released = chip.rp.clock.createAlarm(() => button.setInputValue(true));
+process.on('SIGUSR2', () => {
+  button.setInputValue(false);
+  released.schedule(PRESSED);
+});
 
 const cable = createConnection(socketPath);
 chip.network.onFrame = (frame) => {

@@ -20,6 +20,9 @@ const CYCLE = 8; // ns
 const ERASE = 45e6;
 const PROGRAM = 0.4e6;
 
+/** How long the ends of a cable need to agree. */
+const NEGOTIATION = 1.6e9;
+
 /** Pins, as examples/firmware/rp/src/board/w5500.rs has them. */
 const [BUTTON, MOTORS, SELECT, RESET, INTERRUPT, LED] = [14, 15, 17, 20, 21, 25];
 export { BUTTON, LED, MOTORS };
@@ -224,6 +227,8 @@ export class Chip {
   wire() {
     const { gpio, spi, clock } = this.rp;
     const network = new W5500((low) => gpio[INTERRUPT].setInputValue(!low));
+    const agreed = clock.createAlarm(() => network.connect());
+    network.onReset = () => agreed.schedule(NEGOTIATION);
     const [bus] = spi;
     let answer = 0;
     const done = clock.createAlarm(() => bus.completeTransmit(answer));

@@ -20,6 +20,8 @@ export class W5500 {
     this.onFrame = () => {};
     /** Called when the board resets it. */
     this.onReset = () => {};
+    /** Whether the cable's ends have agreed. */
+    this.link = false;
     /** Frames for which there was no room. */
     this.lost = 0;
     this.powerOn();
@@ -28,7 +30,6 @@ export class W5500 {
   powerOn() {
     this.common = new Uint8Array(0x40);
     this.common[COMMON.VERSION] = 4;
-    this.common[COMMON.PHY] = 0xbf; // 100 Mbit/s, both ways, and the cable is plugged in.
     this.sockets = Array.from({ length: SOCKETS }, () => new Uint8Array(0x30));
     for (const socket of this.sockets) {
       socket[SOCKET.RX_KIB] = socket[SOCKET.TX_KIB] = 2;
@@ -47,7 +48,14 @@ export class W5500 {
     this.isReset = low;
     if (!low) return;
     this.powerOn();
+    this.link = false;
     this.onReset();
+  }
+
+  /** The cable's ends have agreed. */
+  connect() {
+    this.link = true;
+    this.update();
   }
 
   /** The select pin: a transaction begins. */
@@ -118,13 +126,13 @@ export class W5500 {
     for (let index = 0; index < length; index++) frame[index] = this.tx[(from + index) % this.size(SOCKET.TX_KIB)];
     this.set(SOCKET.TX_READ, to);
     this.sockets[0][SOCKET.INTERRUPT] |= SENT;
-    this.onFrame(frame);
+    if (this.link) this.onFrame(frame);
   }
 
   /** A frame comes in by the cable; whether it was taken. */
   receive(frame) {
     const [socket] = this.sockets;
-    if (this.isReset || socket[SOCKET.STATUS] !== 0x42 || !this.isForUs(frame)) return false;
+    if (this.isReset || !this.link || socket[SOCKET.STATUS] !== 0x42 || !this.isForUs(frame)) return false;
     const length = Math.max(frame.length, SHORTEST) + 2;
     if (this.waiting() + length > this.size(SOCKET.RX_KIB)) {
       this.lost++;
@@ -158,6 +166,7 @@ export class W5500 {
     const [socket] = this.sockets;
     this.set(SOCKET.RX_SIZE, this.waiting());
     this.set(SOCKET.TX_FREE, this.size(SOCKET.TX_KIB) - ((this.get(SOCKET.TX_WRITE) - this.get(SOCKET.TX_READ)) & 0xffff));
+    this.common[COMMON.PHY] = this.link ? 0xbf : 0xb8;
     this.common[COMMON.SIR] = socket[SOCKET.INTERRUPT] & socket[SOCKET.MASK] ? 1 : 0;
     this.interrupt((this.common[COMMON.SIR] & this.common[COMMON.SIMR]) !== 0);
   }

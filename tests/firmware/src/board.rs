@@ -62,9 +62,19 @@ impl Bench {
         Self { counts: true, ..self }
     }
 
+    /// The image of its boards.
+    pub(crate) fn image(&self) -> &Path {
+        &self.image
+    }
+
     /// Its boards are an RP2040 with a W5500.
     pub(crate) fn rp2040(self) -> Self {
         Self { is_rp2040: true, ..self }
+    }
+
+    /// Whether its boards can be told to draw the same numbers in each life.
+    pub(crate) fn takes_seeds(&self) -> bool {
+        !self.is_rp2040
     }
 
     /// The same bench for boards that are told other things.
@@ -199,10 +209,15 @@ pub(crate) struct Cable {
 
 impl Cable {
     pub(crate) fn plug_in(&self) -> Result<()> {
+        self.wire.iter().for_each(|wire| wire.plug(true));
         network::run(&format!("ip link set {} up", self.name))
     }
 
     pub(crate) fn pull(&self) -> Result<()> {
+        if let Some(wire) = &self.wire {
+            wire.plug(false);
+            return Ok(());
+        }
         network::run(&format!("ip link set {} down", self.name))
     }
 
@@ -318,6 +333,11 @@ impl Board {
     /// Lets it go on.
     pub(crate) fn thaw(&self) -> Result<()> {
         self.signal(Signal::CONT)
+    }
+
+    /// Presses the button of an RP2040.
+    pub(crate) fn press(&self) -> Result<()> {
+        self.signal(Signal::USR2)
     }
 
     fn signal(&self, signal: Signal) -> Result<()> {

@@ -44,12 +44,11 @@ pub(crate) const CHECKS: [Check; 21] = [
 ];
 
 /// Those that run on an RP2040 as well, in plain mode.
-pub(crate) const RP2040: [Check; 8] = [
+pub(crate) const RP2040: [Check; 7] = [
     Check { name: "it is found by broadcast and shows its functions", run: calls::found },
     Check { name: "it drives where it is sent, and arrives", run: calls::driven },
     Check { name: "it stops when nobody renews its lease", run: calls::not_renewed },
     Check { name: "wrong calls are refused and the rest goes on", run: calls::wrong },
-    Check { name: "it calls the manager's mechanic", run: calls::mechanic },
     Check { name: "a pulled cable stops it, and it returns", run: losses::cable },
     Check { name: "a killed manager stops it, and a new one finds it", run: losses::manager },
     Check { name: "it comes back from every loss of power", run: restarts::run },

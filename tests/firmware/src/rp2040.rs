@@ -4,6 +4,8 @@
 mod events;
 mod wire;
 
+use std::process::Command;
+
 use anyhow::{Context, Result, ensure};
 use cara_apps::agv::GO_TO_LEASE;
 use cara_processes::Process;
@@ -12,20 +14,22 @@ use cara_std::{Error, Renew, RequestOptions};
 use crate::board::{Bench, LONG, Who};
 use crate::checks::{self, Check};
 use crate::keys::Keys;
-use crate::manager::{self, Manager, arrives, at, patiently, sets_out};
+use crate::manager::{self, Manager, at, drives, patiently, sets_out};
 use crate::{Arguments, run_checks};
-pub(crate) use events::Events;
 use events::Event;
+pub(crate) use events::Events;
 pub(crate) use wire::Wire;
 
 /// Where the emulator's programs are.
 pub(crate) const SCRIPTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../rp2040/");
 
-const CHECKS: [Check; 4] = [
+const CHECKS: [Check; 6] = [
     Check { name: "the motors' pin is on while it drives", run: driving },
     Check { name: "without renewal the pin is off as the lease ends", run: not_renewed },
     Check { name: "a manager freezes: the pin is off as the lease ends", run: frozen },
     Check { name: "a manager is killed: the pin is off at once", run: killed },
+    Check { name: "its button calls the manager's mechanic", run: button },
+    Check { name: "no cut of power in flash repeats a count of starts", run: starts },
 ];
 
 /// Runs all of it.
@@ -38,17 +42,24 @@ pub(crate) fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// What the motors' interrupt and the way of a frame through controller and tasks take, in µs.
-const TICK: u64 = 1_000;
+// All of these are times of the chip's clock, in µs.
 const LEASE: u64 = GO_TO_LEASE.as_micros();
+/// The period of the motors' interrupt.
+const TICK: u64 = 1_000;
+/// In which a frame gets from the controller to the unit.
+const READ: u64 = 1_000;
+/// The longest turn of the executor.
+const POLL: u64 = 20_000;
+/// How often a lease ends in a check.
+const TIMES: usize = 5;
 
 fn driving(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
     let manager = Manager::start(&bench.keys)?;
-    let (_board, events) = bench.watched_board(&cable, &Who::agv(17))?;
+    let (board, events) = bench.watched_board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
-    sets_out(&agv, [1, 0])?;
-    arrives(&agv, [1, 0])?;
+    ensure!(events.count_of_motors() <= 1, "the pin changes before it is sent anywhere");
+    drives(&board, [1, 0], || sets_out(&agv, [1, 0]))?;
     let on = events.motors(0, true)?;
     let off = events.motors(on.line, false)?;
     Ok(format!("for {} ms of the chip's clock", off.since(&on) / 1_000))
@@ -59,7 +70,7 @@ fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     let manager = Manager::start(&bench.keys)?;
     let (_board, events) = bench.watched_board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
-    let mut took = Vec::new();
+    let mut ends = Vec::new();
     let mut from = 0;
     for _ in 0..TIMES {
         let once = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
@@ -67,10 +78,10 @@ fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
         let on = events.motors(from, true)?;
         let off = events.motors(on.line, false)?;
         let request = events.last_before(&on, Event::has_payload)?;
-        took.push((off.since(&request), off.since(&on)));
+        ends.push(lease_ended(&request, &off)?);
         from = off.line;
     }
-    Ok(format!("{took:?}"))
+    Ok(format!("{ends:?} us behind the request"))
 }
 
 fn frozen(bench: &Bench, _: u32) -> Result<String> {
@@ -81,8 +92,18 @@ fn frozen(bench: &Bench, _: u32) -> Result<String> {
     manager.freeze()?;
     let off = events.motors(on.line, false)?;
     let renewal = events.last_before(&off, Event::has_payload)?;
-    let took = off.since(&renewal);
-    Ok(format!("{took}"))
+    Ok(format!("{} us behind the last renewal", lease_ended(&renewal, &off)?))
+}
+
+/// How long the motors were on behind the last message that renewed their lease. That may have been on its way for a while, which
+/// counts.
+fn lease_ended(renewal: &Event, off: &Event) -> Result<u64> {
+    let took = off.since(renewal);
+    ensure!(
+        (LEASE / 2..=LEASE + READ + TICK).contains(&took),
+        "the motors go off {took} us behind {renewal:?}, in place of {LEASE}"
+    );
+    Ok(took)
 }
 
 fn killed(bench: &Bench, _: u32) -> Result<String> {
@@ -92,9 +113,10 @@ fn killed(bench: &Bench, _: u32) -> Result<String> {
     let on = events.motors(0, true)?;
     manager.kill()?;
     let off = events.motors(on.line, false)?;
-    let closed = events.last_before(&off, |event| event.what.starts_with("to tcp"))?;
+    let closed = events.last_before(&off, Event::is_segment)?;
     let took = off.since(&closed);
-    Ok(format!("{took}"))
+    ensure!(took <= READ + POLL + TICK, "the motors go off {took} us behind the end of the connection");
+    Ok(format!("{took} us behind the end of the connection"))
 }
 
 /// A manager in a process of its own, for which the vehicle drives.
@@ -104,5 +126,25 @@ fn driving_manager(bench: &Bench) -> Result<Process> {
     Ok(manager)
 }
 
-/// How often a lease ends.
-const TIMES: usize = 5;
+fn button(bench: &Bench, _: u32) -> Result<String> {
+    let cable = bench.cable()?;
+    let manager = Manager::start(&bench.keys)?;
+    let board = bench.board(&cable, &Who::agv(17))?;
+    manager.meet(&Who::agv(17))?;
+    manager.offer_mechanic()?;
+    ensure!(board.last_with("a mechanic comes").is_none(), "it calls without its button");
+    board.press()?;
+    board.logs("a mechanic comes in 5 minutes")?;
+    Ok("pressed once".into())
+}
+
+/// The image counts its starts where it has keys.
+fn starts(bench: &Bench, _: u32) -> Result<String> {
+    let keys = bench.keys.others()?;
+    let (settings, _) = keys.reported("rp2040", &Who::agv(17), "10.77.0.100/24")?;
+    let mut node = Command::new("node");
+    node.arg(SCRIPTS.to_owned() + "starts.mjs").arg(bench.image().with_extension("uf2")).arg(settings);
+    let output = node.output().context("cannot start node")?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+}

@@ -13,12 +13,12 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 
 use crate::binaries;
 use crate::command::Run;
 use crate::groups::Outcome;
-use crate::{install, msrv};
+use crate::{install, msrv, workspace};
 use boards::{BOARDS, Board, Image};
 pub(crate) use boards::{built, find, image_build};
 pub(crate) use faults::{Faults, check as check_faults, faults};
@@ -64,7 +64,11 @@ pub(crate) fn test() -> Outcome {
 
 /// What came of a test on the emulated board, which ends with an exit code.
 pub(crate) fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
-    if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
+    ended(install::program("qemu-system-arm", "qemu-system-arm"), test)
+}
+
+fn ended(emulator: Result<(), String>, test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
+    if let Err(reason) = emulator {
         return Outcome::Skipped(reason);
     }
     match test() {
@@ -73,6 +77,20 @@ pub(crate) fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
         Ok(code) => Outcome::Failed(format!("exit code {code:?}")),
         Err(error) => Outcome::Failed(format!("{error:#}")),
     }
+}
+
+/// Runs an RP2040's firmware in rp2040js against the Linux manager.
+pub(crate) fn test_rp2040() -> Outcome {
+    let node = install::program("node", "nodejs").and_then(|()| install::program("npm", "npm"));
+    ended(node, || {
+        let board = boards::find("rp2040")?;
+        install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+        let image = board.build(&boards::AGV)?;
+        uf2::write_beside(&image, cara_settings::board::find(board.name).context("it has no pages for settings")?)?;
+        let scripts = workspace::root().join("tests/rp2040");
+        Run::new("npm").args(["ci", "--silent", "--prefix"]).args([&scripts]).stream()?;
+        tests(&image)?.args(["--restarts", "12", "rp2040"]).code()
+    })
 }
 
 fn tested() -> Result<Option<i32>> {

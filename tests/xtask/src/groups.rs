@@ -331,6 +331,15 @@ pub(crate) const GROUPS: [Group; 32] = [
         waits: true,
         run: |_| needing(install::program("etcd", "etcd-server"), etcd),
     },
+    Group {
+        name: "rp2040",
+        what: "an RP2040's image in rp2040js with a W5500, against the Linux manager: calls, the motors' pin, losses of power, cuts in flash",
+        budget: 600,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| firmware::test_rp2040(),
+    },
 ];
 
 impl From<Result<()>> for Outcome {

@@ -68,6 +68,7 @@ pub(super) fn run(bench: &Bench, restarts: u32) -> Result<String> {
     let mut seeded = 0;
     for number in 0..restarts {
         let Loss { state, absence, seed } = Loss::of(number);
+        let seed = seed.filter(|_| bench.takes_seeds());
         let who = Who { seed, ..Who::agv(17) };
         let at = || format!("restart {number}, {state:?}, {absence:?}, seed {seed:?}");
         manager.forget_events();

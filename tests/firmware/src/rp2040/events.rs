@@ -28,6 +28,11 @@ impl Event {
     pub(super) fn has_payload(&self) -> bool {
         self.what.starts_with("to ") && !self.what.ends_with(" 0")
     }
+
+    /// Whether it is a segment of a connection, to the board.
+    pub(super) fn is_segment(&self) -> bool {
+        self.what.starts_with("to tcp")
+    }
 }
 
 /// All that happened so far.
@@ -72,6 +77,11 @@ impl Events {
             }
             events = self.shared.1.wait_timeout(events, left).unwrap_or_else(PoisonError::into_inner).0;
         }
+    }
+
+    /// How often the motors' enable went on or off.
+    pub(super) fn count_of_motors(&self) -> usize {
+        self.lock().iter().filter(|event| event.what.starts_with(MOTORS)).count()
     }
 
     /// The last event ahead of another one that `wanted` accepts.

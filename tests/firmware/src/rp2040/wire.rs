@@ -22,8 +22,14 @@ const LENGTH: usize = 4;
 /// A wire whose far end is a socket, for one board after the other.
 pub(crate) struct Wire {
     socket: PathBuf,
-    is_over: Arc<AtomicBool>,
+    state: Arc<State>,
     thread: Option<JoinHandle<Result<()>>>,
+}
+
+#[derive(Default)]
+struct State {
+    is_pulled: AtomicBool,
+    is_over: AtomicBool,
 }
 
 impl Wire {
@@ -32,21 +38,26 @@ impl Wire {
         let socket = folder.join(tap);
         let listener = UnixListener::bind(&socket).context("the wire has no socket")?;
         listener.set_nonblocking(true)?;
-        let is_over = Arc::<AtomicBool>::default();
-        let (tap, over) = (tap.to_owned(), is_over.clone());
-        let thread = std::thread::spawn(move || carry(&tap, &listener, &over));
-        Ok(Self { socket, is_over, thread: Some(thread) })
+        let state = Arc::<State>::default();
+        let (tap, shared) = (tap.to_owned(), Arc::clone(&state));
+        let thread = std::thread::spawn(move || carry(&tap, &listener, &shared));
+        Ok(Self { socket, state, thread: Some(thread) })
     }
 
     /// Where the emulator connects.
     pub(crate) fn socket(&self) -> &Path {
         &self.socket
     }
+
+    /// Plugs it in, or pulls it: nothing goes either way then, and neither end is told.
+    pub(crate) fn plug(&self, is_plugged: bool) {
+        self.state.is_pulled.store(!is_plugged, Ordering::Relaxed);
+    }
 }
 
 impl Drop for Wire {
     fn drop(&mut self) {
-        self.is_over.store(true, Ordering::Relaxed);
+        self.state.is_over.store(true, Ordering::Relaxed);
         match self.thread.take().map(JoinHandle::join) {
             Some(Ok(Ok(()))) | None => {}
             Some(failed) => eprintln!("a wire: {failed:?}"),
@@ -54,11 +65,12 @@ impl Drop for Wire {
     }
 }
 
-fn carry(tap: &str, listener: &UnixListener, is_over: &AtomicBool) -> Result<()> {
+fn carry(tap: &str, listener: &UnixListener, state: &State) -> Result<()> {
     let mut device = TunTapInterface::new(tap, Medium::Ethernet).context("the TAP device cannot be opened")?;
     let mut board: Option<UnixStream> = None;
     let mut arrived = Vec::new();
-    while !is_over.load(Ordering::Relaxed) {
+    while !state.is_over.load(Ordering::Relaxed) {
+        let passes = !state.is_pulled.load(Ordering::Relaxed);
         wait(device.as_raw_fd(), Some(TICK))?;
         if let Ok((connected, _)) = listener.accept() {
             connected.set_nonblocking(true)?;
@@ -68,7 +80,7 @@ fn carry(tap: &str, listener: &UnixListener, is_over: &AtomicBool) -> Result<()>
             frame.consume(|bytes| {
                 let whole = [&(bytes.len() as u32).to_be_bytes(), bytes].concat();
                 // A board that takes no more has hung, or lost its power.
-                if board.as_mut().is_some_and(|board| written(board, &whole).is_err()) {
+                if passes && board.as_mut().is_some_and(|board| written(board, &whole).is_err()) {
                     board = None;
                 }
             });
@@ -79,7 +91,7 @@ fn carry(tap: &str, listener: &UnixListener, is_over: &AtomicBool) -> Result<()>
         while let Some((length, rest)) = arrived.split_first_chunk::<LENGTH>()
             && let Some(frame) = rest.get(..u32::from_be_bytes(*length) as usize)
         {
-            if let Some(free) = device.transmit(StackInstant::ZERO) {
+            if passes && let Some(free) = device.transmit(StackInstant::ZERO) {
                 free.consume(frame.len(), |bytes| bytes.copy_from_slice(frame));
             }
             arrived.drain(..LENGTH + frame.len());

@@ -66,7 +66,8 @@ const NO_RADIO: &str = "none";
 
 /// Of every board.
 const IMAGES: &[Image] = &[AGV, ECHO];
-const AGV: Image = Image::plain("agv", "agv").secured();
+/// The vehicle, with keys or in plain mode.
+pub(crate) const AGV: Image = Image::plain("agv", "agv").secured();
 const ECHO: Image = Image::plain("echo", "echo");
 /// Of the emulated board, on which also the least unit, images without logs and images without a cipher are measured.
 const EMULATED: &[Image] = &[
