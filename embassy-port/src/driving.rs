@@ -24,6 +24,7 @@ use core::task::Context as TaskContext;
 
 use crate::connection::Progress;
 use crate::event::{Name, UnitEvent};
+use crate::link::Link;
 use crate::machine::{Machine, Started};
 use crate::mail::Connection;
 use crate::port::{Board, LinkSession};
@@ -299,7 +300,7 @@ impl<T> Machine<T> {
         if address == self.address {
             return;
         }
-        self.address = address;
+        let was_away = core::mem::replace(&mut self.address, address).is_none();
         log!("the address is now {:?}", address.map(|address| address.octets()));
         if address.is_some() {
             self.hub.node.network_changed(now);
@@ -309,6 +310,10 @@ impl<T> Machine<T> {
             self.notify(UnitEvent::NetworkChanged { up: address });
         }
         for index in self.indices() {
+            // Frames pass before a driver that asks for its cable now and then reports it: this link is of the new address.
+            if was_away && self.link(index).is_some_and(Link::is_live) {
+                continue;
+            }
             self.disconnected(index, CloseReason::Reset);
             if let Some(line) = self.mail.connections.get_mut(usize::from(index)) {
                 line.abort();

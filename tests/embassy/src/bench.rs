@@ -91,7 +91,7 @@ impl Bench {
         let port = self.inner.switch.borrow_mut().add_port(mac);
         let switch = Rc::clone(&self.inner.switch);
         let gate = Rc::new(RefCell::new(Gate::new(self.random(u64::MAX))));
-        let plug = Plug { switch, port, mac, gate, listener: Rc::default() };
+        let plug = Plug { switch, port, mac, gate, listener: Rc::default(), is_unnoticed: Rc::default() };
         self.inner.plugs.borrow_mut().push(plug.clone());
         Board::boot(&self.inner, index, plug, Ipv4Addr::new(10, 77, high, low), config)
     }
@@ -234,6 +234,12 @@ impl Board {
     /// Pulls its cable, or plugs it in.
     pub fn set_cable(&self, up: bool) {
         self.inner.switch.borrow_mut().set_link(self.plug.port, up);
+        self.plug.wake();
+    }
+
+    /// Whether its driver reports the cable, which passes frames all the same.
+    pub fn notice_cable(&self, noticed: bool) {
+        self.plug.is_unnoticed.set(!noticed);
         self.plug.wake();
     }
 

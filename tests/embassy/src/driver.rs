@@ -1,6 +1,6 @@
 //! A port of the switch as embassy-net sees its device.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::task::{Context, Waker};
 
@@ -23,6 +23,8 @@ pub(crate) struct Plug {
     pub(crate) gate: Rc<RefCell<Gate>>,
     /// The waker for an arrived frame or a moved cable.
     pub(crate) listener: Rc<RefCell<Option<Waker>>>,
+    /// The driver has not noticed yet that the cable is plugged in.
+    pub(crate) is_unnoticed: Rc<Cell<bool>>,
 }
 
 impl Plug {
@@ -80,7 +82,8 @@ impl Driver for Cable {
 
     fn link_state(&mut self, context: &mut Context<'_>) -> LinkState {
         self.0.listen(context);
-        if self.0.switch.borrow().is_up(self.0.port) { LinkState::Up } else { LinkState::Down }
+        let is_up = self.0.switch.borrow().is_up(self.0.port) && !self.0.is_unnoticed.get();
+        if is_up { LinkState::Up } else { LinkState::Down }
     }
 
     fn capabilities(&self) -> Capabilities {

@@ -687,6 +687,20 @@ fn keys_are_made_anew_while_calls_go_on() {
     assert_eq!([refused(manager), refused(agv)], [0, 0]);
 }
 
+/// The driver of a W5500 asks for its cable every 500 ms, and frames come before.
+#[test]
+fn a_link_that_came_before_the_cable_was_noticed_stays() {
+    let bench = Bench::new(16);
+    let (_, manager) = manager(&bench);
+    let (board, agv) = agv(&bench);
+    board.notice_cable(false);
+    assert!(bench.run_until(|| agv.is_connected() && manager.is_connected(), LONG));
+    board.notice_cable(true);
+    bench.run_for(SHORT);
+    assert_eq!(agv.with_state(|state| state.losses), Ok(0));
+    assert!(agv.is_connected());
+}
+
 /// Units with an explicit opt-in to plain mode, and units with keys of another fleet: each meets only its like.
 #[test]
 fn an_insecure_unit_meets_insecure_units_only() {
