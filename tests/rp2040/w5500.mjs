@@ -6,6 +6,7 @@ const SOCKET = {
   MODE: 0x00, COMMAND: 0x01, INTERRUPT: 0x02, STATUS: 0x03, RX_KIB: 0x1e, TX_KIB: 0x1f, TX_FREE: 0x20, TX_READ: 0x22,
   TX_WRITE: 0x24, RX_SIZE: 0x26, RX_READ: 0x28, RX_WRITE: 0x2a, MASK: 0x2c,
 };
+const READ_ONLY = [SOCKET.STATUS, ...[SOCKET.TX_FREE, SOCKET.TX_READ, SOCKET.RX_SIZE, SOCKET.RX_WRITE].flatMap((at) => [at, at + 1])];
 const [OPEN, CLOSE, SEND, RECEIVE] = [0x01, 0x10, 0x20, 0x40];
 const [MACRAW, FILTER] = [0x04, 0x80];
 const [RECEIVED, SENT] = [0x04, 0x10];
@@ -22,8 +23,6 @@ export class W5500 {
     this.onReset = () => {};
     /** Whether the cable's ends have agreed. */
     this.link = false;
-    /** Frames for which there was no room. */
-    this.lost = 0;
     this.powerOn();
   }
 
@@ -97,11 +96,9 @@ export class W5500 {
   }
 
   writeSocket(socket, at, byte) {
-    const readOnly = [SOCKET.STATUS, SOCKET.TX_FREE, SOCKET.TX_READ, SOCKET.RX_SIZE, SOCKET.RX_WRITE].flatMap((low) => [low, low + 1]);
-    readOnly[1] = undefined; // The status is one byte.
     if (at === SOCKET.INTERRUPT) socket[at] &= ~byte;
     else if (at === SOCKET.COMMAND) this.command(socket, byte);
-    else if (!readOnly.includes(at)) socket[at] = byte;
+    else if (!READ_ONLY.includes(at)) socket[at] = byte;
   }
 
   command(socket, command) {
@@ -134,10 +131,7 @@ export class W5500 {
     const [socket] = this.sockets;
     if (this.isReset || !this.link || socket[SOCKET.STATUS] !== 0x42 || !this.isForUs(frame)) return false;
     const length = Math.max(frame.length, SHORTEST) + 2;
-    if (this.waiting() + length > this.size(SOCKET.RX_KIB)) {
-      this.lost++;
-      return false;
-    }
+    if (this.waiting() + length > this.size(SOCKET.RX_KIB)) return false;
     let at = this.get(SOCKET.RX_WRITE);
     const put = (byte) => {
       this.rx[at++ % this.size(SOCKET.RX_KIB)] = byte;
