@@ -20,8 +20,8 @@ const CYCLE = 8; // ns
 const ERASE = 45e6;
 const PROGRAM = 0.4e6;
 
-/** How long the ends of a cable need to agree. */
-const NEGOTIATION = 1.6e9;
+/** How long the ends of a cable need to agree: until just after the driver has asked for that, so that frames pass long before it knows. */
+const NEGOTIATION = 1.62e9;
 
 /** Pins, as examples/firmware/rp/src/board/w5500.rs has them. */
 const [BUTTON, MOTORS, SELECT, RESET, INTERRUPT, LED] = [14, 15, 17, 20, 21, 25];
