@@ -2,7 +2,9 @@
 
 use std::collections::HashSet;
 use std::ops::ControlFlow;
-use std::sync::mpsc::RecvTimeoutError;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::Instant;
 
 use cara_core::config::Constraints;
@@ -136,10 +138,15 @@ fn attempt<T: Send + 'static>(
             send(sink, Answer::Constraints(describe::constraints(&constraints)))
         }
         Question::Watch => watch(system, sink, wanted),
+        Question::Commands => {
+            follow(system, system.engine().commands().follow(EVENTS), sink, wanted, |command| command)
+        }
         Question::Stream { node, name, interval_ms } => {
             stream::values(system, node, name.as_deref(), Duration::from_millis(*interval_ms), sink, wanted)
         }
-        Question::Streams { interval_ms } => stream::all(system, Duration::from_millis(*interval_ms), sink, wanted),
+        Question::Streams { interval_ms, names } => {
+            stream::all(system, Duration::from_millis(*interval_ms), names, sink, wanted)
+        }
         Question::Counters { node } => counters(system, node.as_deref(), sink),
         Question::Metrics => metrics(system, sink),
         Question::Ping { node, count, pause_us, timeout_ms } => {
@@ -299,7 +306,17 @@ fn watch<T: Send + 'static>(
     sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
-    let (events, lost) = system.events_with_losses(EVENTS);
+    follow(system, system.events_with_losses(EVENTS), sink, wanted, |event| describe::event(&event, system.uptime()))
+}
+
+/// Sends what is received, and how much of it was lost, until the unit stops or the client has gone.
+fn follow<T: Send + 'static, R>(
+    system: &CommunicationSystem<T>,
+    (received, lost): (Receiver<R>, Arc<AtomicU64>),
+    sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
+    answer: impl Fn(R) -> Answer,
+) -> Result<(), End> {
     let notify = |event: &str, text: String| Answer::Event {
         at_ms: system.uptime().as_millis(),
         unix_ms: unix_ms(),
@@ -309,14 +326,14 @@ fn watch<T: Send + 'static>(
     };
     send(sink, notify("watching", "events from here on".to_owned()))?;
     loop {
-        match events.recv_timeout(LOOK) {
-            Ok(event) => send(sink, describe::event(&event, system.uptime()))?,
+        match received.recv_timeout(LOOK) {
+            Ok(found) => send(sink, answer(found))?,
             Err(RecvTimeoutError::Timeout) if system.is_stopped() => return Ok(()),
             Err(RecvTimeoutError::Timeout) if !wanted() => return Err(End::Gone),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return Ok(()),
         }
-        let missed = lost.swap(0, std::sync::atomic::Ordering::Relaxed);
+        let missed = lost.swap(0, Ordering::Relaxed);
         if missed > 0 {
             send(sink, notify("lost", format!("{missed} events came faster than they were read")))?;
         }

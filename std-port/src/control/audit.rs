@@ -30,7 +30,7 @@ use serde_json::{Value, json};
 
 use super::failure::name_of;
 use super::location::own_uid;
-use super::protocol::{Answer, CallQuestion, Failure, Question};
+use super::protocol::{Answer, By, CallQuestion, Failure, Question};
 use super::role::{Role, names_of_users};
 use crate::LineQueue;
 use crate::seldom::warn_seldom;
@@ -197,7 +197,14 @@ impl Who {
         Ok(())
     }
 
-    fn own() -> Self {
+    /// As those that follow commands get it.
+    pub(super) fn by(&self) -> By {
+        let Self { uid, pid, program, name, role } = self;
+        let (origin, program) = ("operator".to_owned(), Some(program.clone()));
+        By { origin, uid: Some(*uid), pid: Some(*pid), program, name: name.clone(), role: *role }
+    }
+
+    pub(super) fn own() -> Self {
         let (uid, pid) = (getuid().as_raw(), getpid().as_raw_nonzero().get());
         let program = std::fs::read_to_string("/proc/self/comm").unwrap_or_default();
         Self { uid, pid, program: program.trim_end().to_owned(), name: names_of_users().remove(&uid), role: None }
@@ -257,6 +264,11 @@ impl Drop for ProgramCall {
     }
 }
 
+/// Whether a question has an [`Entry`].
+pub(super) fn changes_something(question: &Question) -> bool {
+    Asked::of(question).is_some()
+}
+
 /// What a question asks for.
 #[derive(Clone, Copy)]
 struct Asked<'q> {
@@ -289,6 +301,7 @@ impl<'q> Asked<'q> {
             | Question::Functions { .. }
             | Question::Orders { .. }
             | Question::Watch
+            | Question::Commands
             | Question::Counters { .. }
             | Question::Metrics
             | Question::Stream { .. }

@@ -26,6 +26,7 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
         mode: Some(system.keys().mode().as_str().to_owned()),
         keys: system.keys().ring().map(keys),
         version: VERSIONS.last,
+        release: Some(env!("CARGO_PKG_VERSION").to_owned()),
         discovery_port: system.discovery_port(),
         tcp_port: system.tcp_port(),
         epoch: epoch(system.epoch()),

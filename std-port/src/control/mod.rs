@@ -13,6 +13,7 @@ mod attributes;
 mod audit;
 mod call;
 mod client;
+mod commands;
 mod constraint;
 mod describe;
 mod elsewhere;
@@ -39,6 +40,7 @@ pub(crate) use audit::{Audit, ProgramCall};
 pub use client::{
     Answers, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called, running_in,
 };
+pub(crate) use commands::{Commands, FollowedCall, Recorded};
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use forgetting::{ForgetError, Forgotten, forget_claims, state_folder};
 pub use location::{directories, directory};

@@ -96,6 +96,9 @@ pub enum Question {
     /// An [`Answer::Event`] for each event, until the connection is closed. The first is `watching`, behind which nothing
     /// is missed; `lost` tells how many came faster than they were read.
     Watch,
+    /// An [`Answer::Command`] for each outcome of what operators ask that changes something, and of what the unit's program
+    /// calls, until the connection is closed. The first answer is the event `watching`, and `lost` is as of [`Watch`](Self::Watch).
+    Commands,
     /// Values of a stream of a node as they come, until the connection is closed: an [`Answer::Value`] for each. Without a name
     /// the last value of each of its streams, or that there is none.
     Stream {
@@ -111,6 +114,9 @@ pub enum Question {
     Streams {
         /// Least time between two values of a stream; 0 for as often as the node grants.
         interval_ms: u64,
+        /// Streams of these names alone; of all names if empty.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        names: Vec<String>,
     },
     /// Counters of the unit, or of the link to one node. Answered by an [`Answer::Counters`] for each.
     Counters {
@@ -322,6 +328,17 @@ pub enum Answer {
         /// The rest, in words.
         text: String,
     },
+    /// An outcome of a command.
+    Command {
+        /// Milliseconds since 1970, at the outcome.
+        unix_ms: u64,
+        /// Who asked.
+        by: By,
+        /// What was asked. A call of the unit's program has the form of an operator's.
+        question: Box<Question>,
+        /// An answer to it; none if the client had gone, or the program had given the call up.
+        outcome: Option<Box<Answer>>,
+    },
     /// A value of a stream.
     Value {
         /// The node's `name/id`.
@@ -361,6 +378,30 @@ pub enum Answer {
     Done,
     /// The question could not be answered.
     Failed(Failure),
+}
+
+/// Who asks for a command.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct By {
+    /// `operator`, through the control socket, or `program`, which has nothing of the rest.
+    pub origin: String,
+    /// The user.
+    pub uid: Option<u32>,
+    /// The process, and its program.
+    pub pid: Option<i32>,
+    /// Another program may take its name.
+    pub program: Option<String>,
+    /// The user's name, or for whom that process acts.
+    pub name: Option<String>,
+    /// What they may do.
+    pub role: Option<Role>,
+}
+
+/// The unit's own program.
+impl Default for By {
+    fn default() -> Self {
+        Self { origin: "program".to_owned(), uid: None, pid: None, program: None, name: None, role: None }
+    }
 }
 
 /// An error as text, and where its remedy lies.
@@ -412,6 +453,9 @@ pub struct UnitInfo {
     pub keys: Option<KeysInfo>,
     /// Protocol version.
     pub version: u8,
+    /// The release of `cara-std` that it is built with; absent where it is older than this.
+    #[serde(default)]
+    pub release: Option<String>,
     /// The UDP port of broadcasts.
     pub discovery_port: u16,
     /// Where it takes connections; 0 for nowhere.

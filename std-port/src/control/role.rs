@@ -59,6 +59,7 @@ impl Role {
             | Question::Functions { .. }
             | Question::Orders { .. }
             | Question::Watch
+            | Question::Commands
             | Question::Stream { .. }
             | Question::Streams { .. }
             | Question::Counters { .. }

@@ -17,6 +17,7 @@ use rustix::net::{SendFlags, send};
 
 use super::answering::execute_for;
 use super::audit::{Audit, Entry, Who};
+use super::commands::Asked;
 use super::lines::{Line, Lines};
 use super::location::{Location, LocationError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
@@ -163,7 +164,7 @@ impl Shared {
     fn new(idle_limit: Duration, operators: Option<Operators>, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
         let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
         let (socket, stopped) = (Mutex::default(), Condvar::new());
-        let names = if audit.is_some() { names_of_users() } else { BTreeMap::new() };
+        let names = names_of_users();
         Ok(Arc::new(Self { waker, stopping, idle_limit, operators, audit, names, connections, socket, stopped }))
     }
 
@@ -406,7 +407,9 @@ impl Shared {
                     };
                     writer.borrow_mut().waits = !question.waits_for_no_reader();
                     let mut entry = self.audit.as_ref().and_then(|audit| Entry::of(audit, who, &question));
+                    let mut asked = Asked::of(system.engine().commands(), who, &question);
                     let mut sink = |answer| {
+                        asked.iter_mut().for_each(|asked| asked.note(&answer));
                         entry.iter_mut().for_each(|entry| entry.note(&answer));
                         writer.borrow_mut().sink(&answer)
                     };

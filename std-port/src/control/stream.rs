@@ -53,10 +53,11 @@ struct Report<T: Send + 'static> {
     subscription: Subscription<T>,
 }
 
-/// Values of all streams of all nodes.
+/// Values of all streams of all nodes, or of those with these `names`.
 pub(super) fn all<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     interval: Duration,
+    names: &[String],
     sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
@@ -65,7 +66,7 @@ pub(super) fn all<T: Send + 'static>(
     while !system.is_stopped() {
         if looked.is_none_or(|looked| looked.elapsed() >= JOINED) {
             looked = Some(Instant::now());
-            subscribe(system, interval, &mut reported);
+            subscribe(system, interval, names, &mut reported);
         }
         for Report { peer, definition, subscription } in reported.values_mut() {
             // One that the node does not grant has no values; it is told when it is granted.
@@ -85,13 +86,15 @@ pub(super) fn all<T: Send + 'static>(
 fn subscribe<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     interval: Duration,
+    names: &[String],
     reported: &mut HashMap<(Identity, String), Report<T>>,
 ) {
     for peer in select::nodes(system).into_iter().filter(Peer::is_connected) {
         let streams = peer.streams();
         let has = |name: &str| streams.iter().any(|stream| stream.definition().name() == name);
         reported.retain(|(identity, name), _| identity != peer.identity() || has(name));
-        for stream in &streams {
+        let is_wanted = |name: &str| names.is_empty() || names.iter().any(|wanted| wanted == name);
+        for stream in streams.iter().filter(|stream| is_wanted(stream.definition().name())) {
             let key = (peer.identity().clone(), stream.definition().name().to_owned());
             if !reported.contains_key(&key) && permit(system, &key.1, Verb::Call).is_ok() {
                 let (peer, definition) = (peer.clone(), stream.definition().clone());

@@ -54,7 +54,7 @@ pub struct Pending<T: Send + 'static> {
     made: Made,
     alarm: Alarm,
     mark: Option<Mark>,
-    /// For the audit log, which gets a line also if the call is dropped before it has ended.
+    /// For the audit log and those who follow, which get it also if the call is dropped before it has ended.
     recorded: Option<Recorded>,
 }
 
@@ -106,6 +106,9 @@ impl<T: Send + 'static> Pending<T> {
             return self.over(Err(Error::Cancelled.into()));
         }
         let (parameters, options) = (&*outgoing.parameters, outgoing.options);
+        if self.stage == Stage::Unsent {
+            self.recorded.iter_mut().for_each(|recorded| recorded.asks(parameters));
+        }
         let (polled, again) = match self.send(outgoing.callee, parameters, options, cx.waker(), PAUSE) {
             Err(error) => return self.over(Err(error)),
             Ok(again) => (if again.is_some() { Poll::Pending } else { self.poll_reply(outgoing, cx) }, again),
@@ -182,6 +185,9 @@ impl<T: Send + 'static> Pending<T> {
         loop {
             if let Some(ended) = engine.take_ended(&link, &mut state, id, outgoing.parameters) {
                 engine.settle(&link, state);
+                if ended.is_ok() {
+                    self.recorded.iter_mut().for_each(|recorded| recorded.answers(outgoing.parameters));
+                }
                 let is_given_up = self.given_up.is_some();
                 return self.over(ended.map_err(|error| of_given_up(is_given_up, error)));
             }
@@ -222,7 +228,7 @@ impl<T: Send + 'static> Pending<T> {
         self.stage = Stage::Over { was_sent: stage != Stage::Unsent };
         self.unmark();
         if let Some(recorded) = self.recorded.take() {
-            recorded.ended(ended.as_ref().map_or_else(|failed| Err(failed.error), |()| Ok(())));
+            recorded.ended(ended.as_ref().map(|()| None).map_err(|failed| failed.error));
         }
         let answered = match stage {
             Stage::Sent(id) => ended.map(|()| Answered { link: self.link.clone(), id }).inspect_err(|_| {

@@ -53,13 +53,14 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, CallError> {
-        let recorded = self.notes.recorded(link, callee.name(), options);
+        let mut recorded = self.notes.recorded(link, callee.name(), options);
+        recorded.iter_mut().for_each(|recorded| recorded.asks(parameters));
         let now = self.now();
         let mut state = link.lock();
         let result = self.request_on(now, link, &mut state, callee, parameters, options, false);
         self.settle_at(now, link, state);
         if let Some(recorded) = recorded {
-            recorded.ended(outline(&result));
+            recorded.ended(result.as_ref().map(|id| Some(id.0)).map_err(|error| error.error));
         }
         result
     }
@@ -70,15 +71,19 @@ impl<T: Send + 'static> Engine<T> {
         link: &Arc<LinkCell>,
         mut outgoing: Outgoing<'_, Canceller>,
     ) -> Result<CallId, CallError> {
-        let recorded = self.notes.recorded(link, outgoing.callee.name(), outgoing.options);
+        let mut recorded = self.notes.recorded(link, outgoing.callee.name(), outgoing.options);
+        recorded.iter_mut().for_each(|recorded| recorded.asks(outgoing.parameters));
         let result = self.services.state.waiting_for(link.id, || {
             self.services.go_on_with_parked();
             let started = self.begin_call(link, &outgoing)?;
             let id = started.id;
             self.await_reply(link, started, &mut outgoing).map(|()| id)
         });
-        if let Some(recorded) = recorded {
-            recorded.ended(outline(&result));
+        if let Some(mut recorded) = recorded {
+            if result.is_ok() {
+                recorded.answers(outgoing.parameters);
+            }
+            recorded.ended(result.as_ref().map(|_| None).map_err(|error| error.error));
         }
         result
     }
@@ -430,11 +435,6 @@ fn is_urgent(state: &LinkState, callee: &Callee<'_>, options: &RequestOptions) -
         let class = options.priority.unwrap_or(attributes.priority);
         class == Priority::Emergency || attributes.is_urgent(class)
     })
-}
-
-/// For the audit log.
-fn outline(result: &Result<CallId, CallError>) -> Result<(), Error> {
-    result.as_ref().map(drop).map_err(|error| error.error)
 }
 
 /// When a request that failed with this error may succeed: after `pause` if only the end of another call makes room.

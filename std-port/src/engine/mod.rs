@@ -220,11 +220,19 @@ impl<T: Send + 'static> Engine<T> {
             notes: Notes {
                 #[cfg(feature = "control")]
                 audit: parts.audit,
+                #[cfg(feature = "control")]
+                commands: Arc::default(),
             },
             events: Events::default(),
             unjoined: unjoined::Unjoined::default(),
             news: News::default(),
         })
+    }
+
+    /// Those that follow what operators and the program do.
+    #[cfg(feature = "control")]
+    pub(crate) fn commands(&self) -> &crate::control::Commands {
+        self.notes.commands()
     }
 
     pub(crate) fn is_stopping(&self) -> bool {

@@ -1,26 +1,40 @@
-//! What the audit log has of calls by the unit's own program: those that move, stop or reset something. An operator's are noted
-//! where they are asked for.
+//! What is recorded of calls by the unit's own program: the audit log has those that move, stop or reset something, and whoever
+//! follows commands gets all. An operator's are recorded where they are asked for.
 
 #[cfg(feature = "control")]
-pub(super) use crate::control::ProgramCall as Recorded;
+pub(super) use crate::control::Recorded;
 
 #[cfg(feature = "control")]
 use std::sync::Arc;
 
+#[cfg(feature = "control")]
+use cara_core::distribution::function::Definition;
+#[cfg(not(feature = "control"))]
+use cara_core::distribution::parameters::ParametersView;
+#[cfg(not(feature = "control"))]
+use cara_core::error::Error;
 use cara_core::services::session::RequestOptions;
 
 use super::link::LinkCell;
 #[cfg(feature = "control")]
-use crate::control::Audit;
+use crate::control::{Audit, Commands, FollowedCall, ProgramCall};
 
-/// Without operators there is no audit log.
+/// Without operators there is no audit log, and nobody follows.
 #[cfg(not(feature = "control"))]
 #[derive(Debug)]
 pub(super) enum Recorded {}
 
 #[cfg(not(feature = "control"))]
 impl Recorded {
-    pub(super) fn ended(self, _: Result<(), cara_core::error::Error>) {
+    pub(super) fn asks(&mut self, _: &ParametersView) {
+        match *self {}
+    }
+
+    pub(super) fn answers(&mut self, _: &ParametersView) {
+        match *self {}
+    }
+
+    pub(super) fn ended(self, _: Result<Option<u32>, Error>) {
         match self {}
     }
 }
@@ -29,16 +43,37 @@ impl Recorded {
 pub(super) struct Notes {
     #[cfg(feature = "control")]
     pub(super) audit: Option<Arc<Audit>>,
+    #[cfg(feature = "control")]
+    pub(super) commands: Arc<Commands>,
 }
 
 #[cfg(feature = "control")]
 impl Notes {
-    /// What is to be noted of a call that is about to be made.
+    /// What is to be recorded of a call that is about to be made.
     pub(super) fn recorded(&self, link: &LinkCell, function: &str, options: &RequestOptions) -> Option<Recorded> {
-        let audit = self.audit.as_ref().filter(|_| !options.operator)?;
-        let attributes = link.lock().session.their_function_list().named(function).map(|known| *known.attributes);
-        let node = || link.peer.get().map(|peer| peer.identity.to_string()).unwrap_or_default();
-        Recorded::of(audit, function, attributes, options.take_over, node)
+        let is_followed = self.commands.are_followed();
+        if options.operator || self.audit.is_none() && !is_followed {
+            return None;
+        }
+        let (attributes, definition) = {
+            let link = link.lock();
+            let known = link.session.their_function_list().named(function);
+            let definition = known.filter(|_| is_followed).map(|known| known.signature.to_string());
+            (known.map(|known| *known.attributes), definition)
+        };
+        let peer = link.peer.get();
+        let node = || peer.map(|peer| peer.identity.to_string()).unwrap_or_default();
+        let audited =
+            self.audit.as_ref().and_then(|audit| ProgramCall::of(audit, function, attributes, options.take_over, node));
+        let definition = definition.and_then(|text| Definition::parse(&text).ok());
+        let followed = peer
+            .zip(definition)
+            .map(|(peer, definition)| FollowedCall::of(&self.commands, &peer.identity, definition, options.take_over));
+        Recorded::of(audited, followed)
+    }
+
+    pub(super) fn commands(&self) -> &Commands {
+        &self.commands
     }
 
     /// Lines that nothing has written.

@@ -74,7 +74,7 @@ fn one_connection_gets_the_streams_of_all_nodes_also_of_later_ones() {
     let (stage, _agv, _pose) = stage();
     let mut client = Client::find_in(stage.control(), Some("manager/1")).unwrap();
     let closer = client.closer().unwrap();
-    let mut answers = client.ask(&Question::Streams { interval_ms: 0 }).unwrap();
+    let mut answers = client.ask(&Question::Streams { interval_ms: 0, names: Vec::new() }).unwrap();
     let mut next = || match answers.next() {
         Some(Ok(Answer::Value { node, stream, values, .. })) => Some((node, stream, values)),
         _ => None,

@@ -109,6 +109,7 @@ pub(crate) fn running(name: &str, id: u32) -> Running {
         mode: Some("secured".into()),
         keys: Some(KeysInfo { file: None, generations: vec![1] }),
         version: VERSIONS.last,
+        release: None,
         discovery_port: 21_971,
         tcp_port: 4000,
         epoch: "1".into(),

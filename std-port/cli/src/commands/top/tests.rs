@@ -96,6 +96,7 @@ fn unit() -> UnitInfo {
         mode: Some("secured".into()),
         keys: None,
         version: 1,
+        release: None,
         discovery_port: 21_971,
         tcp_port: 21_971,
         epoch: "1".into(),
