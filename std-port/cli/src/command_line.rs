@@ -33,6 +33,8 @@ pub(crate) enum Verb {
     Watch(commands::watch::Arguments),
     Top(commands::top::Arguments),
     Stream(commands::stream::Arguments),
+    Record(commands::record::Arguments),
+    Replay(commands::replay::Arguments),
     Counters(commands::counters::Arguments),
     Ping(commands::ping::Arguments),
     Web(cara_web::Arguments),
@@ -48,7 +50,10 @@ pub(crate) enum Verb {
 
 /// The verbs as the help groups them.
 const GROUPS: [(&str, &[&str]); 5] = [
-    ("See", &["scan", "functions", "orders", "watch", "top", "stream", "counters", "ping", "doctor"]),
+    (
+        "See",
+        &["scan", "functions", "orders", "watch", "top", "stream", "record", "replay", "counters", "ping", "doctor"],
+    ),
     ("Command", &["call", "stop", "reset", "publish", "set", "retire"]),
     ("Run", &["node", "web", "line"]),
     ("Set up", &["keys", "access", "provision", "forget-claim"]),

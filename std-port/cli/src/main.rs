@@ -10,6 +10,7 @@ mod commands;
 mod node;
 mod nodes;
 mod operator;
+mod recording;
 mod statistics;
 mod text;
 
@@ -29,7 +30,7 @@ fn main() -> ExitCode {
 }
 
 fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
-    if matches!(verb, Verb::Scan(_) | Verb::Watch(_) | Verb::Stream(_) | Verb::Doctor(_)) {
+    if matches!(verb, Verb::Scan(_) | Verb::Watch(_) | Verb::Stream(_) | Verb::Replay(_) | Verb::Doctor(_)) {
         interrupt::end_at_signals()?;
     }
     match verb {
@@ -45,6 +46,8 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),
         Verb::Top(arguments) => commands::top::run(arguments, global),
+        Verb::Record(arguments) => commands::record::run(arguments, global),
+        Verb::Replay(arguments) => commands::replay::run(arguments, global),
         Verb::Stream(arguments) => commands::stream::run(arguments, global),
         Verb::Counters(arguments) => commands::counters::run(arguments, global),
         Verb::Ping(arguments) => commands::ping::run(arguments, global),

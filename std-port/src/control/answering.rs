@@ -2,9 +2,8 @@
 
 use std::collections::HashSet;
 use std::ops::ControlFlow;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::RecvTimeoutError;
 use std::time::Instant;
 
 use cara_core::config::Constraints;
@@ -12,6 +11,7 @@ use cara_core::error::Error;
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
+use super::commands::Followed;
 use super::protocol::{Answer, CallQuestion, Failure, Question, unix_ms};
 use super::stop::{self, Which};
 use super::{call, constraint, describe, everybody, hold, select, stream};
@@ -137,10 +137,8 @@ fn attempt<T: Send + 'static>(
             let constraints = set(system, node.as_deref(), constraint, *value)?;
             send(sink, Answer::Constraints(describe::constraints(&constraints)))
         }
-        Question::Watch => watch(system, sink, wanted),
-        Question::Commands => {
-            follow(system, system.engine().commands().follow(EVENTS), sink, wanted, |command| command)
-        }
+        Question::Watch => watch(system, None, sink, wanted),
+        Question::Commands => watch(system, Some(system.engine().commands().follow(EVENTS)), sink, wanted),
         Question::Stream { node, name, interval_ms } => {
             stream::values(system, node, name.as_deref(), Duration::from_millis(*interval_ms), sink, wanted)
         }
@@ -301,22 +299,14 @@ fn set<T: Send + 'static>(
     Ok(peer.constraints())
 }
 
+/// Events as they come, and commands, where they are followed.
 fn watch<T: Send + 'static>(
     system: &CommunicationSystem<T>,
+    commands: Option<Followed>,
     sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
-    follow(system, system.events_with_losses(EVENTS), sink, wanted, |event| describe::event(&event, system.uptime()))
-}
-
-/// Sends what is received, and how much of it was lost, until the unit stops or the client has gone.
-fn follow<T: Send + 'static, R>(
-    system: &CommunicationSystem<T>,
-    (received, lost): (Receiver<R>, Arc<AtomicU64>),
-    sink: Sink<'_>,
-    wanted: &dyn Fn() -> bool,
-    answer: impl Fn(R) -> Answer,
-) -> Result<(), End> {
+    let (events, lost) = system.events_with_losses(EVENTS);
     let notify = |event: &str, text: String| Answer::Event {
         at_ms: system.uptime().as_millis(),
         unix_ms: unix_ms(),
@@ -326,8 +316,8 @@ fn follow<T: Send + 'static, R>(
     };
     send(sink, notify("watching", "events from here on".to_owned()))?;
     loop {
-        match received.recv_timeout(LOOK) {
-            Ok(found) => send(sink, answer(found))?,
+        match events.recv_timeout(LOOK) {
+            Ok(event) => send(sink, describe::event(&event, system.uptime()))?,
             Err(RecvTimeoutError::Timeout) if system.is_stopped() => return Ok(()),
             Err(RecvTimeoutError::Timeout) if !wanted() => return Err(End::Gone),
             Err(RecvTimeoutError::Timeout) => {}
@@ -336,6 +326,12 @@ fn follow<T: Send + 'static, R>(
         let missed = lost.swap(0, Ordering::Relaxed);
         if missed > 0 {
             send(sink, notify("lost", format!("{missed} events came faster than they were read")))?;
+        }
+        let Some((commands, lost)) = &commands else { continue };
+        commands.try_iter().try_for_each(|command| send(sink, command))?;
+        let missed = lost.swap(0, Ordering::Relaxed);
+        if missed > 0 {
+            send(sink, notify("lost", format!("{missed} commands came faster than they were read")))?;
         }
     }
 }

@@ -16,6 +16,9 @@ use super::values;
 use crate::Identity;
 use crate::locks::Rank;
 
+/// Commands as they come, and how many found no place.
+pub(super) type Followed = (Receiver<Answer>, Arc<AtomicU64>);
+
 /// The followers. Without any, a call costs one look at a flag.
 #[derive(Debug, Default)]
 pub(crate) struct Commands {
@@ -31,7 +34,7 @@ struct Follower {
 
 impl Commands {
     /// Reports what is asked and called from here on. What finds more than `capacity` waiting is counted and dropped.
-    pub(super) fn follow(&self, capacity: usize) -> (Receiver<Answer>, Arc<AtomicU64>) {
+    pub(super) fn follow(&self, capacity: usize) -> Followed {
         let (sender, receiver) = sync_channel(capacity);
         let lost = Arc::<AtomicU64>::default();
         let mut followers = Rank::Leaf.lock(&self.followers);

@@ -96,8 +96,8 @@ pub enum Question {
     /// An [`Answer::Event`] for each event, until the connection is closed. The first is `watching`, behind which nothing
     /// is missed; `lost` tells how many came faster than they were read.
     Watch,
-    /// An [`Answer::Command`] for each outcome of what operators ask that changes something, and of what the unit's program
-    /// calls, until the connection is closed. The first answer is the event `watching`, and `lost` is as of [`Watch`](Self::Watch).
+    /// As [`Watch`](Self::Watch), and an [`Answer::Command`] for each outcome of what operators ask that changes something, and of
+    /// what the unit's program calls.
     Commands,
     /// Values of a stream of a node as they come, until the connection is closed: an [`Answer::Value`] for each. Without a name
     /// the last value of each of its streams, or that there is none.

@@ -258,3 +258,38 @@ fn a_slow_watch_loses_events_and_is_told_how_many() {
         assert!(reported > 0 && reported <= lost());
     });
 }
+
+#[test]
+fn who_follows_commands_gets_arguments_and_outcomes_also_of_the_program() {
+    let (depot, agv) = Depot::with_agv();
+    let (mut following, mut other) = (depot.client(), depot.client());
+    let mut answers = following.ask(&Question::Commands).unwrap();
+    assert!(matches!(answers.next().unwrap().unwrap(), Answer::Event { event, .. } if event == "watching"));
+    let is_event = |answer: &Answer| matches!(answer, Answer::Event { .. });
+    let mut next = || answers.find_map(|answer| Some(answer.unwrap()).filter(|answer| !is_event(answer)));
+    let position = || vec![argument("position", 2, ArgumentValue::Int(vec![1, 2]))];
+    let question = Question::Call(call(Some("agv"), "go_to", position()));
+    let answered = ask(&mut other, question.clone()).unwrap();
+    ask(&mut other, Question::Unit).unwrap();
+    let Answer::Command { by, question: asked, outcome, .. } = next().unwrap() else { panic!("no command") };
+    assert_eq!((by.origin.as_str(), by.pid), ("operator", Some(std::process::id() as i32)));
+    assert_eq!((*asked, outcome.as_deref()), (question, answered.first()));
+
+    // The program's, which have the same form; one that looks only, as the operator's question before, is none.
+    let peer = depot.system.s_unit("agv").unwrap();
+    let mut arguments = Parameters::new();
+    arguments.add_int("position", 2).unwrap();
+    arguments.set_value("position", [1_i64, 2]).unwrap();
+    peer.block_request("go_to", &mut arguments).unwrap();
+    let Answer::Command { by, question, outcome, .. } = next().unwrap() else { panic!("no command") };
+    assert_eq!((by.origin.as_str(), by.pid), ("program", None));
+    let Question::Call(asked) = *question else { panic!("no call") };
+    assert_eq!((asked.node.as_deref(), asked.function.as_str(), asked.arguments), (Some("agv/7"), "go_to", position()));
+    assert!(matches!(outcome.as_deref(), Some(Answer::Called { error: None, took_us: 1.., .. })), "{outcome:?}");
+
+    assert!(peer.block_request("fail", &mut Parameters::new()).is_err());
+    let Answer::Command { outcome, .. } = next().unwrap() else { panic!("no command") };
+    let Some(Answer::Called { error: Some(failure), .. }) = outcome.as_deref() else { panic!("{outcome:?}") };
+    assert_eq!(failure.error, "Service");
+    agv.stop();
+}

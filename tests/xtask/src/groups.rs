@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 33] = [
+pub(crate) const GROUPS: [Group; 34] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -296,6 +296,15 @@ pub(crate) const GROUPS: [Group; 33] = [
         run: |_| instructions::check(),
     },
     Group {
+        name: "recordings",
+        what: "the MCAP tools of PyPI read what `cara record` writes, each message by its schema; asks PyPI",
+        budget: 120,
+        quick: None,
+        by_default: false,
+        waits: false,
+        run: |_| needing(install::program("python3", "python3"), recordings),
+    },
+    Group {
         name: "packages",
         what: "each crate to publish is packaged and builds, a program that has the packages alone runs, the oldest dependencies build; before a release",
         budget: 900,
@@ -467,6 +476,15 @@ fn web() -> Outcome {
         binaries::build(&["cara", "agv", "warehouse", "cara-web-clicks"])?;
         Run::new(&workspace::target().join("debug/cara-web-clicks").to_string_lossy()).stream()
     })
+}
+
+fn recordings() -> Result<()> {
+    let folder = workspace::target().join("recordings");
+    let of_folder = |program: &str| folder.join("bin").join(program);
+    Run::new("python3").args(["-m", "venv", &folder.to_string_lossy()]).stream()?;
+    Run::new(&of_folder("pip").to_string_lossy()).args(["install", "--quiet", "mcap", "jsonschema"]).stream()?;
+    let test = Run::cargo().args(["test", "-p", "cara-cli", "--test", "cara", "--", "--ignored", "tools_of_pypi"]);
+    test.env("CARA_TEST_PYTHON", &of_folder("python").to_string_lossy()).stream()
 }
 
 fn etcd() -> Result<()> {

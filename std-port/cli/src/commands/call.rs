@@ -183,7 +183,7 @@ pub(super) fn of_its_lease(failure: Failure, function: &str, ended_us: Option<u6
 }
 
 /// The results, of which those of size 1 are a value and no list of one.
-pub(super) fn values(results: &[Argument]) -> Vec<Value> {
+pub(crate) fn values(results: &[Argument]) -> Vec<Value> {
     let one = |value: Value| match value {
         Value::Array(list) if list.len() == 1 => list.into_iter().next().unwrap_or_default(),
         value => value,

@@ -10,6 +10,8 @@ pub(crate) mod man;
 pub(crate) mod orders;
 pub(crate) mod ping;
 pub(crate) mod publish;
+pub(crate) mod record;
+pub(crate) mod replay;
 pub(crate) mod retire;
 pub(crate) mod scan;
 pub(crate) mod set;

@@ -35,7 +35,7 @@ pub(crate) struct Arguments {
     count: Option<u64>,
 }
 
-fn rate(text: &str) -> Result<f64, String> {
+pub(super) fn rate(text: &str) -> Result<f64, String> {
     let rate = text.parse().ok().filter(|rate: &f64| rate.is_finite() && *rate > 0.0);
     rate.ok_or_else(|| "a number of values a second, above 0".to_owned())
 }

@@ -29,17 +29,22 @@ pub(crate) fn run(Arguments { span, count }: Arguments, global: &Global) -> anyh
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let mut left = count.unwrap_or(u64::MAX);
     operator.watch(&Question::Watch, span, |answer| {
-        let Answer::Event { at_ms, unix_ms, event, node, text } = answer else { return Ok(true) };
-        match global.json {
-            true => output::object(
-                &json!({ "at_ms": at_ms, "unix_ms": unix_ms, "event": event, "node": node, "text": text }),
-            )?,
-            false => show(unix_ms, &event, node.as_deref(), &text)?,
-        }
-        left -= u64::from(event != "watching");
+        left -= u64::from(!matches!(&answer, Answer::Event { event, .. } if event == "watching"));
+        print(answer, global)?;
         Ok(left > 0)
     })?;
     Ok(Exit::Done.into())
+}
+
+/// An event, in the form that is asked for.
+pub(super) fn print(event: Answer, global: &Global) -> std::io::Result<()> {
+    let Answer::Event { at_ms, unix_ms, event, node, text } = event else { return Ok(()) };
+    match global.json {
+        true => {
+            output::object(&json!({ "at_ms": at_ms, "unix_ms": unix_ms, "event": event, "node": node, "text": text }))
+        }
+        false => show(unix_ms, &event, node.as_deref(), &text),
+    }
 }
 
 fn show(unix_ms: u64, event: &str, node: Option<&str>, text: &str) -> std::io::Result<()> {

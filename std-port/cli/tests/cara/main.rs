@@ -12,6 +12,7 @@ mod hung;
 mod managers;
 mod measuring;
 mod places;
+mod recording;
 mod roles;
 mod scanning;
 mod screens;

@@ -7,9 +7,11 @@ use cara_std::{Definition, Duration, Parameters};
 use crate::support::{PATIENCE, Running, Stage};
 
 /// An AGV with `pose`, which has a value, and `battery`, which has none.
-fn stage() -> (Stage, cara_std::Unit, cara_std::Stream) {
-    let stage = Stage::with(&[]);
-    stage.know("agv-1", 11);
+pub(crate) fn stage() -> (Stage, cara_std::Unit, cara_std::Stream) {
+    let mut stage = Stage::empty();
+    // Before the manager starts, which looks at its keys every few seconds.
+    stage.know_all(&["agv-1/11", "late-1/12"]);
+    stage.start_manager();
     let agv = stage.vehicle("agv-1", 11).build().unwrap();
     let list = agv.my_function_list();
     let pose = list.add_stream(&Definition::stream("pose(x: int)").unwrap(), Duration::ZERO).unwrap();

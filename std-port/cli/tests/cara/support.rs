@@ -315,6 +315,10 @@ impl Running {
         rustix::process::kill_process(pid, signal).unwrap();
     }
 
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// SIGKILL, from which it learns nothing.
     pub(crate) fn kill(&mut self) {
         self.child.kill().unwrap();

@@ -4,8 +4,16 @@ use std::time::Duration;
 
 const SPANS: [(&str, f64); 7] =
     [("ns", 1e-3), ("us", 1.0), ("µs", 1.0), ("ms", 1e3), ("s", 1e6), ("min", 60e6), ("h", 3600e6)];
-const SIZES: [(&str, f64); 6] =
-    [("B", 1.0), ("kB", 1e3), ("KiB", 1024.0), ("MB", 1e6), ("MiB", 1024.0 * 1024.0), ("bytes", 1.0)];
+const SIZES: [(&str, f64); 8] = [
+    ("B", 1.0),
+    ("kB", 1e3),
+    ("KiB", 1024.0),
+    ("MB", 1e6),
+    ("MiB", 1024.0 * 1024.0),
+    ("GB", 1e9),
+    ("GiB", 1024.0 * 1024.0 * 1024.0),
+    ("bytes", 1.0),
+];
 
 /// A span of time in whole microseconds: `50ms`, `2s`, `1.5s`, `0`.
 pub fn parse_micros(text: &str) -> Result<u64, String> {

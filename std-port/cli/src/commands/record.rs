@@ -1,0 +1,246 @@
+//! `cara record`: what a manager reports, into a file.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::thread::{Builder, sleep};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use blake2::{Blake2s256, Digest};
+use cara_std::control::protocol::{Answer, NodeInfo, OrderInfo, Question, UnitInfo};
+use serde_json::json;
+
+use crate::operator::{Need, Operator, Way};
+use crate::recording::{Limits, Recorder};
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::interrupt::Asked;
+use cara_tools::output;
+use cara_tools::units::{parse_bytes, parse_time, show_bytes};
+
+/// Records what the manager reports into an MCAP file, which `cara replay`, Foxglove and other MCAP tools read: events, what
+/// operators and the manager's program ask for and what comes of it, orders, nodes, counters, and the streams that are named.
+/// Ctrl-C ends it.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The file. A recording that is there becomes FILE.1.
+    file: PathBuf,
+    /// Record the streams of this name, of all nodes; may be repeated.
+    #[arg(long, value_name = "NAME")]
+    stream: Vec<String>,
+    /// Record at most so many values of a stream a second; as many as the node grants, up to 50, if absent.
+    #[arg(long, value_name = "NUMBER", value_parser = super::stream::rate, requires = "stream")]
+    rate: Option<f64>,
+    /// How often counters and the state of links are recorded.
+    #[arg(long, value_name = "TIME", default_value = "10s", value_parser = parse_time)]
+    every: Duration,
+    /// Begin the next file after so many bytes; the one before becomes FILE.1.
+    #[arg(long, value_name = "SIZE", default_value = "256MiB", value_parser = size)]
+    max_size: u64,
+    /// Keep so many files besides the one that is written.
+    #[arg(long, value_name = "NUMBER", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..))]
+    keep: u16,
+    /// End after this time.
+    #[arg(long = "for", value_name = "TIME", value_parser = parse_time)]
+    span: Option<Duration>,
+}
+
+/// Between two looks at nodes and orders, and before the next try to reach the manager.
+const LOOK: Duration = Duration::from_secs(1);
+/// What is recorded can be read after this time, also if the process is killed.
+const CHUNK: Duration = Duration::from_secs(1);
+/// Between two looks at whether it is to end.
+const PAUSE: Duration = Duration::from_millis(20);
+/// Between two warnings about losses.
+const WARN: Duration = Duration::from_secs(10);
+/// How long a disk that takes nothing is waited for at the end.
+const LAST: Duration = Duration::from_secs(2);
+/// Every file begins with the state of everything.
+const LEAST: u64 = 64 * 1024;
+
+fn size(text: &str) -> Result<u64, String> {
+    let size = parse_bytes(text)?;
+    if size >= LEAST { Ok(size) } else { Err(format!("a file has at least {}", show_bytes(LEAST))) }
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let asked = Asked::catch()?;
+    let Arguments { file, stream, rate, every, max_size, keep, span } = arguments;
+    let mut operator = Operator::open(global, &Need::Nothing)?;
+    let unit = operator.unit()?;
+    let recorder = Recorder::start(&file, Limits { size: max_size, keep: keep.into() }, about(&unit))?;
+    let way = operator.way();
+    let mut questions = vec![Question::Commands];
+    if !stream.is_empty() {
+        let interval_ms = rate.map_or(0, |rate| (1000.0 / rate).ceil() as u64);
+        questions.push(Question::Streams { interval_ms, names: stream });
+    }
+    for question in questions {
+        let (way, recorder) = (way.clone(), recorder.clone());
+        Builder::new().name("follow".into()).spawn(move || follow(&way, &recorder, question))?;
+    }
+    let (from, to) = (way.clone(), recorder.clone());
+    Builder::new().name("look".into()).spawn(move || look(operator, &from, &to, every))?;
+    match global.json {
+        true => output::object(&json!({ "recording": file }))?,
+        false => output::line(format_args!(
+            "recording {}/{} (fleet {}) into {}",
+            unit.name,
+            unit.id,
+            unit.fleet,
+            file.display()
+        ))?,
+    }
+    await_end(&recorder, &asked, span);
+    way.end();
+    let outcome = recorder.end(LAST);
+    match global.json {
+        true => output::object(&json!({ "messages": outcome.messages, "lost": outcome.lost }))?,
+        false => output::line(format_args!("{} messages recorded, {} lost", outcome.messages, outcome.lost))?,
+    }
+    outcome.whole.map_err(|why| {
+        let why = why.unwrap_or_else(|| "the disk does not answer".to_owned());
+        let text = format!("the end of {} is missing ({why}); what was written before can be read", file.display());
+        Ended::failed("Failed", text)
+    })?;
+    Ok(Exit::Done.into())
+}
+
+fn await_end(recorder: &Recorder, asked: &Asked, span: Option<Duration>) {
+    let start = Instant::now();
+    let (mut flushed, mut warned, mut lost) = (start, None::<Instant>, 0);
+    while !asked.came() && span.is_none_or(|span| start.elapsed() < span) {
+        sleep(PAUSE);
+        if flushed.elapsed() >= CHUNK {
+            flushed = Instant::now();
+            recorder.flush();
+        }
+        if recorder.lost() > lost && warned.is_none_or(|warned| warned.elapsed() >= WARN) {
+            (lost, warned) = (recorder.lost(), Some(Instant::now()));
+            let why = recorder.held_up().map(|why| format!(": {why}")).unwrap_or_default();
+            output::warning(format_args!("{lost} messages are lost until now, which the disk did not take{why}"));
+        }
+    }
+}
+
+/// What is recorded about the recording. Nothing of it is secret.
+fn about(unit: &UnitInfo) -> BTreeMap<String, String> {
+    let UnitInfo { name, id, role, fleet, mode, version, discovery_port, constraints, .. } = unit;
+    let configuration = json!([name, id, role, fleet, mode, version, discovery_port, constraints]).to_string();
+    let hash: String = Blake2s256::digest(configuration).iter().map(|byte| format!("{byte:02x}")).collect();
+    let release = unit.release.clone().unwrap_or_default();
+    [
+        ("unit", format!("{name}/{id}")),
+        ("fleet", fleet.to_string()),
+        ("mode", mode.clone().unwrap_or_default()),
+        ("epoch", unit.epoch.clone()),
+        ("protocol_version", version.to_string()),
+        ("release", release),
+        ("recorded_by", format!("cara {}", env!("CARGO_PKG_VERSION"))),
+        ("configuration_hash", hash),
+    ]
+    .into_iter()
+    .map(|(key, value)| (key.to_owned(), value))
+    .collect()
+}
+
+/// Records the answers to a question that has no end, also after the manager was away.
+fn follow(way: &Way, recorder: &Recorder, mut question: Question) {
+    let is_streams = matches!(question, Question::Streams { .. });
+    let mut is_warned = false;
+    loop {
+        let mut is_followed = false;
+        let ended = way.open().and_then(|mut operator| {
+            operator.watch(&question, None, |answer| {
+                is_followed = true;
+                recorder.take(&answer);
+                Ok(true)
+            })
+        });
+        let is_older = |error: &anyhow::Error| {
+            error.downcast_ref::<Ended>().is_some_and(|ended| ended.name == "BadQuestion")
+                && question != Question::Watch
+        };
+        match ended {
+            Err(error) if is_older(&error) => {
+                let what = if is_streams { "streams by name" } else { "commands" };
+                output::warning(format_args!("the manager is older and does not report {what}: they are not recorded"));
+                if is_streams {
+                    return;
+                }
+                question = Question::Watch;
+                continue;
+            }
+            Err(error) if !is_followed && !is_warned => {
+                let what = if is_streams { "streams" } else { "events" };
+                output::warning(format_args!("{what} are not recorded at this moment: {error:#}"));
+            }
+            _ => {}
+        }
+        is_warned = !is_followed;
+        if is_followed && !is_streams {
+            let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis() as u64;
+            let (event, text) = ("not_watched".to_owned(), "what happens from here on is not seen".to_owned());
+            recorder.take(&Answer::Event { at_ms: 0, unix_ms, event, node: None, text });
+        }
+        sleep(LOOK);
+    }
+}
+
+/// Records what has changed of the unit, nodes and orders, again and again; counters and the state of links every so often.
+fn look(first: Operator, way: &Way, recorder: &Recorder, every: Duration) {
+    let (mut operator, mut file, mut sampled) = (Some(first), 0, None::<Instant>);
+    // By what they are about, without what changes with time alone.
+    let mut known = HashMap::<String, Answer>::new();
+    loop {
+        if recorder.file() != file {
+            file = recorder.file();
+            known.clear();
+        }
+        let is_due = sampled.is_none_or(|sampled| sampled.elapsed() >= every) || known.is_empty();
+        let opened = operator.take().map_or_else(|| way.open(), Ok);
+        let looked = opened.and_then(|mut operator| {
+            let mut questions = vec![Question::Nodes { offering: None }, Question::Orders { node: None }];
+            if is_due {
+                questions.extend([Question::Unit, Question::Counters { node: None }]);
+            }
+            for question in questions {
+                operator.ask(&question, |answer| {
+                    record_changed(recorder, &mut known, answer, is_due);
+                    Ok(())
+                })?;
+            }
+            Ok(operator)
+        });
+        if is_due {
+            sampled = Some(Instant::now());
+        }
+        operator = looked.ok();
+        if operator.is_none() {
+            known.clear();
+        }
+        sleep(LOOK.min(every));
+    }
+}
+
+fn record_changed(recorder: &Recorder, known: &mut HashMap<String, Answer>, answer: Answer, is_due: bool) {
+    let (key, lasting, is_sampled) = match &answer {
+        Answer::Node(node) => {
+            let lasting = NodeInfo { connected_ms: None, left_ms: None, searched_ms: None, link: None, ..node.clone() };
+            (format!("{}/{}@{}", node.name, node.id, node.role), Answer::Node(lasting), node.connected)
+        }
+        Answer::Order(order) => {
+            let lasting = OrderInfo { left_ms: None, age_ms: None, ..order.clone() };
+            (format!("{}/{} {}", order.node, order.id, order.function), Answer::Order(lasting), false)
+        }
+        Answer::Unit(unit) => {
+            (String::new(), Answer::Unit(UnitInfo { uptime_ms: 0, connected: 0, ..unit.clone() }), false)
+        }
+        Answer::Counters { .. } => return recorder.take(&answer),
+        _ => return,
+    };
+    if is_sampled && is_due || known.get(&key) != Some(&lasting) {
+        recorder.take(&answer);
+        known.insert(key, lasting);
+    }
+}

@@ -1,0 +1,203 @@
+//! The files of a recording: FILE is written, FILE.1 is the one before it, and so on.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{self, BufWriter, Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use cara_tools::exit::Ended;
+use mcap::records::MessageHeader;
+use mcap::write::{Metadata, NoSeek};
+use mcap::{McapResult, WriteOptions};
+
+use super::layout::{self, Message};
+use super::recorder::State;
+
+/// Before the disk is tried again.
+const RETRY: Duration = Duration::from_millis(100);
+/// Channels of a file: what comes beyond is lost.
+const MOST_CHANNELS: usize = 10_000;
+/// Bytes after which a chunk ends although its second has not passed.
+const CHUNK: u64 = 1 << 20;
+
+/// How much is kept.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Limits {
+    /// Bytes after which the next file begins.
+    pub(crate) size: u64,
+    /// Files besides the one that is written.
+    pub(crate) keep: usize,
+}
+
+/// The file that is written, and those before it.
+pub(super) struct Files {
+    path: PathBuf,
+    limits: Limits,
+    about: Metadata,
+    state: Arc<State>,
+    open: Option<Open>,
+}
+
+struct Open {
+    mcap: mcap::Writer<NoSeek<BufWriter<Patient>>>,
+    /// Each with its number and that of its last message, by topic and form.
+    channels: HashMap<(String, String), (u16, u32)>,
+}
+
+impl Files {
+    /// Puts a recording that is there aside. Anything else that is there is refused.
+    pub(super) fn open(
+        path: &Path,
+        limits: Limits,
+        about: BTreeMap<String, String>,
+        state: Arc<State>,
+    ) -> anyhow::Result<Self> {
+        let about = Metadata { name: "cara".to_owned(), metadata: about };
+        let mut files = Self { path: path.to_owned(), limits, about, state, open: None };
+        let failed = |error: io::Error| Ended::failed("Failed", format!("{}: {error}", path.display()));
+        if files.is_there()? {
+            shift(path, limits.keep).map_err(failed)?;
+        }
+        let file = create(path).map_err(failed)?;
+        files.begin(file).map_err(|error| failed(io::Error::other(error)))?;
+        Ok(files)
+    }
+
+    fn is_there(&self) -> anyhow::Result<bool> {
+        let (path, shown) = (&self.path, self.path.display());
+        let refused = |why: &str| Ended::usage(format!("{shown} {why}: name another file"));
+        let found = match fs::metadata(path) {
+            Ok(found) => found,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
+            Err(error) => return Err(Ended::failed("Failed", format!("{shown}: {error}"))),
+        };
+        if !found.is_file() {
+            return Err(refused("is no file"));
+        }
+        let mut file = File::open(path).map_err(|error| Ended::failed("Failed", format!("{shown}: {error}")))?;
+        if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
+            return Err(refused("is being recorded into by another process"));
+        }
+        let mut magic = [0; mcap::MAGIC.len()];
+        if found.len() > 0 && (file.read_exact(&mut magic).is_err() || magic != mcap::MAGIC) {
+            return Err(refused("is there, and is no recording"));
+        }
+        Ok(true)
+    }
+
+    fn begin(&mut self, file: File) -> McapResult<()> {
+        self.state.begins();
+        let to = NoSeek::new(BufWriter::new(Patient { file, state: self.state.clone() }));
+        let options = WriteOptions::new().compression(None).chunk_size(Some(CHUNK)).disable_seeking(true);
+        let mut mcap = options.profile("cara").library(super::LIBRARY).create(to)?;
+        mcap.write_metadata(&self.about)?;
+        mcap.flush()?;
+        self.open = Some(Open { mcap, channels: HashMap::new() });
+        Ok(())
+    }
+
+    /// Writes a message that came at that time into the chunk.
+    pub(super) fn write(&mut self, message: &Message, came: u64) -> McapResult<()> {
+        if self.open.is_none() || self.state.bytes() >= self.limits.size {
+            self.next()?;
+        }
+        let Some(open) = &mut self.open else { return Err(mcap::McapError::AttemptedWriteAfterFailure) };
+        open.write(message, came)
+    }
+
+    /// Ends the chunk: what was written until now can be read whatever happens.
+    pub(super) fn flush(&mut self) -> McapResult<()> {
+        self.open.as_mut().map_or(Ok(()), |open| open.mcap.flush())
+    }
+
+    /// Writes what a reader needs to find its way, which makes the file a whole one.
+    pub(super) fn finish(&mut self) -> McapResult<()> {
+        let Some(mut open) = self.open.take() else { return Ok(()) };
+        open.mcap.finish()?;
+        open.mcap.into_inner().into_inner().flush()?;
+        Ok(())
+    }
+
+    fn next(&mut self) -> McapResult<()> {
+        self.finish()?;
+        loop {
+            match shift(&self.path, self.limits.keep).and_then(|()| create(&self.path)) {
+                Ok(file) => return self.begin(file),
+                Err(error) => self.state.is_held_up(error, RETRY)?,
+            }
+        }
+    }
+}
+
+impl Open {
+    fn write(&mut self, message: &Message, came: u64) -> McapResult<()> {
+        let key = (message.topic.to_string(), message.form.clone());
+        if !self.channels.contains_key(&key) {
+            if self.channels.len() >= MOST_CHANNELS {
+                return Err(mcap::McapError::TooManyChannels);
+            }
+            let (name, schema) = layout::schema(message);
+            let schema = self.mcap.add_schema(&name, "jsonschema", schema.to_string().as_bytes())?;
+            let channel = self.mcap.add_channel(schema, &message.topic, "json", &BTreeMap::new())?;
+            self.channels.insert(key.clone(), (channel, 0));
+        }
+        let Some((channel_id, sequence)) = self.channels.get_mut(&key) else { return Ok(()) };
+        *sequence = sequence.wrapping_add(1);
+        let header = MessageHeader {
+            channel_id: *channel_id,
+            sequence: *sequence,
+            log_time: came,
+            publish_time: message.published,
+        };
+        self.mcap.write_to_known_channel(&header, message.body.to_string().as_bytes())
+    }
+}
+
+/// A new file that only its owner can read, and that this process alone records into.
+fn create(path: &Path) -> io::Result<File> {
+    let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
+    // A file system without locks has none of another process either.
+    let _ = file.try_lock();
+    Ok(file)
+}
+
+/// FILE becomes FILE.1, which becomes FILE.2, up to FILE.`keep`, which goes.
+fn shift(path: &Path, keep: usize) -> io::Result<()> {
+    let numbered = |number: usize| match number {
+        0 => path.to_owned(),
+        number => path.with_added_extension(number.to_string()),
+    };
+    let free = (0..keep).find(|number| !numbered(*number).exists()).unwrap_or(keep);
+    if free == keep && keep == 0 && path.exists() {
+        return fs::remove_file(path);
+    }
+    (0..free).rev().try_for_each(|number| fs::rename(numbered(number), numbered(number + 1)))
+}
+
+/// A file on a disk that may be full: whoever writes waits until it takes the bytes, or the recording is given up.
+struct Patient {
+    file: File,
+    state: Arc<State>,
+}
+
+impl Write for Patient {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        loop {
+            match self.file.write(bytes) {
+                Ok(count) => {
+                    self.state.wrote(count);
+                    return Ok(count);
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => self.state.is_held_up(error, RETRY)?,
+            }
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}

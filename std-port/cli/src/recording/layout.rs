@@ -1,0 +1,165 @@
+//! The messages of a recording: JSON objects, each channel with a JSON schema. They are the answers of the control socket as
+//! `cara_std::control::protocol` has them, without members that are null, but for streams and counters, whose values have names
+//! here, so that a program that plots them finds each by its path.
+
+use std::borrow::Cow;
+
+use cara_std::control::protocol::{Answer, Argument, UnitInfo};
+use serde_json::{Map, Value, json};
+
+use crate::commands::call::values as values_of;
+
+const EVENTS: &str = "/events";
+
+/// A message, and the channel that it belongs to.
+pub(super) struct Message {
+    pub(super) topic: Cow<'static, str>,
+    /// Of streams the signature: a node that comes back with another one gets another channel.
+    pub(super) form: String,
+    pub(super) body: Value,
+    /// Nanoseconds since 1970, when what is reported was so.
+    pub(super) published: u64,
+}
+
+/// What is recorded of an answer, which came at that time; `None` if nothing is.
+pub(super) fn message(answer: &Answer, came: u64) -> Option<Message> {
+    let from_ms = |unix_ms: u64| unix_ms.saturating_mul(1_000_000);
+    let (topic, published) = match answer {
+        Answer::Event { unix_ms, .. } => (EVENTS, from_ms(*unix_ms)),
+        Answer::Command { unix_ms, .. } => ("/commands", from_ms(*unix_ms)),
+        Answer::Node(_) => ("/nodes", came),
+        Answer::Order(_) => ("/orders", came),
+        Answer::Unit(unit) => return Some(of("/unit", came, json!(Answer::Unit(without_keys(unit))))),
+        Answer::Counters { node, counters } => {
+            let counted = counters.iter().filter(|(_, count)| *count > 0);
+            let counted: Map<String, Value> = counted.map(|(name, count)| (name.clone(), json!(count))).collect();
+            return Some(of("/counters", came, json!({ "node": node, "counters": counted })));
+        }
+        Answer::Value { node, stream, unix_ms, age_us, values, error } => {
+            let name = stream.split('(').next().unwrap_or_default();
+            let body = json!({
+                "node": node, "stream": stream, "unix_ms": unix_ms, "age_us": age_us, "values": named(values), "error": error,
+            });
+            let published = from_ms(*unix_ms).saturating_sub(age_us.unwrap_or(0).saturating_mul(1_000));
+            let (topic, form) = (Cow::Owned(format!("/streams/{node}/{name}")), stream.clone());
+            return Some(Message { topic, form, body: without_nulls(body), published });
+        }
+        _ => return None,
+    };
+    Some(of(topic, published, json!(answer)))
+}
+
+/// What the recording says of itself.
+pub(super) fn about_itself(body: Value, at: u64) -> Message {
+    of("/recording", at, body)
+}
+
+/// The event that a message of a recording holds.
+pub(crate) fn event_of(topic: &str, body: &[u8]) -> Option<Answer> {
+    if topic != EVENTS {
+        return None;
+    }
+    serde_json::from_slice(body).ok().filter(|answer| matches!(answer, Answer::Event { .. }))
+}
+
+fn of(topic: &'static str, published: u64, body: Value) -> Message {
+    Message { topic: topic.into(), form: String::new(), body: without_nulls(body), published }
+}
+
+/// Generations are no secret; where the file is concerns nobody who reads a recording elsewhere.
+fn without_keys(unit: &UnitInfo) -> UnitInfo {
+    let mut unit = unit.clone();
+    unit.keys.iter_mut().for_each(|keys| keys.file = None);
+    unit
+}
+
+fn named(values: &[Argument]) -> Map<String, Value> {
+    let read =
+        values_of(values).into_iter().map(|mut value| value.get_mut("value").map(Value::take).unwrap_or_default());
+    values.iter().map(|value| value.name.clone()).zip(read).collect()
+}
+
+fn without_nulls(value: Value) -> Value {
+    match value {
+        Value::Object(members) => {
+            let members = members.into_iter().filter(|(_, value)| !value.is_null());
+            members.map(|(name, value)| (name, without_nulls(value))).collect()
+        }
+        Value::Array(elements) => elements.into_iter().map(without_nulls).collect(),
+        value => value,
+    }
+}
+
+/// The name of a channel's schema, and the schema. Each member has one type, as Foxglove wants it; one that is null is left out.
+pub(super) fn schema(message: &Message) -> (String, Value) {
+    let (name, members) = match &*message.topic {
+        EVENTS => ("cara.Event", json!({ "at_ms": 0, "unix_ms": 0, "event": "", "node": "", "text": "" })),
+        "/commands" => ("cara.Command", command()),
+        "/nodes" => ("cara.Node", node()),
+        "/orders" => ("cara.Order", order()),
+        "/recording" => {
+            ("cara.Recording", json!({ "event": "", "messages": 0, "lost": 0, "lost_in_all": 0, "text": "" }))
+        }
+        "/unit" => ("cara.Unit", message.body.clone()),
+        "/counters" => ("cara.Counters", with(&message.body, "node", json!(""))),
+        topic => (topic, with(&message.body, "error", json!({ "error": "", "text": "" }))),
+    };
+    (name.to_owned(), schema_of(&members))
+}
+
+/// One of the samples that schemas are made of: what can come, each with a value of its type.
+fn command() -> Value {
+    let failure = json!({ "cause": "", "error": "", "kind": "", "code": 0, "text": "" });
+    let variable = json!({ "name": "", "size": 0, "type": "" });
+    json!({
+        "unix_ms": 0,
+        "by": { "origin": "", "uid": 0, "pid": 0, "program": "", "name": "", "role": "" },
+        "question": { "ask": "", "node": "", "function": "", "arguments": [variable] },
+        "outcome": { "answer": "", "node": "", "id": 0, "results": [variable], "took_us": 0, "error": failure, "expired": false },
+    })
+}
+
+fn node() -> Value {
+    json!({
+        "name": "", "id": 0, "role": "", "connected": true, "expected": true, "address": "", "version": 0, "epoch": "",
+        "connected_ms": 0, "left_ms": 0, "left_reason": "", "left_text": "", "searched_ms": 0, "searched_from": "",
+        "functions": 0,
+        "limits": { "message_size": 0, "chunk_size": 0, "calls": 0, "minimum_interval_us": 0 },
+        "link": {
+            "silent_ms": 0, "calls": 0, "calls_here": 0, "queued_bytes": 0, "stream_ms": 0, "datagrams": "", "segment": 0,
+        },
+    })
+}
+
+fn order() -> Value {
+    json!({
+        "node": "", "id": 0, "function": "", "order": "", "holder": 0, "trace": "", "claim": [0], "left_ms": 0, "age_ms": 0,
+        "inhibited": { "by": 0, "reason": 0 },
+    })
+}
+
+fn with(sample: &Value, name: &str, value: Value) -> Value {
+    let mut sample = sample.clone();
+    if let Value::Object(members) = &mut sample {
+        members.entry(name).or_insert(value);
+    }
+    sample
+}
+
+/// The schema that a sample follows.
+fn schema_of(sample: &Value) -> Value {
+    match sample {
+        Value::Object(members) => {
+            let members: Map<String, Value> =
+                members.iter().map(|(name, value)| (name.clone(), schema_of(value))).collect();
+            json!({ "type": "object", "properties": members })
+        }
+        Value::Array(elements) => {
+            json!({ "type": "array", "items": elements.first().map_or_else(|| json!({ "type": "object" }), schema_of) })
+        }
+        Value::String(_) => json!({ "type": "string" }),
+        Value::Bool(_) => json!({ "type": "boolean" }),
+        Value::Number(number) if number.is_f64() => json!({ "type": "number" }),
+        Value::Number(_) | Value::Null => json!({ "type": "integer" }),
+    }
+}

@@ -1,0 +1,210 @@
+//! The recorder: whoever reports something puts it into a bounded queue and goes on; a thread writes it.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use cara_std::LineQueue;
+use cara_std::control::protocol::Answer;
+use mcap::McapResult;
+use serde_json::json;
+
+use super::file::{Files, Limits};
+use super::layout;
+
+/// Longest message; a longer one is lost. With the 1024 lines of the queue this bounds its memory to 256 MiB.
+const LONGEST: usize = 256 * 1024;
+/// Lines of the queue that are no messages: the chunk ends, the recording ends.
+const FLUSH: &[u8] = b"";
+const END: &[u8] = b"end";
+/// Bytes of the time before each message.
+const TIME: usize = size_of::<u64>();
+
+/// Writes a recording. Its clones write the same one.
+#[derive(Clone)]
+pub(crate) struct Recorder {
+    queue: LineQueue,
+    state: Arc<State>,
+}
+
+/// What has come of a recording.
+pub(crate) struct Outcome {
+    pub(crate) messages: u64,
+    pub(crate) lost: u64,
+    /// The last file is whole; otherwise what the disk said, if it said something.
+    pub(crate) whole: Result<(), Option<String>>,
+}
+
+impl Recorder {
+    /// Begins a file with `about` as its metadata.
+    pub(crate) fn start(path: &Path, limits: Limits, about: BTreeMap<String, String>) -> anyhow::Result<Self> {
+        let state = Arc::<State>::default();
+        let files = Files::open(path, limits, about, state.clone())?;
+        let mut writer = Writer { files, state: state.clone(), lost: 0, unflushed: 0 };
+        Ok(Self { queue: LineQueue::new("recorder", move |line, lost| writer.take(line, lost))?, state })
+    }
+
+    /// Records an answer. Never waits: what finds no place is counted.
+    pub(crate) fn take(&self, answer: &Answer) {
+        let mut line = now().to_le_bytes().to_vec();
+        match serde_json::to_writer(&mut line, answer) {
+            Ok(()) if line.len() <= LONGEST => self.queue.write(&line),
+            _ => drop(self.state.too_long.fetch_add(1, Ordering::Relaxed)),
+        }
+    }
+
+    /// Ends the chunk; to be called every second.
+    pub(crate) fn flush(&self) {
+        // A full queue is a disk that takes nothing now, and is flushed when it does.
+        if self.state.held_up().is_none() {
+            self.queue.write(FLUSH);
+        }
+    }
+
+    /// Messages that the disk did not take, or not in time.
+    pub(crate) fn lost(&self) -> u64 {
+        self.queue.lost() + self.state.too_long.load(Ordering::Relaxed) + self.state.unwritten.load(Ordering::Relaxed)
+    }
+
+    /// Why nothing is written at this moment, as far as the system says.
+    pub(crate) fn held_up(&self) -> Option<String> {
+        self.state.held_up()
+    }
+
+    /// Which file of the recording is written: each has to begin with the state of everything.
+    pub(crate) fn file(&self) -> u64 {
+        self.state.file.load(Ordering::Relaxed)
+    }
+
+    /// Ends the recording. A disk that takes nothing is waited for twice for so long, and then given up.
+    pub(crate) fn end(self, at_most: Duration) -> Outcome {
+        let in_time = self.queue.flush(at_most) && {
+            self.queue.write(END);
+            self.queue.flush(at_most)
+        };
+        if !in_time {
+            self.state.given_up.store(true, Ordering::Relaxed);
+            // What waits is counted as lost.
+            self.queue.flush(at_most);
+        }
+        let is_whole = self.state.is_whole.load(Ordering::Relaxed);
+        let whole = if is_whole { Ok(()) } else { Err(self.state.held_up()) };
+        Outcome { messages: self.state.messages.load(Ordering::Relaxed), lost: self.lost(), whole }
+    }
+}
+
+/// What the recorder and its thread share.
+#[derive(Default)]
+pub(super) struct State {
+    file: AtomicU64,
+    /// Of that file.
+    bytes: AtomicU64,
+    messages: AtomicU64,
+    too_long: AtomicU64,
+    /// Messages of a chunk that the disk did not take.
+    unwritten: AtomicU64,
+    held_up: Mutex<Option<String>>,
+    given_up: AtomicBool,
+    is_whole: AtomicBool,
+}
+
+impl State {
+    pub(super) fn begins(&self) {
+        self.bytes.store(0, Ordering::Relaxed);
+        self.file.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(super) fn bytes(&self) -> u64 {
+        self.bytes.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn wrote(&self, count: usize) {
+        self.bytes.fetch_add(count as u64, Ordering::Relaxed);
+        *self.held_up.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
+    /// The system refuses to write: waits before the next try. An error once the recording is given up.
+    pub(super) fn is_held_up(&self, error: io::Error, pause: Duration) -> io::Result<()> {
+        *self.held_up.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
+        if self.given_up.load(Ordering::Relaxed) {
+            return Err(error);
+        }
+        std::thread::sleep(pause);
+        Ok(())
+    }
+
+    fn held_up(&self) -> Option<String> {
+        self.held_up.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+/// The thread's side.
+struct Writer {
+    files: Files,
+    state: Arc<State>,
+    /// Losses that the recording has.
+    lost: u64,
+    /// Messages since the last chunk ended.
+    unflushed: u64,
+}
+
+impl Writer {
+    /// An error counts the line as lost.
+    fn take(&mut self, line: &[u8], lost: u64) -> io::Result<()> {
+        let lost = lost + self.state.too_long.load(Ordering::Relaxed);
+        match line {
+            FLUSH => self.flush(),
+            END => self.end(lost),
+            line => self.write(line, lost),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        // Its messages are counted one by one, and not the line that ends them.
+        match self.files.flush() {
+            Ok(()) => self.unflushed = 0,
+            Err(_) => drop(self.state.unwritten.fetch_add(std::mem::take(&mut self.unflushed), Ordering::Relaxed)),
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, lost: u64) -> io::Result<()> {
+        let messages = self.state.messages.load(Ordering::Relaxed);
+        let body = json!({ "event": "ended", "messages": messages, "lost_in_all": lost });
+        let ended = self.note_losses(lost).and_then(|()| self.files.write(&layout::about_itself(body, now()), now()));
+        self.flush()?;
+        if ended.and_then(|()| self.files.finish()).is_ok() {
+            self.state.is_whole.store(true, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+
+    fn write(&mut self, line: &[u8], lost: u64) -> io::Result<()> {
+        let (came, body) = line.split_first_chunk::<TIME>().ok_or(io::ErrorKind::InvalidData)?;
+        let came = u64::from_le_bytes(*came);
+        let Some(message) = layout::message(&serde_json::from_slice(body)?, came) else { return Ok(()) };
+        self.note_losses(lost).and_then(|()| self.files.write(&message, came)).map_err(io::Error::other)?;
+        self.state.messages.fetch_add(1, Ordering::Relaxed);
+        self.unflushed += 1;
+        Ok(())
+    }
+
+    /// Writes down how many messages are missing here.
+    fn note_losses(&mut self, lost: u64) -> McapResult<()> {
+        if lost <= self.lost {
+            return Ok(());
+        }
+        let text = format!("{} messages came faster than the disk took them", lost - self.lost);
+        let body = json!({ "event": "lost", "lost": lost - self.lost, "lost_in_all": lost, "text": text });
+        self.lost = lost;
+        self.files.write(&layout::about_itself(body, now()), now())
+    }
+}
+
+/// Nanoseconds since 1970.
+fn now() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
+}

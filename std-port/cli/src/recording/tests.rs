@@ -1,0 +1,204 @@
+//! Recordings written here, read back by the crate `mcap` and by [`Reading`].
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use cara_std::control::protocol::{Answer, Argument, ArgumentValue, KeysInfo, Number};
+use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader};
+use serde_json::Value;
+
+use super::reading::End;
+use super::{Limits, Reading, Recorder, event_of};
+
+const LONG: Duration = Duration::from_secs(20);
+const ALL: Limits = Limits { size: u64::MAX, keep: 2 };
+
+fn start(path: &Path, limits: Limits) -> Recorder {
+    Recorder::start(path, limits, BTreeMap::from([("unit".to_owned(), "depot/1".to_owned())])).unwrap()
+}
+
+fn event(text: &str) -> Answer {
+    Answer::Event { at_ms: 1, unix_ms: 2, event: "left".into(), node: None, text: text.into() }
+}
+
+fn pose(stream: &str, x: ArgumentValue) -> Answer {
+    let values = vec![
+        Argument { name: "x".into(), size: 1, value: x },
+        Argument { name: "route".into(), size: 2, value: ArgumentValue::Int(vec![1, 2]) },
+    ];
+    let (node, stream) = ("agv/7".to_owned(), stream.to_owned());
+    Answer::Value { node, stream, unix_ms: 2_000, age_us: Some(500_000), values, error: None }
+}
+
+fn whole(recorder: Recorder) -> u64 {
+    let outcome = recorder.end(LONG);
+    assert_eq!((outcome.whole, outcome.lost), (Ok(()), 0));
+    outcome.messages
+}
+
+/// The texts of a file's events, and how it ends.
+fn texts(file: &[u8]) -> (Vec<String>, End) {
+    let mut reading = Reading::of(file);
+    let events = reading.by_ref().filter_map(|message| match event_of(&message.topic, &message.body)? {
+        Answer::Event { text, .. } => Some(text),
+        _ => None,
+    });
+    (events.collect(), reading.end().unwrap().clone())
+}
+
+#[test]
+fn the_summary_and_the_index_lead_to_every_message() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    recorder.take(&event("one"));
+    recorder.flush();
+    for x in [0.5, 1.0] {
+        recorder.take(&pose("pose() -> (x: float)", ArgumentValue::Float(vec![Number::Finite(x)])));
+    }
+    recorder.take(&pose("pose() -> (x: bool)", ArgumentValue::Bool(vec![true])));
+    assert_eq!(whole(recorder), 4);
+
+    let file = fs::read(&path).unwrap();
+    let summary = mcap::Summary::read(&file).unwrap().unwrap();
+    let counted = summary.stats.as_ref().unwrap();
+    assert_eq!((counted.message_count, counted.chunk_count, counted.metadata_count), (5, 2, 1));
+    let mut found: Vec<(String, String, Value, u64)> = Vec::new();
+    let mut indexed = IndexedReader::new(&summary).unwrap();
+    while let Some(next) = indexed.next_event() {
+        match next.unwrap() {
+            IndexedReadEvent::ReadChunkRequest { offset, length } => {
+                indexed.insert_chunk_record_data(offset, &file[offset as usize..][..length]).unwrap();
+            }
+            IndexedReadEvent::Message { header, data } => {
+                let channel = &summary.channels[&header.channel_id];
+                let schema = channel.schema.as_ref().unwrap();
+                assert_eq!((channel.message_encoding.as_str(), schema.encoding.as_str()), ("json", "jsonschema"));
+                let schema: Value = serde_json::from_slice(&schema.data).unwrap();
+                assert_eq!(schema["type"], "object", "{schema}");
+                let kind = schema["properties"]["values"]["properties"]["x"]["type"].to_string();
+                found.push((channel.topic.clone(), kind, serde_json::from_slice(data).unwrap(), header.publish_time));
+            }
+        }
+    }
+    let topics: Vec<_> = found.iter().map(|(topic, ..)| topic.as_str()).collect();
+    let pose = "/streams/agv/7/pose";
+    assert_eq!(topics, ["/events", pose, pose, pose, "/recording"]);
+    assert_eq!((&found[0].2["text"], found[0].2.get("node")), (&"one".into(), None), "no member is null");
+    let (_, kind, body, published) = &found[1];
+    assert_eq!((kind.as_str(), *published), ("\"number\"", 1_500_000_000));
+    assert_eq!(body["values"], serde_json::json!({ "x": 0.5, "route": [1, 2] }));
+    assert_eq!(found[4].2, serde_json::json!({ "event": "ended", "messages": 4, "lost_in_all": 0 }));
+    assert_eq!(summary.channels.len(), 4, "another signature is another channel");
+}
+
+#[test]
+fn a_file_that_is_long_enough_is_put_aside_and_the_oldest_goes() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, Limits { size: 4096, keep: 2 });
+    let mut all = 0;
+    while recorder.file() < 5 {
+        recorder.take(&event(&all.to_string()));
+        recorder.flush();
+        all += 1;
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    assert_eq!(whole(recorder), all);
+    let mut names: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    names.sort();
+    assert_eq!(names, ["a.mcap", "a.mcap.1", "a.mcap.2"]);
+    let mut read = Vec::new();
+    for name in ["a.mcap.2", "a.mcap.1", "a.mcap"] {
+        let file = fs::read(folder.path().join(name)).unwrap();
+        assert!(mcap::Summary::read(&file).unwrap().is_some(), "{name} is whole");
+        let (texts, end) = texts(&file);
+        assert_eq!(end, End::Whole);
+        read.extend(texts.iter().map(|text| text.parse::<u64>().unwrap()));
+    }
+    assert!(read.len() > 3 && read.iter().copied().eq(read[0]..all), "no message is missing between files: {read:?}");
+}
+
+#[test]
+fn a_recording_that_is_there_is_kept_and_nothing_else_is_touched() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    let refused = |path: &Path| Recorder::start(path, ALL, BTreeMap::new()).err().unwrap().to_string();
+    assert!(refused(&path).contains("another process"), "it is being written");
+    assert_eq!(whole(recorder), 0);
+    let first = fs::read(&path).unwrap();
+    whole(start(&path, ALL));
+    assert_eq!(fs::read(folder.path().join("a.mcap.1")).unwrap(), first);
+    let other = folder.path().join("notes.txt");
+    fs::write(&other, "mine").unwrap();
+    assert!(refused(&other).contains("no recording") && refused(folder.path()).contains("no file"));
+    assert_eq!(fs::read(&other).unwrap(), b"mine");
+}
+
+#[test]
+fn what_ends_anywhere_is_read_up_to_there_and_no_damage_panics() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    for text in ["one", "two"] {
+        recorder.take(&event(text));
+        recorder.flush();
+    }
+    whole(recorder);
+    let file = fs::read(&path).unwrap();
+    let (all, end) = texts(&file);
+    assert_eq!((all, end), (vec!["one".to_owned(), "two".to_owned()], End::Whole));
+    /// The magic, and the header, the first record of every file.
+    const BEGIN: usize = mcap::MAGIC.len() + 9 + 4 + "cara".len() + 4 + super::LIBRARY.len();
+    let mut most = 0;
+    for length in 0..file.len() {
+        let (read, end) = texts(&file[..length]);
+        assert!(read.len() >= most, "more of the file brings no less");
+        // Behind the messages stands what leads to them, which nothing here needs.
+        assert_eq!(matches!(end, End::Damaged(_)), length < BEGIN, "{length}: {end:?}");
+        most = read.len();
+    }
+    assert_eq!(most, 2);
+    assert_eq!(texts(&file[..BEGIN]).1, End::CutOff);
+    let mut damaged = file.clone();
+    for index in 0..file.len() {
+        damaged[index] ^= 0xff;
+        texts(&damaged);
+        damaged[index] ^= 0xff;
+    }
+    assert!(matches!(texts(b"a text").1, End::Damaged(_)));
+}
+
+#[test]
+fn a_message_that_is_too_long_is_counted_and_the_recording_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    recorder.take(&event(&"x".repeat(300_000)));
+    recorder.take(&event("short"));
+    let outcome = recorder.end(LONG);
+    assert_eq!((outcome.whole, outcome.messages, outcome.lost), (Ok(()), 1, 1));
+    let lost = Reading::open(&path).unwrap().find(|message| message.topic == "/recording").unwrap();
+    let lost: Value = serde_json::from_slice(&lost.body).unwrap();
+    assert_eq!((&lost["event"], &lost["lost"]), (&"lost".into(), &1.into()));
+}
+
+#[test]
+fn where_the_keys_are_is_not_recorded() {
+    let unit = serde_json::json!({
+        "answer": "unit", "name": "depot", "id": 1, "role": "m_unit", "fleet": 0, "version": 2, "discovery_port": 1, "tcp_port": 1,
+        "epoch": "1", "uptime_ms": 1, "interfaces": [], "connected": 0, "keys": { "file": "/etc/cara/secret.keys", "generations": [1] },
+        "constraints": {
+            "request_timeout_us": 1, "minimum_interval_us": 1, "maximum_nodes": 1, "message_size": 1, "chunk_size": 1,
+            "keep_alive_us": 1, "calls_per_peer": 1,
+        },
+    });
+    let unit: Answer = serde_json::from_value(unit).unwrap();
+    let Answer::Unit(info) = &unit else { panic!("{unit:?}") };
+    assert!(matches!(&info.keys, Some(KeysInfo { file: Some(_), .. })));
+    let message = super::layout::message(&unit, 7).unwrap();
+    assert_eq!(message.body["keys"], serde_json::json!({ "generations": [1] }));
+}

@@ -1,0 +1,132 @@
+//! `cara record` and `cara replay`.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::path::Path;
+use std::process::Command;
+
+use rustix::process::{Pid, Resource, Rlimit, prlimit};
+use serde_json::Value;
+
+use crate::support::{Running, Stage, until};
+
+/// The channels of a file that is written at this moment.
+fn topics(file: &Path) -> BTreeSet<String> {
+    let Ok(file) = File::open(file) else { return BTreeSet::new() };
+    let messages = mcap::io::MessageReader::new(file).map_while(Result::ok);
+    messages.map(|message| message.channel.topic.clone()).collect()
+}
+
+/// How many messages a recording says to be lost.
+fn losses(file: &Path) -> u64 {
+    let messages = mcap::io::MessageReader::new(File::open(file).unwrap()).map_while(Result::ok);
+    let own = messages.filter(|message| message.channel.topic == "/recording");
+    own.filter_map(|message| serde_json::from_slice::<Value>(&message.data).ok()?["lost"].as_u64()).sum()
+}
+
+/// Records until something of every kind can be read. One recording is ended, and one is killed.
+fn record(stage: &mut Stage, file: &Path, killed: &Path) {
+    let record = |file: &Path| {
+        let more = ["record", file.to_str().unwrap(), "--stream", "pose", "--every", "20ms"];
+        let mut recording = Running::start(stage.command(&more));
+        recording.expect("recording manager/1");
+        recording
+    };
+    let (mut recording, mut to_kill) = (record(file), record(killed));
+    let of_look = |topics: &BTreeSet<String>| topics.contains("/nodes") && topics.contains("/events");
+    until("both watch", || of_look(&topics(file)) && of_look(&topics(killed)));
+    stage.ends(0, &["set", ".", "request_timeout", "19s"]);
+    stage.start_agv("late-1", 12);
+    let all = ["/commands", "/counters", "/events", "/nodes", "/streams/agv-1/11/pose", "/unit"];
+    let all: BTreeSet<_> = all.map(str::to_owned).into();
+    let has_all = |file: &Path| {
+        topics(file) == all
+            && stage.cara(&["replay", file.to_str().unwrap()]).out.contains("joined            late-1/12")
+    };
+    until("all is written down", || has_all(file) && has_all(killed));
+    to_kill.kill();
+    recording.interrupt();
+    recording.expect("messages recorded, 0 lost");
+    assert_eq!(recording.end(), 0);
+}
+
+#[test]
+fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_file_to_read() {
+    let (mut stage, agv, _pose) = crate::streaming::stage();
+    let folder = tempfile::tempdir().unwrap();
+    let (file, killed) = (folder.path().join("a.mcap"), folder.path().join("killed.mcap"));
+    record(&mut stage, &file, &killed);
+    let whole = stage.ends(0, &["replay", file.to_str().unwrap(), "--json"]);
+    let lines = whole.lines();
+    let joined: Vec<_> = lines.iter().filter(|event| event["event"] == "joined").collect();
+    assert!(joined.len() == 1 && joined[0]["node"] == "late-1/12" && joined[0]["unix_ms"].is_u64(), "{}", whole.out);
+    assert!(whole.err.is_empty() && lines[0]["event"] == "watching", "{}", whole.everything());
+    stage
+        .ends(0, &["replay", killed.to_str().unwrap()])
+        .says("Z  joined            late-1/12")
+        .says("was cut off here");
+    stage.ends(2, &["record", killed.to_str().unwrap(), "--max-size", "1kB"]);
+    stage.ends(1, &["replay", folder.path().join("none").to_str().unwrap()]);
+    agv.stop();
+}
+
+/// A limit of the system for the size of files stands for a disk that is full, and later has space again.
+#[test]
+fn a_full_disk_costs_messages_that_are_counted_and_the_recording_goes_on() {
+    let stage = Stage::with(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a.mcap");
+    let inner = stage.command(&["record", file.to_str().unwrap(), "--every", "1ms"]);
+    let mut command = Command::new("sh");
+    // A process that does not ignore the signal ends with it.
+    command
+        .args(["-c", "trap '' XFSZ; ulimit -S -f 32; exec \"$0\" \"$@\" 2>&1"])
+        .arg(inner.get_program())
+        .args(inner.get_args());
+    inner.get_envs().for_each(|(name, value)| {
+        value.map(|value| command.env(name, value));
+    });
+    let mut recording = Running::start(command);
+    recording.expect("recording manager/1");
+    let size = || std::fs::metadata(&file).unwrap().len();
+    until("the disk is full", || size() >= 16 * 1024);
+    let full = size();
+    recording.expect("messages are lost until now");
+    assert_eq!(size(), full);
+    let pid = Pid::from_raw(recording.id() as i32).unwrap();
+    let limit = Rlimit { current: Some(1 << 30), maximum: None };
+    prlimit(Some(pid), Resource::Fsize, limit).unwrap();
+    until("the losses are written down", || losses(&file) > 0);
+    recording.interrupt();
+    let line = recording.expect("messages recorded");
+    let said: u64 = line.split(' ').nth(3).unwrap().parse().unwrap();
+    assert_eq!((recording.end(), losses(&file)), (0, said), "{line}");
+    assert!(mcap::Summary::read(&std::fs::read(&file).unwrap()).unwrap().is_some(), "the file is whole");
+}
+
+/// With Python's `mcap` and `jsonschema`: `cargo xtask test recordings` installs them.
+#[test]
+#[ignore = "needs packages of PyPI"]
+fn tools_of_pypi_read_a_recording() {
+    let python =
+        std::env::var_os("CARA_TEST_PYTHON").expect("CARA_TEST_PYTHON names a python with mcap and jsonschema");
+    let (mut stage, agv, _pose) = crate::streaming::stage();
+    let folder = tempfile::tempdir().unwrap();
+    let (file, killed) = (folder.path().join("a.mcap"), folder.path().join("killed.mcap"));
+    record(&mut stage, &file, &killed);
+    let read = |file: &Path| {
+        let ran = Command::new(&python).arg("tests/recording.py").arg(file).output().unwrap();
+        assert!(ran.status.success(), "{}", String::from_utf8_lossy(&ran.stderr));
+        serde_json::from_slice::<Value>(&ran.stdout).unwrap()
+    };
+    let (whole, cut) = (read(&file), read(&killed));
+    assert!(whole["summary"].as_bool().unwrap() && !cut["summary"].as_bool().unwrap(), "{whole} {cut}");
+    for topic in ["/commands", "/counters", "/events", "/nodes", "/streams/agv-1/11/pose", "/unit"] {
+        assert!(
+            whole["topics"][topic].as_u64() > Some(0) && cut["topics"][topic].as_u64() > Some(0),
+            "{topic}: {whole} {cut}"
+        );
+    }
+    assert_eq!((&whole["metadata"]["unit"], &cut["metadata"]["unit"]), (&"manager/1".into(), &"manager/1".into()));
+    agv.stop();
+}
