@@ -63,7 +63,7 @@ pub(crate) struct Call {
 /// The results of a function.
 pub(crate) enum Results {
     /// A type that has the names, such as `()`.
-    Struct(Type),
+    Struct(Box<Type>),
     /// One result or, as a tuple, several, with names in `#[returns(…)]`.
     Named(Vec<Variable>),
 }
@@ -234,7 +234,7 @@ impl Function {
             Input::Call(_) | Input::Variable(..) => None,
         });
         let results = match &self.results {
-            Results::Struct(rust) => Some(rust.clone()),
+            Results::Struct(rust) => Some((**rust).clone()),
             Results::Named(_) => None,
         };
         let reported = self.reported().map(|(progress, fails)| [progress, fails]);
@@ -391,7 +391,7 @@ fn read_results(output: &ReturnType, returns: Option<Punctuated<Named, Token![,]
             Type::Reference(reference) => {
                 Err(Error::new_spanned(reference, "a result is owned: it outlives the call that made it"))
             }
-            _ => Ok((Results::Struct(rust), can_fail)),
+            _ => Ok((Results::Struct(Box::new(rust)), can_fail)),
         };
     };
     let types: Vec<Type> = match (&rust, names.len()) {

@@ -170,7 +170,7 @@ fn arguments(function: &Function, root: &TokenStream) -> (Vec<TokenStream>, Vec<
 fn write_results(function: &Function, root: &TokenStream) -> TokenStream {
     let (holder_places, typed) = (function.constant("PLACES"), quote!(#root::typed));
     match &function.results {
-        Results::Struct(syn::Type::Tuple(_)) => quote!(),
+        Results::Struct(rust) if matches!(**rust, syn::Type::Tuple(_)) => quote!(),
         Results::Struct(_) => quote!(#typed::Variables::write_places(&results, parameters, &Self::#holder_places)?;),
         Results::Named(results) => {
             let is_tuple = results.len() > 1;
