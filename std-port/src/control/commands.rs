@@ -118,18 +118,19 @@ impl Drop for Asked<'_> {
 #[derive(Debug)]
 pub(crate) struct Recorded {
     audited: Option<ProgramCall>,
-    followed: Option<FollowedCall>,
+    /// Boxed, since almost no call has one.
+    followed: Option<Box<FollowedCall>>,
 }
 
 impl Recorded {
     /// `None` if neither wants it.
     pub(crate) fn of(audited: Option<ProgramCall>, followed: Option<FollowedCall>) -> Option<Self> {
-        (audited.is_some() || followed.is_some()).then_some(Self { audited, followed })
+        (audited.is_some() || followed.is_some()).then(|| Self { audited, followed: followed.map(Box::new) })
     }
 
     /// Its arguments.
     pub(crate) fn asks(&mut self, arguments: &ParametersView) {
-        if let Some(FollowedCall { definition, question: Question::Call(call), .. }) = &mut self.followed {
+        if let Some(FollowedCall { definition, question: Question::Call(call), .. }) = self.followed.as_deref_mut() {
             call.arguments = values::arguments(definition.signature().arguments(), arguments);
         }
     }
@@ -137,7 +138,7 @@ impl Recorded {
     /// Its results.
     pub(crate) fn answers(&mut self, results: &ParametersView) {
         if let Some(FollowedCall { definition, outcome: Answer::Called { results: found, .. }, .. }) =
-            &mut self.followed
+            self.followed.as_deref_mut()
         {
             *found = values::arguments(definition.signature().results(), results);
         }
