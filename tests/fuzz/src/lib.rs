@@ -1,0 +1,50 @@
+//! What libFuzzer drives, and what a plain test replays: each [target](TARGETS) is a function of bytes that panics where something
+//! that must hold does not. `cargo xtask fuzz` runs them; the inputs in `corpus` and `crashes` are replayed by `tests/replay.rs`.
+
+mod discovery;
+mod handshake;
+mod peer;
+mod play;
+mod said;
+mod script;
+mod serial;
+mod session;
+mod unit;
+mod values;
+mod whole;
+
+/// Something to fuzz.
+pub struct Target {
+    /// Its name, and that of its folder in `corpus`.
+    pub name: &'static str,
+    /// Runs one input.
+    pub run: fn(&[u8]),
+    /// Longest useful input.
+    pub longest: u32,
+}
+
+/// All of them.
+pub const TARGETS: &[Target] = &[
+    Target { name: "session", run: session::plain, longest: 1_024 },
+    Target { name: "sealed", run: session::sealed, longest: 512 },
+    Target { name: "handshake", run: handshake::run, longest: 256 },
+    Target { name: "discovery", run: discovery::run, longest: 512 },
+    Target { name: "unit", run: whole::run, longest: 1_024 },
+    Target { name: "values", run: values::run, longest: 512 },
+    Target { name: "serial", run: serial::run, longest: 512 },
+];
+
+/// The inputs in a file of `corpus`: each behind its length in two bytes, little-endian.
+pub fn inputs(mut file: &[u8]) -> impl Iterator<Item = &[u8]> {
+    std::iter::from_fn(move || {
+        let (length, rest) = file.split_first_chunk()?;
+        let (input, rest) = rest.split_at_checked(u16::from_le_bytes(*length).into())?;
+        file = rest;
+        Some(input)
+    })
+}
+
+/// The target of this name.
+pub fn target(name: &str) -> Option<&'static Target> {
+    TARGETS.iter().find(|target| target.name == name)
+}
