@@ -25,13 +25,13 @@ pub struct Target {
 
 /// All of them.
 pub const TARGETS: &[Target] = &[
-    Target { name: "session", run: session::plain, longest: 1_024 },
-    Target { name: "sealed", run: session::sealed, longest: 512 },
-    Target { name: "handshake", run: handshake::run, longest: 256 },
-    Target { name: "discovery", run: discovery::run, longest: 512 },
-    Target { name: "unit", run: whole::run, longest: 1_024 },
+    Target { name: "session", run: session::plain, longest: 200 },
+    Target { name: "sealed", run: session::sealed, longest: 128 },
+    Target { name: "handshake", run: handshake::run, longest: 128 },
+    Target { name: "discovery", run: discovery::run, longest: 256 },
+    Target { name: "unit", run: whole::run, longest: 200 },
     Target { name: "values", run: values::run, longest: 512 },
-    Target { name: "serial", run: serial::run, longest: 512 },
+    Target { name: "serial", run: serial::run, longest: 400 },
 ];
 
 /// The inputs in a file of `corpus`: each behind its length in two bytes, little-endian.

@@ -82,7 +82,7 @@ impl Play {
         for _ in 0..6 {
             self.carry(index);
         }
-        let published = said::published();
+        let published = said::PUBLISHED.clone();
         self.say(index, Said::Message(Priority::High, published), false);
     }
 
@@ -297,7 +297,7 @@ impl Play {
         let slot = unit.functions.find(definition.name());
         let motor = handler.motor.filter(|_| attributes.lease.is_some());
         let gone = match act {
-            0 => unit.functions.replace(&definition, attributes, handler).is_ok(),
+            0 => unit.functions.replace(definition, attributes, handler).is_ok(),
             1 => unit.functions.remove(definition.name()).is_ok(),
             _ => false,
         };
@@ -319,7 +319,7 @@ impl Play {
             _ => {
                 let (definition, attributes, handler) =
                     offered(usize::from(script.below(FUNCTIONS as u8)), &leases);
-                let added = unit.functions.add_function(&definition, attributes, handler);
+                let added = unit.functions.add_function(definition, attributes, handler);
                 let slot = added.ok().or_else(|| unit.functions.find(definition.name()));
                 if let Some(slot) = slot {
                     let _ = unit.hub.publications.publish_to_all(slot);

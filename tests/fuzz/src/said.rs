@@ -1,5 +1,7 @@
 //! What a peer says on a link that has joined, as a script wants it: mostly numbers that mean something to the unit.
 
+use std::sync::LazyLock;
+
 use cara_core::config::Priority;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{Generation, Slot};
@@ -33,8 +35,10 @@ pub(crate) const OFFERED: [(&str, Attributes); 4] = [
     ("heat(x: int)", Attributes { stream: Some(10), ..Attributes::NORMAL }),
 ];
 
-/// The control messages that publish them.
-pub(crate) fn published() -> Vec<u8> {
+/// The control message that publishes them.
+pub(crate) static PUBLISHED: LazyLock<Vec<u8>> = LazyLock::new(published);
+
+fn published() -> Vec<u8> {
     let mut bytes = Vec::new();
     for (slot, (text, attributes)) in OFFERED.iter().enumerate() {
         let is_stream = attributes.stream.is_some();

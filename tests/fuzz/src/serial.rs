@@ -49,16 +49,15 @@ pub(crate) fn run(data: &[u8]) {
                 receive(end, &bytes, now);
             }
             6 => {
-                change(&mut ends[index].line, index, now, script.byte());
-                let has_ended = |end: &End| matches!(end.line.state(), State::Closing | State::Ended(_));
                 // A second stream would bring bytes of its own.
-                is_garbled |= ends.iter().any(has_ended);
+                is_garbled |= change(&mut ends[index].line, index, now, script.byte());
             }
             _ => {
                 let bytes = script.bytes();
                 ends[index].line.send_datagram(script.byte().into(), 1, bytes);
             }
         }
+        is_garbled |= ends.iter().any(|end| matches!(end.line.state(), State::Ended(_)));
         if !is_garbled {
             let [one, other] = &ends;
             for (from, to) in [(one, other), (other, one)] {
@@ -91,12 +90,14 @@ fn receive(end: &mut End, mut bytes: &[u8], now: Instant) {
     end.line.take(came.len());
 }
 
-fn change(line: &mut Line, index: usize, now: Instant, act: u8) {
+/// Dials, accepts or ends; whether it has ended a stream.
+fn change(line: &mut Line, index: usize, now: Instant, act: u8) -> bool {
     match (act % 4, line.state()) {
         (0, State::Idle) if index == 0 => drop(line.dial(7)),
         (0 | 1, State::Offered(_)) => drop(line.accept()),
         (2, state) if state != State::Idle => line.close(now),
         (3, state) if state != State::Idle => line.abort(),
-        _ => {}
+        _ => return false,
     }
+    act & 2 != 0
 }

@@ -16,6 +16,7 @@ mod dependencies;
 mod figures;
 mod firmware;
 mod fleet;
+mod fuzz;
 mod groups;
 mod house;
 mod hygiene;
@@ -118,6 +119,8 @@ enum Task {
     },
     /// Runs fleets on the simulator from many seeds, in which nothing may move that is not wanted; or with planted bugs.
     Orders(orders::Orders),
+    /// Runs libFuzzer over the targets of tests/fuzz; or over bugs that are planted on purpose.
+    Fuzz(fuzz::Fuzz),
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
     Fleet {
         /// How many s_units; 1,000 if not given.
@@ -171,6 +174,7 @@ fn main() -> ExitCode {
         Task::Fleet { nodes, processes, json } => fleet::run(nodes, processes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
         Task::Orders(options) => orders::run(&options),
+        Task::Fuzz(options) => fuzz::run(&options),
         Task::Sanitize => sanitize::run(),
         Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),

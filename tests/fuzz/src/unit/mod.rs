@@ -182,7 +182,8 @@ pub(crate) struct Unit {
     pub(crate) stores: bool,
     /// The highest claim that it has made or obeyed.
     highest: Claim,
-    arguments: Box<Arguments>,
+    /// Lent to each call.
+    arguments: Option<Box<Arguments>>,
 }
 
 /// The identities of all units: a vehicle, its manager, and others.
@@ -250,7 +251,7 @@ impl Unit {
             dials: Vec::new(),
             stores: true,
             highest: Claim::NONE,
-            arguments: Box::new(Arguments::sized()),
+            arguments: None,
         };
         for slot in 0..FUNCTIONS {
             unit.hub.publications.publish_to_all(Slot(slot as u16)).expect("the table has capacity");
@@ -416,12 +417,12 @@ impl Unit {
                 worked = true;
                 self.happened(index, event);
             }
-            let mut arguments = std::mem::replace(&mut self.arguments, Box::new(Arguments::sized()));
+            let mut arguments = std::mem::take(&mut self.arguments).unwrap_or_default();
             let receipt = self.with(index, |link, cx| {
                 link.came = if link.inbox.is_empty() { link.came } else { cx.now };
                 link.session.receive(cx, &mut link.inbox, Some(&mut arguments))
             });
-            self.arguments = arguments;
+            self.arguments = Some(arguments);
             let Some(receipt) = receipt else { break };
             if let Some(event) = receipt.event {
                 self.happened(index, event);
@@ -446,9 +447,9 @@ impl Unit {
                 worked = true;
                 self.happened(index, event);
             }
-            let mut arguments = std::mem::replace(&mut self.arguments, Box::new(Arguments::sized()));
+            let mut arguments = std::mem::take(&mut self.arguments).unwrap_or_default();
             let call = self.with(index, |link, cx| link.session.next_call(cx, &mut *arguments)).flatten();
-            self.arguments = arguments;
+            self.arguments = Some(arguments);
             let Some(call) = call else { return worked };
             worked = true;
             self.happened(index, Event::Incoming(call));
@@ -516,8 +517,7 @@ impl Unit {
                 if let Ok(results) = outcome
                     && let Ok(block) = link.session.results(&results, &link.inbox)
                 {
-                    let _ = block.read_into(&mut *self.arguments);
-                    self.arguments.clear();
+                    let _ = block.read_into(&mut Arguments::sized());
                 }
             }
             Event::Failed(id, _) => {

@@ -2,6 +2,7 @@
 
 use std::cell::RefCell;
 use std::rc::Rc;
+use std::sync::LazyLock;
 
 use cara_core::config::Priority;
 use cara_core::distribution::function::{Attributes, Definition};
@@ -70,16 +71,23 @@ const OFFERED: [Offered; 11] = [
     ("speed(x: int)", None, false, Attributes { stream: Some(5), ..NORMAL }, false),
 ];
 
+static DEFINITIONS: LazyLock<Vec<Definition>> = LazyLock::new(|| {
+    let parsed = OFFERED.iter().map(|(text, .., attributes, _)| match attributes.stream {
+        Some(_) => Definition::stream(text),
+        None => Definition::parse(text),
+    });
+    parsed.map(|definition| definition.expect("the texts are signatures")).collect()
+});
+
 /// One of these functions as it is added or replaced.
-pub(crate) fn offered(index: usize, motors: &[Rc<Lease>]) -> (Definition, Attributes, Handler) {
-    let (text, motor, moves, attributes, is_slow) = OFFERED[index % FUNCTIONS];
+pub(crate) fn offered(index: usize, motors: &[Rc<Lease>]) -> (&'static Definition, Attributes, Handler) {
+    let (_, motor, moves, attributes, is_slow) = OFFERED[index];
     let is_stream = attributes.stream.is_some();
-    let definition = if is_stream { Definition::stream(text) } else { Definition::parse(text) };
     let length = motor.filter(|_| moves).and_then(|motor| LEASES.get(motor));
     let attributes = Attributes { lease: length.map(|length| Duration::from_millis(*length)), ..attributes };
     let lease = motor.and_then(|motor| motors.get(motor)).map(Rc::clone);
     let values = is_stream.then(|| Values(RefCell::new(Newest::new([0; 8]))));
-    (definition.expect("the texts are signatures"), attributes, Handler { motor, lease, is_slow, values })
+    (&DEFINITIONS[index], attributes, Handler { motor, lease, is_slow, values })
 }
 
 /// The list of a unit that starts.
@@ -88,7 +96,7 @@ pub(crate) fn functions(motors: &[Rc<Lease>]) -> FunctionList<Boxed, Handler> {
     let mut list = FunctionList::new(entries, Boxed::slice(512));
     for index in 0..FUNCTIONS {
         let (definition, attributes, handler) = offered(index, motors);
-        list.add_function(&definition, attributes, handler).expect("the list has capacity");
+        list.add_function(definition, attributes, handler).expect("the list has capacity");
     }
     list
 }

@@ -109,7 +109,7 @@ pub(crate) fn run(numbers: &[String]) -> Result<ExitCode> {
 
 /// A clone of the last commit, with builds of its own.
 pub(crate) struct Tree {
-    root: PathBuf,
+    pub(crate) root: PathBuf,
     pub(crate) commit: String,
 }
 
@@ -134,6 +134,11 @@ impl Tree {
         self.git(&["apply", CONTEXT, &file.to_string_lossy()]).map(drop)
     }
 
+    /// Undoes what was applied.
+    pub(crate) fn reset(&self) -> Result<()> {
+        self.git(&["reset", "--quiet", "--hard"]).map(drop)
+    }
+
     fn git(&self, arguments: &[&str]) -> Result<String> {
         Run::new("git").within(&self.root).args(arguments).text()
     }
@@ -152,7 +157,7 @@ impl Tree {
     pub(crate) fn finds(&self, patch: &Path, test: &str) -> Result<String> {
         self.apply(patch)?;
         let ended = self.passes(test);
-        self.git(&["reset", "--quiet", "--hard"])?;
+        self.reset()?;
         match ended? {
             (name, false) => Ok(name),
             (name, true) => bail!("{name} passes"),
