@@ -94,7 +94,10 @@ fn datagram(script: &mut Script<'_>, play: &mut Play, heard: &mut Heard, act: u8
     let who = identity(script.below(6));
     let own = play.unit.hub.node.identity().clone();
     let root = ROOTS[usize::from(script.byte() > 0xD0)];
-    let keys = Keyed::new(mode, root, who.clone());
+    // Another member of the fleet may speak in the name of this one.
+    let speaker = if script.byte() > 0xC0 { identity(script.below(6)) } else { who.clone() };
+    let is_genuine = root == ROOTS[0] && speaker == who;
+    let keys = Keyed::new(mode, root, speaker);
     let mut out = [0; 700];
     let bytes = match act {
         0..4 => {
@@ -120,7 +123,11 @@ fn datagram(script: &mut Script<'_>, play: &mut Play, heard: &mut Heard, act: u8
             let manager = identity(1);
             let answer = Announce {
                 claim: if is_m_unit { claim(script, &who, &keys) } else { None },
-                obeyed: if is_m_unit { None } else { claim(script, &manager, &Keyed::new(mode, root, manager.clone())) },
+                obeyed: if is_m_unit {
+                    None
+                } else {
+                    claim(script, &manager, &Keyed::new(mode, root, manager.clone()))
+                },
                 identity: who,
                 epoch: Epoch(script.below(3).into()),
                 sequence: script.number() as u32,
@@ -130,7 +137,7 @@ fn datagram(script: &mut Script<'_>, play: &mut Play, heard: &mut Heard, act: u8
                 expected: script.number() as u16,
                 skipped: 0,
             };
-            heard.is_genuine |= root == ROOTS[0];
+            heard.is_genuine |= is_genuine;
             answer.encode(FLEET, &keys.codes, Some(&own), &mut out).map(<[u8]>::to_vec)
         }
         9 => {

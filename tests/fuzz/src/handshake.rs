@@ -45,7 +45,8 @@ pub(crate) fn run(data: &[u8]) {
             play.unit.with(0, |link, cx| link.session.writable(cx));
             play.unit.settle();
             // What comes behind the last frame of a handshake does not change it, nor does a stream that ends.
-            let is_changed_now = if play.has_joined() { !bytes.starts_with(&genuine) } else { !genuine.starts_with(&bytes) };
+            let is_changed_now =
+                if play.has_joined() { !bytes.starts_with(&genuine) } else { !genuine.starts_with(&bytes) };
             is_changed |= is_changed_now;
             if is_cut {
                 play.unit.with(0, |link, _| link.session.disconnected(CloseReason::Reset));

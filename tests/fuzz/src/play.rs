@@ -8,7 +8,7 @@ use cara_core::distribution::identity::{Epoch, Role};
 use cara_core::error::{CloseReason, Error, ServiceError};
 use cara_core::services::call::Callee;
 use cara_core::services::heart::Renew;
-use cara_core::services::lease::{Latch};
+use cara_core::services::lease::Latch;
 use cara_core::services::session::{Delivery, RequestOptions};
 use cara_core::storage::Buffers as _;
 use cara_core::time::{Duration, Instant};
@@ -110,7 +110,7 @@ impl Play {
 
     /// Bytes reach the unit.
     pub(crate) fn arrive(&mut self, index: usize, bytes: &[u8]) {
-        if let Some(link) = self.unit.links[index].as_mut().filter(|link| link.inbox.len() < 1 << 14) {
+        if let Some(link) = self.unit.links[index].as_mut().filter(|link| link.inbox.len() < 1 << 15) {
             link.inbox.extend_from_slice(bytes);
         }
     }
@@ -125,9 +125,10 @@ impl Play {
 
     /// The peer says something on a link that its handshake has opened.
     fn say(&mut self, index: usize, said: Said, by_datagram: bool) {
+        self.note_release(index, &said);
         let Some(peer) = self.peers[index].as_mut().filter(|peer| peer.is_live) else { return };
         let mut datagram = match &said {
-            Said::Body(body) if by_datagram => Some(peer.datagram(body)),
+            Said::Body(body) | Said::Release(_, _, body) if by_datagram => Some(peer.datagram(body)),
             Said::Message(priority, message) if by_datagram => {
                 Some(peer.datagram(&[&[3, priority.to_wire()][..], message].concat()))
             }
@@ -139,10 +140,22 @@ impl Play {
         }
         let bytes = match said {
             Said::Message(priority, message) => peer.message(priority, &message),
-            Said::Body(body) => peer.raw(&[&[6][..], &body].concat()),
+            Said::Body(body) | Said::Release(_, _, body) => peer.raw(&[&[6][..], &body].concat()),
             Said::Frame(bytes) => bytes,
         };
         self.arrive(index, &bytes);
+    }
+
+    /// What a peer releases moves no more once the unit has read that. Behind bytes that are no frames nothing need be read.
+    fn note_release(&mut self, index: usize, said: &Said) {
+        let Some(link) = self.unit.links[index].as_mut().filter(|link| !link.is_loose && link.joined) else { return };
+        let Said::Release(slot, call, _) = said else { return };
+        for (moving, of) in self.unit.motors.iter().filter_map(|motor| motor.mover(index)) {
+            let is_meant = slot.map_or(moving == *call, |slot| slot == of && moving <= *call);
+            if is_meant {
+                link.released.insert(moving);
+            }
+        }
     }
 
     /// One step of a link that has joined, of its unit, or of time.
@@ -317,8 +330,7 @@ impl Play {
                 }
             }
             _ => {
-                let (definition, attributes, handler) =
-                    offered(usize::from(script.below(FUNCTIONS as u8)), &leases);
+                let (definition, attributes, handler) = offered(usize::from(script.below(FUNCTIONS as u8)), &leases);
                 let added = unit.functions.add_function(definition, attributes, handler);
                 let slot = added.ok().or_else(|| unit.functions.find(definition.name()));
                 if let Some(slot) = slot {

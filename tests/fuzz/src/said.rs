@@ -23,6 +23,8 @@ pub(crate) enum Said {
     Message(Priority, Vec<u8>),
     /// As a session body, in the stream or a datagram.
     Body(Vec<u8>),
+    /// The same, where it releases a call, or all calls of a function up to that one.
+    Release(Option<Slot>, u32, Vec<u8>),
     /// As a frame.
     Frame(Vec<u8>),
 }
@@ -200,9 +202,15 @@ pub(crate) fn next(script: &mut Script<'_>, peer: &mut Peer, link: &mut Link, no
         }
         6 => {
             let release = Release { call: call(script, peer), class: priority(script) };
-            Said::Body(if script.flag() { SessionBody::release(&release) } else { SessionBody::cancel(&release) }.to_vec())
+            if script.flag() {
+                return Said::Release(None, release.call, SessionBody::release(&release).to_vec());
+            }
+            Said::Body(SessionBody::cancel(&release).to_vec())
         }
-        7 => Said::Body(SessionBody::release_all(Slot(script.below(13).into()), call(script, peer)).to_vec()),
+        7 => {
+            let (slot, call) = (Slot(script.below(13).into()), call(script, peer));
+            Said::Release(Some(slot), call, SessionBody::release_all(slot, call).to_vec())
+        }
         8 => {
             let report = Report { received: script.number() as u32, hears: script.flag(), holds: script.flag() };
             Said::Body(match script.below(4) {

@@ -9,7 +9,8 @@ use cara_fuzz::TARGETS;
 fn every_input_that_was_found_is_run_again() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
     for target in TARGETS {
-        let corpus = fs::read(folder.join("corpus").join(target.name).with_extension("inputs")).expect("each target has one");
+        let corpus =
+            fs::read(folder.join("corpus").join(target.name).with_extension("inputs")).expect("each target has one");
         let inputs: Vec<_> = cara_fuzz::inputs(&corpus).collect();
         assert!(inputs.len() > 20, "{} has {} inputs", target.name, inputs.len());
         inputs.into_iter().for_each(target.run);

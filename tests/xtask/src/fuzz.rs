@@ -231,7 +231,8 @@ mod tests {
 
     #[test]
     fn what_libfuzzer_says_is_understood() {
-        let good = "#2\tINITED cov: 5 ft: 6\n#900\tDONE   cov: 17 ft: 6 corp: 2/2b\nstat::number_of_executed_units: 901\n";
+        let good =
+            "#2\tINITED cov: 5 ft: 6\n#900\tDONE   cov: 17 ft: 6 corp: 2/2b\nstat::number_of_executed_units: 901\n";
         assert_eq!(told(good), Some(Told { executions: 901, coverage: 17, crash: None }));
         let bad = "#7\tNEW    cov: 9 ft\nthread '<unnamed>' (1) panicked at a.rs:1:1:\na motor moves\n\
                    artifact_prefix='x'; Test unit written to x/crash-1\n";

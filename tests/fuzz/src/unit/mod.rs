@@ -3,7 +3,7 @@
 mod motors;
 pub(crate) mod services;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::rc::Rc;
 
@@ -21,7 +21,9 @@ use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::access::{Access, Decision, Principal, Rule, Verb, Verbs, Who, decide};
 use cara_core::services::hub::Hub;
 use cara_core::services::publications::Publications;
-use cara_core::services::session::{Event, Incoming, Publication, Session, SessionConfig, SessionStorage, buffer_bytes};
+use cara_core::services::session::{
+    Event, Incoming, Publication, Session, SessionConfig, SessionStorage, buffer_bytes,
+};
 use cara_core::services::{Context, Keys, Port, slots_for};
 use cara_core::storage::{Buffers as _, Pool};
 use cara_core::time::{Duration, Instant};
@@ -141,7 +143,7 @@ pub(crate) struct Link {
     /// Bytes that have come and were not consumed.
     pub(crate) inbox: Vec<u8>,
     /// Calls whose handlers have not answered, and how often their motors were stopped when they began.
-    pub(crate) held: Vec<(Incoming, u32)>,
+    pub(crate) held: Vec<(Incoming, Stops)>,
     unanswered: Vec<(Incoming, Result<i64, Error>)>,
     /// The unit's own calls that have not ended, and whether each waits for a reply.
     pub(crate) asked: BTreeMap<u32, bool>,
@@ -150,16 +152,24 @@ pub(crate) struct Link {
     /// Bytes have come that need not be what the peer has said: then anything may have been wanted when something came last.
     pub(crate) is_loose: bool,
     came: Instant,
+    /// Calls that moved something when the peer released them.
+    pub(crate) released: BTreeSet<u32>,
     pub(crate) joined: bool,
 }
 
 impl Link {
     /// Until when the peer can have wanted a call.
     fn wanted(&self, call: u32) -> Instant {
+        if self.inbox.is_empty() && self.released.contains(&call) {
+            return Instant::START;
+        }
         let said = self.said.get(&call).copied().unwrap_or(Instant::START);
         if self.is_loose { said.max(self.came) } else { said }
     }
 }
+
+/// How often each motor had been stopped.
+type Stops = [u32; services::LEASES.len()];
 
 /// The variables of a call.
 pub(crate) type Arguments = Parameters<512>;
@@ -214,7 +224,8 @@ impl Unit {
         let identity = identity(u8::from(is_manager));
         let target = if is_manager { Target::Everybody } else { Target::Manager(manager()) };
         let constraints = if is_manager { Constraints::M_UNIT } else { Constraints::S_UNIT };
-        let constraints = Constraints { maximum_nodes: 2, message_size: MESSAGE_BYTES, calls_per_peer: 6, ..constraints };
+        let constraints =
+            Constraints { maximum_nodes: 2, message_size: MESSAGE_BYTES, calls_per_peer: 6, ..constraints };
         let config = NodeConfig {
             identity: identity.clone(),
             fleet: FLEET,
@@ -264,7 +275,11 @@ impl Unit {
     }
 
     /// Does something to a link, if it is there.
-    pub(crate) fn with<R>(&mut self, link: usize, act: impl FnOnce(&mut Link, &mut Context<'_, Fuzzed>) -> R) -> Option<R> {
+    pub(crate) fn with<R>(
+        &mut self,
+        link: usize,
+        act: impl FnOnce(&mut Link, &mut Context<'_, Fuzzed>) -> R,
+    ) -> Option<R> {
         let Self { now, hub, functions, pool, table, keys, mail, links, .. } = self;
         let access = table.as_ref().map(|table| table as &dyn Access);
         let mut cx = Context { now: *now, mailman: mail, buffers: pool, functions, access, hub, keys };
@@ -296,6 +311,7 @@ impl Unit {
             said: BTreeMap::new(),
             is_loose: false,
             came: self.now,
+            released: BTreeSet::new(),
             joined: false,
         });
         if dialed {
@@ -467,7 +483,7 @@ impl Unit {
     }
 
     /// A handler answers: with `x` and everything else that its function returns, or with an error.
-    pub(crate) fn answer(&mut self, index: usize, call: Incoming, result: Result<i64, Error>, stops: Option<u32>) {
+    pub(crate) fn answer(&mut self, index: usize, call: Incoming, result: Result<i64, Error>, stops: Option<Stops>) {
         let Some(function) = self.functions.function(call.slot) else { return };
         let (motor, resets) = (function.handler.motor, function.attributes.reset);
         let mut results = Arguments::sized();
@@ -487,9 +503,10 @@ impl Unit {
             }
             // Only an answer with results, to a reset that was made after the last stop, ends a latch.
             Some(Ok(())) if resets && result.is_ok() => {
-                for (_, motor) in self.motors.iter_mut().enumerate().filter(|(at, _)| motor.is_none_or(|motor| motor == *at)) {
-                    if stops.is_none_or(|stops| stops == motor.stops) {
-                        motor.is_stopped = motor.lease.is_inhibited();
+                for (at, reset) in self.motors.iter_mut().enumerate() {
+                    let is_meant = motor.is_none_or(|motor| motor == at);
+                    if is_meant && stops.is_none_or(|stops| stops[at] == reset.stops) {
+                        reset.is_stopped = reset.lease.is_inhibited();
                     }
                 }
             }
@@ -504,7 +521,7 @@ impl Unit {
             Event::Incoming(call) => self.started(index, call),
             Event::LeaseExpired(slot) => {
                 let motor = self.functions.function(slot).and_then(|function| function.handler.motor);
-                self.motors[motor.expect("only what moves has a lease")].made_safe(now);
+                self.motors[motor.expect("only what moves has a lease")].made_safe(index, now);
             }
             Event::Joined => {
                 let link = self.links[index].as_mut().expect("it is there");
@@ -538,19 +555,19 @@ impl Unit {
         let is_leased = attributes.lease.is_some();
         assert_eq!(is_leased, call.order.is_some(), "what moves has an order, and nothing else");
         if let Some((order, motor)) = call.order.zip(motor) {
-            self.motors[motor].began(order, index, self.now);
+            self.motors[motor].began(order, index, call.slot, self.now);
         }
-        let mut stops = 0;
-        for (at, motor_of) in self.motors.iter_mut().enumerate() {
-            if motor.is_none_or(|motor| motor == at) {
-                if attributes.stop {
-                    assert!(!motor_of.lease.is_live(self.now), "a motor moves while its stop is handled");
-                    motor_of.stop();
-                    motor_of.is_stopped = motor_of.lease.is_inhibited();
-                }
-                stops = motor_of.stops;
+        for (at, stopped) in self.motors.iter_mut().enumerate() {
+            // A motor that no function moves inherits the unit's latch with its next one.
+            let is_there =
+                || self.functions.iter().any(|it| it.attributes.lease.is_some() && it.handler.motor == Some(at));
+            if attributes.stop && motor.is_none_or(|motor| motor == at) && is_there() {
+                assert!(!stopped.lease.is_live(self.now), "a motor moves while its stop is handled");
+                stopped.stop();
+                assert!(stopped.lease.is_inhibited(), "a stop inhibits nothing");
             }
         }
+        let stops = std::array::from_fn(|at| self.motors[at].stops);
         if is_slow {
             self.links[index].as_mut().expect("it is there").held.push((call, stops));
         } else {
@@ -614,7 +631,11 @@ impl Unit {
             0 => None,
             1 => Some(Table(Vec::new())),
             2 => Some(Table(vec![Rule::new(Who::ANYBODY, Functions::All, Verbs::ALL).at(slow)])),
-            _ => Some(Table(vec![Rule::new(Who::ANYBODY, Functions::Named(&["go", "stop", "now"]), Verbs::LIST.and(Verbs::CALL))])),
+            _ => Some(Table(vec![Rule::new(
+                Who::ANYBODY,
+                Functions::Named(&["go", "stop", "now"]),
+                Verbs::LIST.and(Verbs::CALL),
+            )])),
         };
         for index in 0..LINKS {
             self.with(index, |link, cx| link.session.access_changed(cx));

@@ -2,6 +2,7 @@
 
 use std::rc::Rc;
 
+use cara_core::distribution::function_list::Slot;
 use cara_core::services::lease::{Lease, Order};
 use cara_core::time::{Duration, Instant};
 
@@ -26,22 +27,24 @@ pub(crate) struct Motor {
 pub(crate) struct Open {
     pub(crate) order: Order,
     pub(crate) link: usize,
+    slot: Slot,
     /// It was dead when the motor looked, so its safe hook comes before any other order.
     pub(crate) is_dead: bool,
 }
 
 impl Motor {
     pub(crate) fn all() -> Vec<Self> {
-        let motor = |_| Self { lease: Rc::new(Lease::new()), open: None, is_stopped: false, stops: 0, is_cleared: false };
+        let motor =
+            |_| Self { lease: Rc::new(Lease::new()), open: None, is_stopped: false, stops: 0, is_cleared: false };
         LEASES.iter().map(motor).collect()
     }
 
     /// A call has begun that moves it.
-    pub(crate) fn began(&mut self, order: Order, link: usize, now: Instant) {
+    pub(crate) fn began(&mut self, order: Order, link: usize, slot: Slot, now: Instant) {
         assert!(!self.open.is_some_and(|open| open.is_dead), "an order begins before the safe hook of the one before");
         assert!(!self.is_stopped, "an order begins behind a stop");
         assert!(self.lease.is_live_for(order, now), "an order is dead when it begins");
-        self.open = Some(Open { order, link, is_dead: false });
+        self.open = Some(Open { order, link, slot, is_dead: false });
         self.is_cleared = false;
     }
 
@@ -54,8 +57,11 @@ impl Motor {
     }
 
     /// Its safe hook runs.
-    pub(crate) fn made_safe(&mut self, now: Instant) {
-        assert!(self.open.take().is_some() || self.is_cleared, "a safe hook without an order");
+    pub(crate) fn made_safe(&mut self, link: usize, now: Instant) {
+        match self.open.take() {
+            Some(open) => assert_eq!(open.link, link, "a link stops what another one has begun"),
+            None => assert!(self.is_cleared, "a safe hook without an order"),
+        }
         self.is_cleared = false;
         assert!(!self.lease.is_live(now), "a motor moves behind its safe hook");
     }
@@ -63,6 +69,12 @@ impl Motor {
     pub(crate) fn stop(&mut self) {
         self.is_stopped = true;
         self.stops += 1;
+    }
+
+    /// The call of a link that has begun its order, and the slot of its function.
+    pub(crate) fn mover(&self, link: usize) -> Option<(u32, Slot)> {
+        let open = self.open.filter(|open| open.link == link && !open.is_dead)?;
+        self.lease.state().last.map(|last| (last.call, open.slot))
     }
 
     fn look(&mut self, now: Instant, bound: impl FnOnce(&Open, u32) -> Option<Instant>) {
@@ -89,7 +101,9 @@ impl Unit {
     pub(crate) fn look_at_motors(&mut self) {
         let Self { motors, links, now, .. } = self;
         for (motor, length) in motors.iter_mut().zip(LEASES) {
-            motor.look(*now, |open, call| Some(links.get(open.link)?.as_ref()?.wanted(call) + Duration::from_millis(length)));
+            motor.look(*now, |open, call| {
+                Some(links.get(open.link)?.as_ref()?.wanted(call) + Duration::from_millis(length))
+            });
         }
     }
 }
