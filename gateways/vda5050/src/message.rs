@@ -1,0 +1,158 @@
+//! The messages of VDA 5050 2.0 and 2.1 (clauses 6.4 to 6.15), as their schemas and the document have them.
+//!
+//! One set of structs serves both versions: 2.1 only adds members. Where a schema and its document differ, the document counts:
+//! 2.0's schemas have `allowedDeviationXy` and `actionName`, which are read and never written.
+// The members are the standard's, with its names and its meanings.
+#![allow(missing_docs)]
+
+mod factsheet;
+
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
+
+pub use factsheet::*;
+
+/// A struct of a JSON object: members that must be there; those that may be absent, or null when read.
+macro_rules! object {
+    ($($(#[$attribute:meta])* $name:ident { $($(#[$of:meta])* $field:ident: $type:ty),* $(; $($(#[$of_optional:meta])* $optional:ident: $optional_type:ty),*)? $(,)? })*) => {
+        $($(#[$attribute])*
+        #[derive(Clone, Debug, Default, PartialEq, ::serde::Serialize, ::serde::Deserialize)]
+        #[serde(rename_all = "camelCase")]
+        pub struct $name {
+            $($(#[$of])* pub $field: $type,)*
+            $($($(#[$of_optional])* #[serde(default, skip_serializing_if = "Option::is_none")] pub $optional: Option<$optional_type>,)*)?
+        })*
+    };
+}
+/// An enum of a text; the first is what a `Default` needs.
+macro_rules! words {
+    ($($(#[$attribute:meta])* $name:ident { $($(#[$of:meta])* $word:ident = $text:literal),* $(,)? })*) => {
+        $($(#[$attribute])*
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, ::serde::Serialize, ::serde::Deserialize)]
+        pub enum $name { $($(#[$of])* #[serde(rename = $text)] $word),* })*
+    };
+}
+pub(crate) use {object, words};
+
+object! {
+    /// What each message starts with (6.4).
+    Header { header_id: u32, timestamp: String, version: String, manufacturer: String, serial_number: String }
+    /// Topic `order` (6.6.6).
+    Order {
+        #[serde(flatten)] header: Header,
+        order_id: String, order_update_id: u32, nodes: Vec<Node>, edges: Vec<Edge>; zone_set_id: String
+    }
+    Node {
+        node_id: String, sequence_id: u32, released: bool, actions: Vec<Action>;
+        node_description: String, node_position: NodePosition
+    }
+    NodePosition {
+        x: f64, y: f64, map_id: String;
+        theta: f64, #[serde(rename = "allowedDeviationXY")] allowed_deviation_xy: f64, allowed_deviation_theta: f64,
+        map_description: String
+    }
+    Edge {
+        edge_id: String, sequence_id: u32, released: bool, start_node_id: String, end_node_id: String, actions: Vec<Action>;
+        edge_description: String, max_speed: f64, max_height: f64, min_height: f64, orientation: f64, orientation_type: String,
+        direction: String, rotation_allowed: bool, max_rotation_speed: f64, length: f64, trajectory: Trajectory, corridor: Corridor
+    }
+    Trajectory { degree: i64, knot_vector: Vec<f64>, control_points: Vec<ControlPoint> }
+    ControlPoint { x: f64, y: f64; weight: f64 }
+    Corridor { left_width: f64, right_width: f64; corridor_ref_point: CorridorRefPoint }
+    Action {
+        action_type: String, action_id: String, blocking_type: BlockingType;
+        action_description: String, action_parameters: Vec<ActionParameter>
+    }
+    ActionParameter { key: String, value: Value }
+    /// Topic `instantActions` (6.9).
+    InstantActions { #[serde(flatten)] header: Header, actions: Vec<Action> }
+    /// Topic `connection` (6.14).
+    Connection { #[serde(flatten)] header: Header, connection_state: ConnectionState }
+    /// Topic `visualization` (6.13).
+    Visualization { #[serde(flatten)] header: Header; agv_position: AgvPosition, velocity: Velocity }
+    /// Topic `state` (6.10.6), without its header: what is compared to see whether there is news.
+    Report {
+        order_id: String, order_update_id: u32, last_node_id: String, last_node_sequence_id: u32, driving: bool,
+        operating_mode: OperatingMode, node_states: Vec<NodeState>, edge_states: Vec<EdgeState>, action_states: Vec<ActionState>,
+        battery_state: BatteryState, errors: Vec<Error>, safety_state: SafetyState;
+        maps: Vec<MapState>, zone_set_id: String, paused: bool, new_base_request: bool, distance_since_last_node: f64,
+        agv_position: AgvPosition, velocity: Velocity, loads: Vec<Load>, information: Vec<Information>
+    }
+    /// Topic `state`.
+    State { #[serde(flatten)] header: Header, #[serde(flatten)] report: Report }
+    MapState { map_id: String, map_version: String, map_status: MapStatus; map_description: String }
+    NodeState { node_id: String, sequence_id: u32, released: bool; node_description: String, node_position: NodePosition }
+    EdgeState { edge_id: String, sequence_id: u32, released: bool; edge_description: String, trajectory: Trajectory }
+    AgvPosition {
+        x: f64, y: f64, theta: f64, map_id: String, position_initialized: bool;
+        map_description: String, localization_score: f64, deviation_range: f64
+    }
+    Velocity {; vx: f64, vy: f64, omega: f64 }
+    Load {;
+        load_id: String, load_type: String, load_position: String, bounding_box_reference: BoundingBoxReference,
+        load_dimensions: LoadDimensions, weight: f64
+    }
+    BoundingBoxReference { x: f64, y: f64, z: f64; theta: f64 }
+    LoadDimensions { length: f64, width: f64; height: f64 }
+    ActionState {
+        action_id: String, action_status: ActionStatus; action_type: String, action_description: String, result_description: String
+    }
+    BatteryState { battery_charge: f64, charging: bool; battery_voltage: f64, battery_health: f64, reach: f64 }
+    Error {
+        error_type: String, error_level: ErrorLevel;
+        error_references: Vec<Reference>, error_description: String, error_hint: String
+    }
+    Reference { reference_key: String, reference_value: String }
+    Information { info_type: String, info_level: InfoLevel; info_references: Vec<Reference>, info_description: String }
+    SafetyState { e_stop: EStop, field_violation: bool }
+}
+
+words! {
+    BlockingType { #[default] None = "NONE", Soft = "SOFT", Hard = "HARD" }
+    CorridorRefPoint { #[default] KinematicCenter = "KINEMATICCENTER", Contour = "CONTOUR" }
+    ConnectionState { #[default] Online = "ONLINE", Offline = "OFFLINE", Broken = "CONNECTIONBROKEN" }
+    OperatingMode {
+        #[default] Automatic = "AUTOMATIC", Semiautomatic = "SEMIAUTOMATIC", Manual = "MANUAL", Service = "SERVICE", Teachin = "TEACHIN",
+    }
+    MapStatus { #[default] Enabled = "ENABLED", Disabled = "DISABLED" }
+    /// `PAUSED` is in the documents (6.11) and absent from both schemas; it is never written.
+    ActionStatus {
+        #[default] Waiting = "WAITING", Initializing = "INITIALIZING", Running = "RUNNING", Paused = "PAUSED",
+        Finished = "FINISHED", Failed = "FAILED",
+    }
+    ErrorLevel { #[default] Warning = "WARNING", Fatal = "FATAL" }
+    InfoLevel { #[default] Info = "INFO", Debug = "DEBUG" }
+    EStop { #[default] None = "NONE", AutoAck = "AUTOACK", Manual = "MANUAL", Remote = "REMOTE" }
+}
+
+impl ActionStatus {
+    /// Whether it is over.
+    pub const fn has_ended(self) -> bool {
+        matches!(self, Self::Finished | Self::Failed)
+    }
+}
+
+/// Reads a message, with the names that 2.0's schemas have instead of the document's.
+pub fn read<T: DeserializeOwned>(text: &[u8]) -> Result<T, serde_json::Error> {
+    let mut value: Value = serde_json::from_slice(text)?;
+    each_object(&mut value, &mut |object| {
+        for (schema, document) in [("actionName", "actionType"), ("allowedDeviationXy", "allowedDeviationXY")] {
+            if let Some(old) = object.remove(schema) {
+                object.entry(document).or_insert(old);
+            }
+        }
+    });
+    serde_json::from_value(value)
+}
+
+fn each_object(value: &mut Value, change: &mut impl FnMut(&mut Map<String, Value>)) {
+    match value {
+        Value::Object(object) => {
+            change(object);
+            // The value of an action's parameter is the application's.
+            object.iter_mut().filter(|(key, _)| *key != "value").for_each(|(_, value)| each_object(value, change));
+        }
+        Value::Array(values) => values.iter_mut().for_each(|value| each_object(value, change)),
+        _ => {}
+    }
+}
