@@ -1,0 +1,671 @@
+//! One vehicle's order, and what follows from it, without I/O and without a clock.
+//!
+//! Messages and statuses change the [`Machine`]; [`Machine::next`] says what the vehicle is to be told. Whoever drives it writes
+//! [`Machine::record`] to disk when [`Machine::take_changed`] says so, before it tells the vehicle or the master anything.
+
+use std::time::Duration;
+
+use crate::actions::{Entry, Place, block_driving, startable};
+use crate::errors::{Kind, Refusal};
+use crate::message::{Action, ActionScope, ActionStatus, EStop, InstantActions, OperatingMode, Order, Report};
+use crate::order::{Held, Verdict, judge, performable};
+use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status};
+
+/// Most errors that are reported at a time; the oldest go.
+pub const ERRORS: usize = 16;
+/// Most actions at once that are remembered after they have ended; the oldest go.
+pub const INSTANT_ACTIONS: usize = 64;
+/// How long the vehicle is left alone after it has refused something.
+const BACK_OFF: Duration = Duration::from_millis(500);
+
+/// A topic of the gateway's own messages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Topic {
+    /// `connection`.
+    Connection,
+    /// `state`.
+    State,
+    /// `visualization`.
+    Visualization,
+    /// `factsheet`.
+    Factsheet,
+}
+
+/// One vehicle under VDA 5050.
+#[derive(Debug)]
+pub struct Machine {
+    record: Record,
+    policy: Policy,
+    status: Option<Status>,
+    has_changed: bool,
+    header_ids: [u32; 4],
+    is_drive_sent: bool,
+    is_halt_due: bool,
+    is_position_sent: bool,
+    retry_at: Duration,
+    /// Since when the broker is away, and what the vehicle had driven then.
+    broker_lost: Option<(Duration, Option<f64>)>,
+    had_broker: bool,
+    /// The vehicle stands because the broker is away.
+    is_held: bool,
+    is_report_due: bool,
+    is_factsheet_due: bool,
+}
+
+impl Machine {
+    /// Goes on from a record. The broker counts as away from `now` on.
+    pub fn new(record: Record, policy: Policy, now: Duration) -> Self {
+        Self {
+            header_ids: record.header_ids,
+            record,
+            policy,
+            status: None,
+            has_changed: false,
+            is_drive_sent: false,
+            is_halt_due: false,
+            is_position_sent: false,
+            retry_at: Duration::ZERO,
+            broker_lost: Some((now, None)),
+            had_broker: false,
+            is_held: false,
+            is_report_due: true,
+            is_factsheet_due: false,
+        }
+    }
+
+    /// What is to be kept.
+    pub const fn record(&self) -> &Record {
+        &self.record
+    }
+
+    /// Whether the record has changed since this was asked.
+    pub const fn take_changed(&mut self) -> bool {
+        std::mem::replace(&mut self.has_changed, false)
+    }
+
+    /// Whether a state was asked for, or is due whatever it says.
+    pub const fn take_report_due(&mut self) -> bool {
+        std::mem::replace(&mut self.is_report_due, false)
+    }
+
+    /// Whether the factsheet was asked for.
+    pub const fn take_factsheet_due(&mut self) -> bool {
+        std::mem::replace(&mut self.is_factsheet_due, false)
+    }
+
+    /// Whether the vehicle is linked.
+    pub const fn is_linked(&self) -> bool {
+        self.status.is_some()
+    }
+
+    /// The next header id of a topic (6.4). They are taken in blocks, so that the record is not written for each message; after a
+    /// start they go on above.
+    pub const fn header_id(&mut self, topic: Topic) -> u32 {
+        /// Of a block.
+        const BLOCK: u32 = 1_000;
+        let (next, kept) = (&mut self.header_ids[topic as usize], &mut self.record.header_ids[topic as usize]);
+        if *next >= *kept {
+            *kept = next.saturating_add(BLOCK);
+            self.has_changed = true;
+        }
+        let id = *next;
+        *next = next.saturating_add(1);
+        id
+    }
+
+    /// A message that cannot be read, or is not for now.
+    pub fn refuse(&mut self, refusal: &Refusal) {
+        let error = refusal.error();
+        self.has_changed = true;
+        self.is_report_due = true;
+        self.record.errors.retain(|known| *known != error);
+        self.record.errors.push(error);
+        if self.record.errors.len() > ERRORS {
+            self.record.errors.remove(0);
+        }
+    }
+
+    /// A message on topic `order`.
+    pub fn order(&mut self, order: Order) {
+        self.is_report_due = true;
+        match self.judge(&order) {
+            Ok(Verdict::Duplicate) => {}
+            Ok(verdict) => self.take(order, verdict),
+            Err(refusal) => {
+                let refusal = refusal.about("topic", "order").about("headerId", order.header.header_id);
+                let refusal = refusal.about("orderId", &order.order_id);
+                self.refuse(&refusal.about("orderUpdateId", order.order_update_id));
+            }
+        }
+    }
+
+    fn judge(&self, order: &Order) -> Result<Verdict, Refusal> {
+        let record = &self.record;
+        let refused = |text: &str| Err(Refusal::new(Kind::Order, text));
+        let Some(status) = &self.status else { return refused("the vehicle is not connected") };
+        if !is_controlled(status.mode) {
+            return refused("the vehicle is not in an automatic mode");
+        }
+        let base = record.nodes.iter().take_while(|node| node.released).last();
+        let last_node = (record.last_node_id.as_str(), record.last_node_sequence_id);
+        let held = Held {
+            order_id: &record.order_id,
+            order_update_id: record.order_update_id,
+            zone_set_id: record.zone_set_id.as_deref(),
+            is_cancelled: record.is_cancelled,
+            is_executing: self.is_executing(),
+            decision_point: Some(base.map_or(last_node, |node| (&node.node_id, node.sequence_id))),
+            last_node,
+            position: status.position.as_ref().map(|at| (at.x, at.y, at.map_id.as_str())),
+        };
+        let verdict = judge(order, &held, &self.policy.can)?;
+        if verdict == Verdict::New && record.spent.contains(&order.order_id) {
+            return refused("the order was replaced by a later one");
+        }
+        if verdict != Verdict::Duplicate {
+            self.is_new(order, verdict)?;
+        }
+        Ok(verdict)
+    }
+
+    /// Actions' ids are used once, and their number is bounded. An update sends its first node again.
+    fn is_new(&self, order: &Order, verdict: Verdict) -> Result<(), Refusal> {
+        let skipped = usize::from(verdict == Verdict::Update);
+        let nodes = order.nodes.iter().skip(skipped).flat_map(|node| &node.actions);
+        let sent: Vec<&Action> = nodes.chain(order.edges.iter().flat_map(|edge| &edge.actions)).collect();
+        let stays = |entry: &&Entry| verdict == Verdict::Update && !self.is_in_horizon(entry.place);
+        let kept: Vec<&Entry> = self.record.actions.iter().filter(stays).collect();
+        if let Some(twice) = sent.iter().find(|sent| kept.iter().any(|kept| kept.action.action_id == sent.action_id)) {
+            let text = "an action of this id is here";
+            return Err(Refusal::new(Kind::Validation, text).about("actionId", &twice.action_id));
+        }
+        if sent.len() + kept.len() > self.policy.can.max_actions {
+            return Err(Refusal::new(Kind::Order, "too many actions").about("actions", sent.len() + kept.len()));
+        }
+        Ok(())
+    }
+
+    fn is_in_horizon(&self, place: Place) -> bool {
+        let nodes = self.record.nodes.iter().filter(|node| !node.released);
+        let edges = self.record.edges.iter().filter(|edge| !edge.released);
+        match place {
+            Place::Node(id) => nodes.map(|node| node.sequence_id).any(|horizon| horizon == id),
+            Place::Edge(id) => edges.map(|edge| edge.sequence_id).any(|horizon| horizon == id),
+            Place::Instant => false,
+        }
+    }
+
+    /// Takes an order that was judged: box 9.
+    fn take(&mut self, order: Order, verdict: Verdict) {
+        let Order { order_id, order_update_id, zone_set_id, mut nodes, edges, .. } = order;
+        if verdict == Verdict::New {
+            let number = self.record.number;
+            let old = std::mem::take(&mut self.record);
+            let Record { last_node_id, last_node_sequence_id, is_paused, header_ids, spent, .. } = old;
+            self.record = Record {
+                spent,
+                last_node_id,
+                last_node_sequence_id,
+                is_paused,
+                header_ids,
+                number,
+                order_id,
+                zone_set_id,
+                ..Record::default()
+            };
+            let instant = old.actions.into_iter().filter(|entry| !entry.is_of_order());
+            std::iter::once(old.order_id)
+                .chain(instant.map(|entry| entry.action.action_id))
+                .for_each(|id| self.record.spend(id));
+        } else {
+            let horizon: Vec<Place> = self.record.actions.iter().map(|entry| entry.place).collect();
+            let mut stays = horizon.iter().map(|place| !self.is_in_horizon(*place)).collect::<Vec<_>>().into_iter();
+            self.record.actions.retain(|_| stays.next().unwrap_or(true));
+            self.record.nodes.retain(|node| node.released);
+            self.record.edges.retain(|edge| edge.released);
+            // The node at which it is joined is here, and stays as it was sent first.
+            nodes.remove(0);
+            let errors = [Kind::Validation, Kind::Order, Kind::OrderUpdate, Kind::NoOrderToCancel].map(Kind::name);
+            self.record.errors.retain(|error| !errors.contains(&error.error_type.as_str()));
+        }
+        self.record.order_update_id = order_update_id;
+        let mut at_edges = edges.iter().map(|edge| (edge.sequence_id, Place::Edge(edge.sequence_id), &edge.actions));
+        let mut actions: Vec<_> =
+            nodes.iter().map(|node| (node.sequence_id, Place::Node(node.sequence_id), &node.actions)).collect();
+        actions.extend(&mut at_edges);
+        actions.sort_by_key(|(sequence, ..)| *sequence);
+        let entries = actions
+            .into_iter()
+            .flat_map(|(_, place, actions)| actions.iter().map(move |action| Entry::new(action.clone(), place)));
+        // Actions at once stay behind those of the order.
+        let (mut order, instant): (Vec<_>, Vec<_>) =
+            std::mem::take(&mut self.record.actions).into_iter().partition(|entry| entry.is_of_order());
+        order.extend(entries);
+        order.extend(instant);
+        self.record.actions = order;
+        self.record.nodes.extend(nodes);
+        self.record.edges.extend(edges);
+        self.has_changed = true;
+        if self.record.nodes.len() > self.record.edges.len() {
+            // The vehicle is at an order's first node, or it would have been refused.
+            self.traverse();
+        }
+    }
+
+    /// Box 3.
+    fn is_executing(&self) -> bool {
+        !self.record.nodes.is_empty() || self.record.actions.iter().any(|entry| !entry.status.has_ended())
+    }
+
+    /// The first node that is left counts as traversed (6.10.2).
+    fn traverse(&mut self) {
+        let record = &mut self.record;
+        if record.nodes.is_empty() {
+            return;
+        }
+        let left = (record.edges.len() == record.nodes.len()).then(|| record.edges.remove(0));
+        let node = record.nodes.remove(0);
+        (record.last_node_id, record.last_node_sequence_id) = (node.node_id, node.sequence_id);
+        for entry in &mut record.actions {
+            if entry.place == Place::Node(node.sequence_id) {
+                entry.is_triggered = true;
+            }
+            let is_on_left = left.as_ref().is_some_and(|edge| entry.place == Place::Edge(edge.sequence_id));
+            if is_on_left && !entry.status.has_ended() {
+                if entry.number == 0 {
+                    entry.end(ActionStatus::Failed, Some("the edge was left".into()));
+                } else {
+                    entry.ends_as.get_or_insert(ActionStatus::Finished);
+                }
+            }
+        }
+        record.drive = None;
+        self.is_drive_sent = false;
+        self.has_changed = true;
+    }
+
+    /// A message on topic `instantActions`. One whose id is known changes nothing.
+    pub fn instant_actions(&mut self, message: InstantActions) {
+        for action in message.actions {
+            let is_known = |entry: &Entry| entry.action.action_id == action.action_id;
+            if self.record.actions.iter().any(is_known) || self.record.spent.contains(&action.action_id) {
+                continue;
+            }
+            if self.record.actions.len() >= self.policy.can.max_actions + INSTANT_ACTIONS {
+                self.refuse(&Refusal::new(Kind::Order, "too many actions").about("actionId", &action.action_id));
+                continue;
+            }
+            self.has_changed = true;
+            self.is_report_due = true;
+            let mut entry = Entry::new(action, Place::Instant);
+            self.begin(&mut entry);
+            self.record.actions.push(entry);
+        }
+        self.forget_instant_actions();
+        self.settle();
+    }
+
+    fn begin(&mut self, entry: &mut Entry) {
+        let finished = (ActionStatus::Finished, None);
+        let running = (ActionStatus::Running, None);
+        let (status, result) = match entry.action.action_type.as_str() {
+            "startPause" => {
+                self.record.is_paused = true;
+                running
+            }
+            "stopPause" => {
+                self.record.is_paused = false;
+                self.record.errors.retain(|error| error.error_type != Kind::BrokerLost.name());
+                finished
+            }
+            "cancelOrder" => return self.cancel(entry),
+            "stateRequest" => finished,
+            "factsheetRequest" => {
+                self.is_factsheet_due = true;
+                finished
+            }
+            "initPosition" if self.is_executing() => {
+                (ActionStatus::Failed, Some("an order is being executed".to_owned()))
+            }
+            "initPosition" => running,
+            _ => match performable(&entry.action, ActionScope::Instant, &self.policy.can) {
+                Ok(_) => {
+                    entry.is_triggered = true;
+                    (ActionStatus::Waiting, None)
+                }
+                Err(refusal) => {
+                    self.refuse(&refusal.about("topic", "instantActions"));
+                    (ActionStatus::Failed, None)
+                }
+            },
+        };
+        (entry.status, entry.result) = (status, result);
+    }
+
+    /// `cancelOrder` (6.6.3): what waits fails, what runs is ended where that can be; then the vehicle stands, and the order is over.
+    fn cancel(&mut self, entry: &mut Entry) {
+        if !self.record.is_order_open() {
+            entry.status = ActionStatus::Failed;
+            let refusal = Refusal::new(Kind::NoOrderToCancel, "there is no order");
+            return self.refuse(&refusal.about("actionId", &entry.action.action_id).about("topic", "instantActions"));
+        }
+        entry.status = ActionStatus::Running;
+        self.give_up_order("the order was cancelled");
+    }
+
+    fn give_up_order(&mut self, why: &str) {
+        self.record.is_cancelled = true;
+        for entry in self.record.actions.iter_mut().filter(|entry| entry.is_of_order()) {
+            let kind = self.policy.can.actions.get(&entry.action.action_type);
+            if entry.status.has_ended() {
+            } else if entry.number == 0 {
+                entry.end(ActionStatus::Failed, Some(why.into()));
+            } else if kind.is_none_or(|kind| kind.can_be_cancelled) {
+                entry.ends_as = Some(ActionStatus::Failed);
+            }
+        }
+        self.has_changed = true;
+    }
+
+    /// Ends what waits for the vehicle to stand: `cancelOrder` and `startPause`.
+    fn settle(&mut self) {
+        let Some(status) = &self.status else { return };
+        let is_controlled = is_controlled(status.mode);
+        // What is driven by hand moves, and has no order all the same.
+        let stands = (!status.is_driving || !is_controlled) && !self.is_drive_sent && !self.is_halt_due;
+        if !is_controlled && !self.record.is_cancelled && self.record.is_order_open() {
+            self.give_up_order("the vehicle is not in an automatic mode");
+        }
+        let is_cancelling = self.record.is_cancelled;
+        if !stands {
+            return;
+        }
+        let runs = self.record.actions.iter().any(|entry| entry.is_of_order() && !entry.status.has_ended());
+        if is_cancelling && !runs && !self.record.nodes.is_empty() {
+            self.record.nodes.clear();
+            self.record.edges.clear();
+            self.record.drive = None;
+            self.has_changed = true;
+        }
+        for entry in &mut self.record.actions {
+            let is_done = match entry.action.action_type.as_str() {
+                "startPause" => true,
+                "cancelOrder" => !runs,
+                _ => false,
+            };
+            if !entry.is_of_order() && entry.status == ActionStatus::Running && is_done {
+                entry.status = ActionStatus::Finished;
+                self.has_changed = true;
+            }
+        }
+    }
+
+    fn forget_instant_actions(&mut self) {
+        let is_old = |entry: &Entry| !entry.is_of_order() && entry.status.has_ended();
+        let mut too_many =
+            self.record.actions.iter().filter(|entry| is_old(entry)).count().saturating_sub(INSTANT_ACTIONS);
+        let (gone, kept) = std::mem::take(&mut self.record.actions).into_iter().partition(|entry| {
+            let goes = too_many > 0 && is_old(entry);
+            too_many -= usize::from(goes);
+            goes
+        });
+        self.record.actions = kept;
+        let gone: Vec<Entry> = gone;
+        gone.into_iter().for_each(|entry| self.record.spend(entry.action.action_id));
+    }
+
+    /// The vehicle has said how it is. The first status of a link says what has become of what the link before had begun.
+    pub fn status(&mut self, status: Status) {
+        let floor = status.drive.max(status.action);
+        if floor > self.record.number {
+            // The record is older than what the vehicle has been told.
+            self.record.number = floor;
+            self.has_changed = true;
+        }
+        if self.record.drive == Some(status.drive) && status.has_arrived {
+            self.traverse();
+        } else if self.is_drive_sent && self.record.drive == Some(status.drive) && !status.is_ordered {
+            self.is_drive_sent = false;
+        }
+        for index in 0..self.record.actions.len() {
+            self.learn(index, &status);
+        }
+        self.status = Some(status);
+        self.settle();
+    }
+
+    /// What a status says of an action.
+    fn learn(&mut self, index: usize, status: &Status) {
+        let entry = &mut self.record.actions[index];
+        if !entry.runs() {
+            return;
+        }
+        if entry.number == status.action {
+            let (ended, ends_as) = (status.action_status.has_ended(), entry.ends_as);
+            if !ended && entry.status != status.action_status && status.action_status != ActionStatus::Waiting {
+                entry.status = status.action_status;
+                self.has_changed = true;
+            }
+            if ended {
+                // What was to end may have ended well before.
+                let how = match (status.action_status, ends_as) {
+                    (ActionStatus::Failed, Some(ends_as)) => ends_as,
+                    (how, _) => how,
+                };
+                self.end(index, how, &status.action_result, ends_as.is_some());
+            }
+        } else if entry.number < status.action {
+            self.end(index, ActionStatus::Failed, "the vehicle has begun another action", false);
+        } else if entry.boot != status.boot {
+            self.end(index, ActionStatus::Failed, "the vehicle restarted: whether it ran is not known", false);
+        } else if entry.ends_as.is_some() && !entry.is_sent {
+            // The vehicle has never heard of it.
+            let how = entry.ends_as.unwrap_or_default();
+            self.end(index, how, "", true);
+        }
+    }
+
+    fn end(&mut self, index: usize, how: ActionStatus, result: &str, was_wanted: bool) {
+        let entry = &mut self.record.actions[index];
+        entry.end(how, Some(result.to_owned()));
+        self.has_changed = true;
+        if how == ActionStatus::Failed && !was_wanted {
+            let refusal = Refusal::new(Kind::Action, if result.is_empty() { "the action failed" } else { result });
+            let about = refusal.about("actionId", &self.record.actions[index].action.action_id);
+            self.refuse(&about);
+        }
+    }
+
+    /// The link to the vehicle is lost: what moved on it has ended.
+    pub fn vehicle_lost(&mut self) {
+        self.status = None;
+        self.is_drive_sent = false;
+        self.is_halt_due = false;
+        self.is_position_sent = false;
+        for entry in &mut self.record.actions {
+            (entry.is_sent, entry.is_end_sent) = (false, false);
+        }
+    }
+
+    /// The broker is there, or not. What came meanwhile is not known: a state is due.
+    pub fn broker(&mut self, is_there: bool, now: Duration) {
+        if is_there {
+            self.had_broker = true;
+            self.broker_lost = None;
+            self.is_held = false;
+            self.is_report_due = true;
+        } else if self.broker_lost.is_none() {
+            self.broker_lost = Some((now, self.status.as_ref().map(|status| status.driven)));
+        }
+    }
+
+    /// Whether the vehicle stands because the broker is away.
+    fn hold(&mut self, now: Duration) {
+        let Some((since, from)) = &mut self.broker_lost else { return };
+        let driven = self.status.as_ref().map(|status| status.driven);
+        let from = *from.get_or_insert(driven.unwrap_or_default());
+        let is_over = match self.policy.on_broker_loss {
+            OnBrokerLoss::Stop => true,
+            OnBrokerLoss::FinishBase { seconds, metres } => {
+                let too_long = now.saturating_sub(*since).as_secs_f64() > seconds;
+                // A comparison that a NaN fails.
+                too_long || !driven.is_none_or(|driven| driven - from <= metres)
+            }
+        };
+        if !is_over || self.is_held {
+            return;
+        }
+        self.is_held = true;
+        let moves = self.record.nodes.first().is_some_and(|node| node.released) && !self.record.is_cancelled;
+        // Before its first connection the program has stopped nothing.
+        if self.had_broker && moves && !self.policy.resumes_by_itself && !self.record.is_paused {
+            self.record.is_paused = true;
+            self.refuse(&Refusal::new(Kind::BrokerLost, "the vehicle stopped while the broker was away"));
+        }
+    }
+
+    /// What the vehicle is to be told now, if anything. The record is to be written before.
+    pub fn next(&mut self, now: Duration) -> Option<Command> {
+        self.hold(now);
+        let status = self.status.as_ref()?;
+        let boot = status.boot;
+        let is_able = is_controlled(status.mode) && status.e_stop == EStop::None && status.stopped.is_none();
+        let may_drive = is_able && !self.record.is_paused && !self.is_held && !self.record.is_cancelled;
+        if self.is_drive_sent && !may_drive {
+            self.is_drive_sent = false;
+            self.is_halt_due = true;
+        }
+        if self.is_halt_due {
+            return Some(Command::Halt);
+        }
+        if now < self.retry_at {
+            return None;
+        }
+        if let Some(command) = self.next_action(boot) {
+            return Some(command);
+        }
+        if !may_drive || self.is_drive_sent {
+            return None;
+        }
+        self.next_drive(boot)
+    }
+
+    fn next_action(&mut self, boot: u64) -> Option<Command> {
+        for entry in &mut self.record.actions {
+            if entry.ends_as.is_some() && entry.runs() && !entry.is_end_sent {
+                entry.is_end_sent = true;
+                return Some(Command::EndAction { number: entry.number });
+            }
+            if entry.runs() && entry.ends_as.is_none() && !entry.is_sent {
+                entry.is_sent = true;
+                return Some(Command::Act { number: entry.number, action: entry.action.clone() });
+            }
+            let is_new_position = entry.action.action_type == "initPosition" && entry.status == ActionStatus::Running;
+            if is_new_position && !entry.is_of_order() && !self.is_position_sent {
+                self.is_position_sent = true;
+                return Some(Command::InitPosition { action: entry.action.clone() });
+            }
+        }
+        if self.record.is_paused || self.is_held {
+            return None;
+        }
+        let index = startable(&self.record.actions, self.policy.actions_at_once)?;
+        self.record.number += 1;
+        self.has_changed = true;
+        let entry = &mut self.record.actions[index];
+        (entry.number, entry.boot, entry.status) = (self.record.number, boot, ActionStatus::Running);
+        entry.is_sent = true;
+        Some(Command::Act { number: entry.number, action: entry.action.clone() })
+    }
+
+    fn next_drive(&mut self, boot: u64) -> Option<Command> {
+        let (edge, node) = (self.record.edges.first()?, self.record.nodes.first()?);
+        if !edge.released || !node.released || block_driving(&self.record.actions) {
+            return None;
+        }
+        let (edge, node) = (Box::new(edge.clone()), Box::new(node.clone()));
+        if self.record.drive.is_none() {
+            let entered = Place::Edge(edge.sequence_id);
+            for entry in self.record.actions.iter_mut().filter(|entry| entry.place == entered && !entry.is_triggered) {
+                entry.is_triggered = true;
+                self.has_changed = true;
+            }
+            // What stands on the edge begins before the vehicle moves there.
+            if let Some(command) = self.next_action(boot) {
+                return Some(command);
+            }
+            if block_driving(&self.record.actions) {
+                return None;
+            }
+            self.record.number += 1;
+            self.record.drive = Some(self.record.number);
+            self.has_changed = true;
+        }
+        self.is_drive_sent = true;
+        self.record.drive.map(|number| Command::Drive { number, edge, node })
+    }
+
+    /// What the vehicle has answered to a command: nothing, or a refusal for people. One that was refused comes again, but for an
+    /// action, which fails.
+    pub fn answered(&mut self, command: &Command, answer: Result<(), Failure>, now: Duration) {
+        let failed = answer.as_ref().is_err();
+        match command {
+            Command::Drive { .. } => {
+                self.is_drive_sent &= !failed;
+                // It may drive all the same.
+                self.is_halt_due |= matches!(answer, Err(Failure::Lost(_)));
+            }
+            Command::Halt => self.is_halt_due = failed,
+            Command::Act { number, .. } => self.acted(*number, answer),
+            Command::EndAction { number } => {
+                if let Some(entry) = self.record.actions.iter_mut().find(|entry| entry.number == *number) {
+                    entry.is_end_sent = !failed;
+                }
+            }
+            Command::InitPosition { action } => self.positioned(action, answer),
+        }
+        if failed {
+            self.retry_at = now + BACK_OFF;
+        }
+        self.settle();
+    }
+
+    fn acted(&mut self, number: u64, answer: Result<(), Failure>) {
+        let Some(index) = self.record.actions.iter().position(|entry| entry.number == number) else { return };
+        match answer {
+            Ok(()) => {}
+            Err(Failure::Refused(why)) => self.end(index, ActionStatus::Failed, &why, false),
+            // It may have begun: the same number is sent again.
+            Err(_) => self.record.actions[index].is_sent = false,
+        }
+    }
+
+    fn positioned(&mut self, action: &Action, answer: Result<(), Failure>) {
+        self.is_position_sent = false;
+        let Some(index) = self.record.actions.iter().position(|entry| entry.action.action_id == action.action_id)
+        else {
+            return;
+        };
+        match answer {
+            Ok(()) => {
+                let named = action.action_parameters.iter().flatten().find(|parameter| parameter.key == "lastNodeId");
+                if let Some(node) = named.and_then(|parameter| parameter.value.as_str()) {
+                    (self.record.last_node_id, self.record.last_node_sequence_id) = (node.to_owned(), 0);
+                }
+                self.end(index, ActionStatus::Finished, "", true);
+            }
+            Err(Failure::Refused(why)) => self.end(index, ActionStatus::Failed, &why, false),
+            Err(_) => {}
+        }
+    }
+
+    /// The state without its header; `None` while the vehicle is not linked, as nothing is known then.
+    pub fn report(&self) -> Option<Report> {
+        self.status.as_ref().map(|status| self.record.report(status, &self.policy.can.maps, self.is_held))
+    }
+}
+
+/// Whether the master's orders count in a mode.
+const fn is_controlled(mode: OperatingMode) -> bool {
+    matches!(mode, OperatingMode::Automatic | OperatingMode::Semiautomatic)
+}

@@ -1,0 +1,495 @@
+//! The order handling of the standard (2.0 and 2.1: 6.6, 6.8 to 6.12), box by box.
+
+mod fake;
+
+use cara_vda5050::message::{
+    ActionScope, BlockingType, Corridor, EStop, Edge, NodePosition, OperatingMode, Order, Trajectory,
+};
+use cara_vda5050::state::{OnBrokerLoss, Policy};
+use fake::{Fake, Pair, instant, order, policy};
+
+const VERSIONS: [&str; 2] = ["2.0.0", "2.1.0"];
+
+/// A way of preparing, what comes then, and what is reported; `""` is no error.
+type Row = (&'static str, fn(&mut Pair), Order, &'static str);
+
+fn nothing(_: &mut Pair) {}
+
+/// Drives a, b; c is the horizon.
+fn half_way(pair: &mut Pair) {
+    pair.machine.order(order("o1", 0, 0, "a! b! c"));
+    pair.turns(10);
+    assert_eq!(pair.left(), "bc c");
+}
+
+/// Has driven all of a, b.
+fn done(pair: &mut Pair) {
+    pair.machine.order(order("o1", 3, 0, "a! b!"));
+    pair.turns(10);
+    assert_eq!(pair.left(), "");
+}
+
+fn cancelled(pair: &mut Pair) {
+    half_way(pair);
+    pair.machine.instant_actions(instant("cancelOrder", "c1"));
+    pair.turns(5);
+    assert_eq!(pair.left(), "");
+}
+
+fn replaced(pair: &mut Pair) {
+    done(pair);
+    pair.machine.order(order("o2", 0, 0, "b! a!"));
+    pair.turns(10);
+}
+
+fn changed(change: impl FnOnce(&mut Order)) -> Order {
+    let mut order = order("o1", 0, 0, "a! b! c");
+    change(&mut order);
+    order
+}
+
+fn edge(change: impl FnOnce(&mut Edge)) -> Order {
+    changed(|order| change(&mut order.edges[0]))
+}
+
+#[test]
+fn each_box_of_the_order_handling() {
+    let rows: Vec<Row> = vec![
+        // Box 1: validity.
+        (
+            "no node",
+            nothing,
+            changed(|order| {
+                order.nodes.clear();
+                order.edges.clear();
+            }),
+            "validationError",
+        ),
+        (
+            "an edge too few",
+            nothing,
+            changed(|order| {
+                order.edges.pop();
+            }),
+            "validationError",
+        ),
+        ("a gap of sequence ids", nothing, changed(|order| order.nodes[1].sequence_id = 4), "validationError"),
+        ("an edge's sequence id", nothing, changed(|order| order.edges[0].sequence_id = 2), "validationError"),
+        ("the highest sequence id", nothing, changed(|order| order.nodes[0].sequence_id = u32::MAX), "validationError"),
+        (
+            "an edge from elsewhere",
+            nothing,
+            changed(|order| order.edges[0].start_node_id = "x".into()),
+            "validationError",
+        ),
+        ("an edge to elsewhere", nothing, changed(|order| order.edges[1].end_node_id = "x".into()), "validationError"),
+        ("no base", nothing, order("o1", 0, 0, "a b c"), "validationError"),
+        ("a base behind the horizon", nothing, order("o1", 0, 0, "a! b c!"), "validationError"),
+        ("an edge ahead of its node", nothing, changed(|order| order.edges[1].released = true), "validationError"),
+        (
+            "an action id twice",
+            nothing,
+            changed(|order| {
+                order.nodes = fake::order("o1", 0, 0, "a!:pick b!:pick c").nodes;
+                order.nodes[1].actions[0].action_id = order.nodes[0].actions[0].action_id.clone();
+            }),
+            "validationError",
+        ),
+        ("one node", nothing, order("o1", 0, 0, "a!"), ""),
+        // What the vehicle cannot do (6.6.4.2).
+        ("an action that it does not have", nothing, order("o1", 0, 0, "a!:dance b!"), "orderError"),
+        ("an id that is too long", nothing, changed(|order| order.edges[0].edge_id = "e".repeat(65)), "orderError"),
+        ("no position", nothing, changed(|order| order.nodes[1].node_position = None), "orderError"),
+        ("a trajectory", nothing, edge(|edge| edge.trajectory = Some(Trajectory::default())), "orderError"),
+        ("a corridor", nothing, edge(|edge| edge.corridor = Some(Corridor::default())), "orderError"),
+        ("an orientation", nothing, edge(|edge| edge.orientation = Some(0.0)), "orderError"),
+        ("a direction", nothing, edge(|edge| edge.direction = Some("left".into())), "orderError"),
+        ("a height", nothing, edge(|edge| edge.max_height = Some(2.0)), "orderError"),
+        ("a least height", nothing, edge(|edge| edge.min_height = Some(2.0)), "orderError"),
+        ("no rotation", nothing, edge(|edge| edge.rotation_allowed = Some(false)), "orderError"),
+        ("a speed of rotation", nothing, edge(|edge| edge.max_rotation_speed = Some(1.0)), "orderError"),
+        (
+            "rotation, a speed, a length",
+            nothing,
+            edge(|edge| {
+                (edge.rotation_allowed, edge.max_speed, edge.length) = (Some(true), Some(1.0), Some(2.0));
+            }),
+            "",
+        ),
+        ("too many nodes", nothing, order("o1", 0, 0, &"a! ".repeat(21)), "orderError"),
+        ("too many actions", nothing, order("o1", 0, 0, &"a!:pick,beep,drop ".repeat(7)), "orderError"),
+        // Boxes 2, 3 and 4: a new order.
+        ("a new order", nothing, order("o1", 7, 0, "a! b!"), ""),
+        ("while one is executed", half_way, order("o2", 0, 0, "b! c!"), "orderError"),
+        ("behind one", done, order("o2", 0, 0, "b! c!"), ""),
+        ("far away", nothing, order("o1", 0, 0, "c! b!"), "orderError"),
+        (
+            "within its deviation",
+            nothing,
+            changed(|order| {
+                let at = NodePosition {
+                    x: 1.9,
+                    allowed_deviation_xy: Some(2.0),
+                    map_id: "hall".into(),
+                    ..NodePosition::default()
+                };
+                order.nodes[0].node_position = Some(at);
+            }),
+            "",
+        ),
+        (
+            "on another map",
+            nothing,
+            changed(|order| {
+                order.nodes[0].node_position.as_mut().unwrap().map_id = "roof".into();
+            }),
+            "orderError",
+        ),
+        ("one that was replaced", replaced, order("o1", 9, 0, "a! b!"), "orderError"),
+        // Boxes 5 and 6.
+        ("a lower update", done, order("o1", 2, 2, "b! c!"), "orderUpdateError"),
+        ("the same again", done, order("o1", 3, 0, "a! b!"), ""),
+        ("the same update with other content", done, order("o1", 3, 2, "b! c!"), ""),
+        // Box 7.
+        ("from the decision point", half_way, order("o1", 1, 2, "b! c!"), ""),
+        ("with another horizon", half_way, order("o1", 1, 2, "b! d e"), ""),
+        ("without a horizon", half_way, order("o1", 5, 2, "b!"), ""),
+        ("from an earlier node", half_way, order("o1", 1, 0, "a! b! c!"), "orderUpdateError"),
+        ("from the horizon", half_way, order("o1", 1, 4, "c! d!"), "orderUpdateError"),
+        ("from the right node at another sequence id", half_way, order("o1", 1, 6, "b! c!"), "orderUpdateError"),
+        (
+            "with another zone set",
+            half_way,
+            {
+                let mut update = order("o1", 1, 2, "b! c!");
+                update.zone_set_id = Some("zones".into());
+                update
+            },
+            "orderUpdateError",
+        ),
+        // Box 8.
+        ("from the last node", done, order("o1", 4, 2, "b! c!"), ""),
+        ("from another node", done, order("o1", 4, 2, "c! d!"), "orderUpdateError"),
+        // Behind cancelOrder (6.6.3.1).
+        ("an update of a cancelled order", cancelled, order("o1", 1, 2, "b! c!"), "orderUpdateError"),
+        ("a new order behind a cancelled one", cancelled, order("o2", 0, 0, "b! c!"), ""),
+    ];
+    for version in VERSIONS {
+        for (name, prepare, order, expected) in &rows {
+            let mut pair = Pair::new("a");
+            prepare(&mut pair);
+            let before = pair.machine.record().clone();
+            let mut order = order.clone();
+            order.header.version = version.into();
+            pair.machine.order(order.clone());
+            let expected: Vec<&str> = expected.split_whitespace().collect();
+            assert_eq!(pair.errors(), expected, "{version}: {name}");
+            let after = pair.machine.record();
+            if let Some(error) = after.errors.first() {
+                let references = error.error_references.as_ref().unwrap();
+                let has = |key: &str, value: &str| {
+                    references.iter().any(|of| of.reference_key == key && of.reference_value == value)
+                };
+                assert!(has("orderId", &order.order_id) && has("headerId", "1") && has("topic", "order"), "{name}");
+                let untouched = (&after.nodes, &after.edges, &after.order_id, after.order_update_id, &after.actions);
+                assert_eq!(
+                    untouched,
+                    (&before.nodes, &before.edges, &before.order_id, before.order_update_id, &before.actions)
+                );
+            }
+            // The next order that is taken clears it.
+            if *name == "far away" {
+                pair.machine.order(fake::order("o9", 0, 0, "a! b!"));
+                assert!(pair.errors().is_empty(), "{name}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_order_is_driven_node_by_node_and_not_beyond_its_base() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b! c! d e"));
+    assert_eq!(pair.left(), "ab! b! bc! c! cd d de e");
+    pair.turns(20);
+    assert_eq!((pair.left().as_str(), pair.machine.record().last_node_id.as_str()), ("cd d de e", "c"));
+    assert!(pair.machine.report().unwrap().new_base_request == Some(true));
+    pair.machine.order(order("o1", 1, 4, "c! x! y"));
+    assert_eq!(pair.left(), "cx! x! xy y");
+    pair.turns(20);
+    let reached: Vec<&str> = pair.vehicle.reached.iter().map(|(node, _)| node.as_str()).collect();
+    assert_eq!(reached, ["b", "c", "x"]);
+}
+
+#[test]
+fn blocking_types_decide_what_runs_beside_what() {
+    // The way, and what the log of the vehicle is: nodes and actions as they begin.
+    let rows = [
+        ("a!:beep=HARD b!", "beep|b"),
+        ("a!:beep=SOFT b!", "beep|b"),
+        ("a!:beep b!", "beep b"),
+        ("a!:beep,pick=HARD b!", "beep|pick|b"),
+        ("a! b!/beep", "beep b"),
+        ("a! b!/beep=SOFT", "beep|b"),
+    ];
+    for (way, expected) in rows {
+        let mut pair = Pair::new("a");
+        pair.machine.order(order("o1", 0, 0, way));
+        let mut log = Vec::new();
+        for _ in 0..20 {
+            let (began, reached) = (pair.vehicle.began.len(), pair.vehicle.reached.len());
+            pair.tell();
+            let actions = pair.vehicle.began[began..].iter().map(|id| id.rsplit('-').next().unwrap().to_owned());
+            let turn: Vec<String> =
+                actions.chain(pair.vehicle.reached[reached..].iter().map(|(node, _)| node.clone())).collect();
+            log.extend((!turn.is_empty()).then(|| turn.join(" ")));
+            pair.turn();
+        }
+        assert_eq!(log.join("|"), expected, "{way}");
+        assert!(pair.actions().iter().all(|action| action.ends_with("FINISHED")), "{way}: {:?}", pair.actions());
+    }
+}
+
+#[test]
+fn actions_run_side_by_side_where_the_vehicle_can() {
+    use cara_vda5050::actions::{Entry, Place, block_driving, startable};
+    let entry = |blocking: BlockingType, number: u64| {
+        let action = cara_vda5050::message::Action { blocking_type: blocking, ..Default::default() };
+        let mut entry = Entry::new(action, Place::Node(0));
+        (entry.is_triggered, entry.number) = (true, number);
+        entry
+    };
+    let (none, soft, hard) = (BlockingType::None, BlockingType::Soft, BlockingType::Hard);
+    // (actions with whether they run, how many at once, the next, whether it stands)
+    let rows: [(&[(BlockingType, u64)], usize, Option<usize>, bool); 9] = [
+        (&[(none, 0), (soft, 0)], 4, Some(0), true),
+        (&[(none, 1), (soft, 0)], 4, Some(1), true),
+        (&[(none, 1), (soft, 0)], 1, None, true),
+        (&[(none, 1), (hard, 0)], 4, None, true),
+        (&[(hard, 0), (none, 0)], 4, Some(0), true),
+        (&[(hard, 1), (none, 0)], 4, None, true),
+        (&[(none, 1), (none, 2), (none, 0)], 3, Some(2), false),
+        (&[(none, 1), (none, 2), (none, 0)], 2, None, false),
+        (&[], 1, None, false),
+    ];
+    for (actions, at_once, next, stands) in rows {
+        let entries: Vec<Entry> = actions.iter().map(|(blocking, number)| entry(*blocking, *number)).collect();
+        assert_eq!((startable(&entries, at_once), block_driving(&entries)), (next, stands), "{actions:?}");
+    }
+}
+
+#[test]
+fn an_edges_action_ends_with_the_edge() {
+    let mut pair = Pair::new("a");
+    pair.vehicle.steps = 2;
+    pair.machine.order(order("o1", 0, 0, "a! b!/beep,pick c!"));
+    pair.tell();
+    // It lasts longer than the drive.
+    pair.vehicle.steps = 50;
+    pair.turns(10);
+    // Only one runs at once: the other one never began.
+    assert_eq!(pair.actions()[1], "o1-b2e-pick FAILED");
+    assert_eq!(pair.actions()[0], "o1-b2e-beep FINISHED");
+    assert_eq!(pair.vehicle.began, ["o1-b2e-beep"]);
+}
+
+#[test]
+fn a_pause_stops_the_vehicle_and_keeps_the_order() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+    pair.turn();
+    pair.machine.instant_actions(instant("startPause", "p1"));
+    assert_eq!(pair.actions(), ["p1 RUNNING"], "it still drives");
+    pair.turns(5);
+    assert_eq!(pair.actions(), ["p1 FINISHED"]);
+    let report = pair.machine.report().unwrap();
+    assert_eq!((report.paused, report.driving, pair.left().as_str()), (Some(true), false, "ab! b! bc! c!"));
+    pair.machine.instant_actions(instant("stopPause", "p2"));
+    pair.turns(10);
+    assert_eq!((pair.left().as_str(), pair.vehicle.reached.len()), ("", 2));
+}
+
+#[test]
+fn a_cancelled_order_ends_when_the_vehicle_stands_and_its_actions_have_ended() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a!:beep b! c!:pick"));
+    pair.turn();
+    pair.machine.instant_actions(instant("cancelOrder", "c1"));
+    assert_eq!(pair.actions(), ["o1-a0n-beep RUNNING", "o1-c4n-pick FAILED", "c1 RUNNING"]);
+    pair.turns(3);
+    assert_eq!(pair.actions(), ["o1-a0n-beep FAILED", "o1-c4n-pick FAILED", "c1 FINISHED"]);
+    let report = pair.machine.report().unwrap();
+    assert_eq!((report.order_id.as_str(), report.node_states.len(), report.edge_states.len()), ("o1", 0, 0));
+    assert!(!report.driving && pair.errors().is_empty());
+    // What cannot be cancelled is awaited.
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a!:drop=HARD b!"));
+    pair.vehicle.steps = 8;
+    pair.turn();
+    pair.machine.instant_actions(instant("cancelOrder", "c1"));
+    pair.turns(3);
+    assert_eq!(pair.actions(), ["o1-a0n-drop RUNNING", "c1 RUNNING"]);
+    pair.turns(10);
+    assert_eq!(pair.actions(), ["o1-a0n-drop FINISHED", "c1 FINISHED"]);
+}
+
+#[test]
+fn what_is_not_there_cannot_be_cancelled() {
+    for prepare in [nothing, done, cancelled] {
+        let mut pair = Pair::new("a");
+        prepare(&mut pair);
+        pair.machine.instant_actions(instant("cancelOrder", "c9"));
+        assert_eq!(pair.actions().last().unwrap(), "c9 FAILED");
+        assert_eq!(pair.errors(), ["noOrderToCancel"]);
+        let error = &pair.machine.record().errors[0];
+        let references = error.error_references.as_ref().unwrap();
+        assert!(references.iter().any(|of| of.reference_key == "actionId" && of.reference_value == "c9"));
+    }
+}
+
+#[test]
+fn instant_actions_are_done_once() {
+    let mut pair = Pair::new("a");
+    for (kind, id, expected) in [
+        ("stateRequest", "i1", "FINISHED"),
+        ("factsheetRequest", "i2", "FINISHED"),
+        ("initPosition", "i3", "FINISHED"),
+        ("beep", "i4", "FINISHED"),
+        ("dance", "i5", "FAILED"),
+    ] {
+        pair.machine.take_report_due();
+        pair.machine.instant_actions(instant(kind, id));
+        assert!(pair.machine.take_report_due(), "{kind}");
+        assert_eq!(pair.machine.take_factsheet_due(), kind == "factsheetRequest");
+        pair.turns(5);
+        assert_eq!(pair.actions().last().unwrap(), &format!("{id} {expected}"));
+    }
+    assert_eq!(pair.errors(), ["orderError"]);
+    pair.machine.instant_actions(instant("beep", "i4"));
+    // A late copy behind the next order does nothing either, above all no cancelOrder.
+    pair.machine.instant_actions(instant("cancelOrder", "i6"));
+    pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+    pair.turn();
+    for (kind, id) in [("cancelOrder", "i6"), ("beep", "i4")] {
+        pair.machine.instant_actions(instant(kind, id));
+    }
+    pair.turns(10);
+    assert_eq!((pair.vehicle.began.as_slice(), pair.vehicle.reached.len()), (["i4".to_owned()].as_slice(), 2));
+}
+
+#[test]
+fn init_position_waits_for_no_order() {
+    let mut pair = Pair::new("a");
+    half_way(&mut pair);
+    pair.machine.instant_actions(instant("initPosition", "i1"));
+    assert_eq!(pair.actions(), ["i1 FAILED"]);
+}
+
+#[test]
+fn another_mode_ends_the_order() {
+    for mode in [OperatingMode::Manual, OperatingMode::Service, OperatingMode::Teachin] {
+        let mut pair = Pair::new("a");
+        pair.machine.order(order("o1", 0, 0, "a! b!:pick c!"));
+        pair.turn();
+        pair.vehicle.status.mode = mode;
+        pair.machine.status(pair.vehicle.status.clone());
+        pair.tell();
+        assert_eq!((pair.left().as_str(), pair.actions()), ("", vec!["o1-b2n-pick FAILED".to_owned()]));
+        assert!(!pair.vehicle.status.is_driving);
+        pair.machine.order(order("o2", 0, 0, "a! b!"));
+        assert_eq!(pair.errors(), ["orderError"]);
+    }
+}
+
+#[test]
+fn a_stopped_vehicle_keeps_its_order() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+    pair.turn();
+    let stops: [fn(&mut Fake); 2] = [
+        |vehicle| vehicle.status.stopped = Some("stopped by its operator".into()),
+        |vehicle| vehicle.status.e_stop = EStop::Manual,
+    ];
+    for stop in stops {
+        stop(&mut pair.vehicle);
+        pair.vehicle.unlink();
+        pair.machine.status(pair.vehicle.status.clone());
+        pair.turns(5);
+        assert!(!pair.vehicle.status.is_driving && pair.left() == "ab! b! bc! c!");
+        let fatal: Vec<_> = pair.machine.report().unwrap().errors;
+        assert_eq!(fatal.len(), usize::from(pair.vehicle.status.stopped.is_some()));
+        (pair.vehicle.status.stopped, pair.vehicle.status.e_stop) = (None, EStop::None);
+        pair.machine.status(pair.vehicle.status.clone());
+        pair.tell();
+        assert!(pair.vehicle.status.is_driving, "it goes on once it is reset");
+    }
+}
+
+#[test]
+fn an_action_of_unknown_outcome_fails_and_is_not_repeated() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a!:pick=HARD b!"));
+    pair.turn();
+    pair.machine.vehicle_lost();
+    pair.vehicle.reboot();
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.turns(10);
+    assert_eq!((pair.actions(), pair.errors()), (vec!["o1-a0n-pick FAILED".to_owned()], vec!["actionError"]));
+    assert_eq!((pair.vehicle.began.len(), pair.left().as_str()), (1, ""));
+}
+
+#[test]
+fn nothing_is_reported_of_a_vehicle_that_is_not_linked() {
+    let mut pair = Pair::new("a");
+    half_way(&mut pair);
+    pair.machine.vehicle_lost();
+    assert!(pair.machine.report().is_none());
+    pair.machine.order(order("o1", 1, 2, "b! c!"));
+    assert_eq!(pair.errors(), ["orderError"]);
+    pair.machine.status(pair.vehicle.status.clone());
+    assert_eq!(pair.left(), "bc c");
+}
+
+/// For each policy: how far the vehicle gets while the broker is away, and whether it goes on when it is back.
+#[test]
+fn the_loss_of_the_broker_is_bounded() {
+    let far = OnBrokerLoss::FinishBase { seconds: 600.0, metres: 600.0 };
+    let short = OnBrokerLoss::FinishBase { seconds: 600.0, metres: 3.0 };
+    let brief = OnBrokerLoss::FinishBase { seconds: 0.3, metres: 600.0 };
+    for (on_broker_loss, by_itself, reached, goes_on) in [
+        (far, false, "d", true),
+        (short, false, "d", false),
+        (short, true, "d", true),
+        (brief, false, "c", false),
+        (OnBrokerLoss::Stop, false, "b", false),
+        (OnBrokerLoss::Stop, true, "b", true),
+    ] {
+        let mut pair = Pair::with("a", Policy { on_broker_loss, resumes_by_itself: by_itself, ..policy() });
+        pair.machine.order(order("o1", 0, 0, "a! b! c! d! e"));
+        pair.turn();
+        pair.machine.broker(false, pair.now);
+        pair.turns(30);
+        let last = pair.vehicle.reached.last().unwrap().0.clone();
+        assert!(!pair.vehicle.status.is_driving, "{on_broker_loss:?}");
+        assert_eq!(last, reached, "{on_broker_loss:?}");
+        let stopped = pair.left() != "de e";
+        pair.machine.broker(true, pair.now);
+        pair.turns(30);
+        assert_eq!(pair.left() == "de e", goes_on, "{on_broker_loss:?} {by_itself}");
+        assert_eq!(pair.errors().contains(&"brokerLost"), stopped && !by_itself, "{on_broker_loss:?}");
+        pair.machine.instant_actions(instant("stopPause", "p1"));
+        pair.turns(30);
+        assert_eq!((pair.left().as_str(), pair.errors().len()), ("de e", 0));
+    }
+}
+
+#[test]
+fn scopes_of_actions_are_kept() {
+    let mut policy = policy();
+    policy.can.actions.get_mut("pick").unwrap().scopes = vec![ActionScope::Node];
+    for (way, expected) in [("a!:pick b!", 0), ("a! b!/pick", 1)] {
+        let mut pair = Pair::with("a", policy.clone());
+        pair.machine.order(order("o1", 0, 0, way));
+        assert_eq!(pair.errors().len(), expected, "{way}");
+    }
+}
