@@ -1,8 +1,18 @@
 //! Vehicles of CARA under VDA 5050 2.0 and 2.1.
+//!
+//! [`machine`] decides, and has no I/O: orders ([`order`]), actions ([`actions`]), errors ([`errors`]) and the state that is reported
+//! ([`state`]). [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`]), [`mqtt`] is the broker, [`gateway`] joins
+//! them, [`config`] is its file. `docs/vda5050.md` says what of the standard is there.
 
 pub mod actions;
+pub mod config;
+pub mod driver;
 pub mod errors;
+pub mod gateway;
 pub mod machine;
 pub mod message;
+pub mod mqtt;
 pub mod order;
+pub mod record;
 pub mod state;
+pub mod vehicle;

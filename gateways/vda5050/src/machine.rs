@@ -98,6 +98,11 @@ impl Machine {
         self.status.is_some()
     }
 
+    /// Whether the vehicle moves or handles something, or is to.
+    pub fn is_busy(&self) -> bool {
+        self.record.is_order_open() || self.record.actions.iter().any(|entry| !entry.status.has_ended())
+    }
+
     /// The next header id of a topic (6.4). They are taken in blocks, so that the record is not written for each message; after a
     /// start they go on above.
     pub const fn header_id(&mut self, topic: Topic) -> u32 {

@@ -1,0 +1,236 @@
+//! The gateway's file: `example.toml` shows all of it.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use serde::Deserialize;
+
+use crate::message::Factsheet;
+use crate::order::Capabilities;
+use crate::state::{OnBrokerLoss, Policy};
+
+/// All of it.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Who the gateway is among the units of CARA.
+    pub manager: Manager,
+    /// Where the master is.
+    pub broker: Broker,
+    /// How vehicles are shown to it.
+    pub vda5050: Vda5050,
+    /// What they can do.
+    #[serde(default)]
+    pub capabilities: Capabilities,
+    /// The vehicles.
+    pub vehicle: Vec<Vehicle>,
+}
+
+/// The m_unit whose vehicles these are.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manager {
+    /// Its name.
+    pub name: String,
+    /// Its ID number.
+    pub id: u32,
+    /// Its fleet.
+    pub fleet: u32,
+    /// Its keys, if they are not where `CARA_KEYS` says.
+    pub key_file: Option<PathBuf>,
+    /// Where its claim and the records of the vehicles are kept.
+    pub state_folder: PathBuf,
+    /// Only vehicles of this host.
+    #[serde(default)]
+    pub only_this_host: bool,
+}
+
+/// The MQTT broker.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Broker {
+    /// Its name or address.
+    pub host: String,
+    /// Its port; 8883 is usual with TLS.
+    #[serde(default = "port")]
+    pub port: u16,
+    /// Name and password.
+    pub user: Option<String>,
+    /// A file with the password.
+    pub password_file: Option<PathBuf>,
+    /// The authorities of the broker's certificate, as PEM. With it the connection is TLS 1.2 or 1.3.
+    pub ca_file: Option<PathBuf>,
+    /// The gateway's own certificate, as PEM.
+    pub certificate_file: Option<PathBuf>,
+    /// Its key.
+    pub key_file: Option<PathBuf>,
+    /// Seconds between signs of life.
+    #[serde(default = "keep_alive")]
+    pub keep_alive: u16,
+    /// Milliseconds between probes: messages of each vehicle to its own topic `cara-probe` and back. 0 sends none.
+    #[serde(default = "probe")]
+    pub probe: u64,
+    /// Milliseconds without a probe coming back after which the broker counts as away.
+    #[serde(default = "probe_timeout")]
+    pub probe_timeout: u64,
+}
+
+const fn port() -> u16 {
+    1883
+}
+const fn keep_alive() -> u16 {
+    15
+}
+const fn probe() -> u64 {
+    500
+}
+const fn probe_timeout() -> u64 {
+    2_000
+}
+
+/// How vehicles are shown to the master.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Vda5050 {
+    /// Whole version, as in messages: 2.0.x or 2.1.x.
+    pub version: String,
+    /// First level of the topics.
+    #[serde(default = "interface_name")]
+    pub interface_name: String,
+    /// Third level of the topics.
+    pub manufacturer: String,
+    /// What a vehicle does while the broker is away.
+    pub on_broker_loss: OnBrokerLoss,
+    /// Whether one that stood for that goes on by itself; else it waits for `stopPause`.
+    #[serde(default)]
+    pub resumes_by_itself: bool,
+    /// Seconds between states while nothing happens, 30 at most.
+    #[serde(default = "state_every")]
+    pub state_every: f64,
+    /// Seconds between states at least, whatever happens.
+    #[serde(default = "state_interval")]
+    pub state_interval: f64,
+    /// Seconds between messages of topic `visualization`; 0 sends none.
+    #[serde(default)]
+    pub visualization_every: f64,
+    /// Orders and instant actions older than so many seconds are refused; 0 takes all. For synchronised clocks only.
+    #[serde(default)]
+    pub oldest: f64,
+    /// The factsheet of the series, as JSON.
+    pub factsheet: PathBuf,
+}
+
+fn interface_name() -> String {
+    "uagv".into()
+}
+const fn state_every() -> f64 {
+    10.0
+}
+const fn state_interval() -> f64 {
+    0.2
+}
+
+/// A vehicle: an s_unit of CARA.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Vehicle {
+    /// Its name in CARA.
+    pub name: String,
+    /// Its ID number in CARA.
+    pub id: u32,
+    /// Its serial number, the fourth level of its topics.
+    pub serial_number: String,
+}
+
+impl Config {
+    /// Reads and checks a file. Paths in it are relative to its folder.
+    pub fn read(file: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
+        let mut config: Self = toml::from_str(&text).with_context(|| file.display().to_string())?;
+        let folder = file.parent().unwrap_or(Path::new(""));
+        let Self { manager, broker, vda5050, .. } = &mut config;
+        let files =
+            [&mut broker.password_file, &mut broker.ca_file, &mut broker.certificate_file, &mut broker.key_file];
+        let files = files.into_iter().chain([&mut manager.key_file]).flatten();
+        files.chain([&mut manager.state_folder, &mut vda5050.factsheet]).for_each(|path| *path = folder.join(&*path));
+        config.check().with_context(|| file.display().to_string())?;
+        Ok(config)
+    }
+
+    fn check(&self) -> Result<()> {
+        let Self { broker, vda5050, vehicle, .. } = self;
+        let is_known = ["2.0.", "2.1."].iter().any(|version| vda5050.version.starts_with(version));
+        ensure!(is_known, "version {} is not 2.0.x or 2.1.x", vda5050.version);
+        for level in [&vda5050.interface_name, &vda5050.manufacturer] {
+            ensure!(is_level(level, false), "{level:?} cannot be a level of a topic");
+        }
+        ensure!(!vehicle.is_empty(), "there is no vehicle");
+        let mut serial_numbers = BTreeSet::new();
+        for vehicle in vehicle {
+            let serial = &vehicle.serial_number;
+            ensure!(is_level(serial, true), "serial number {serial:?} has other characters than A-Z a-z 0-9 _ . : -");
+            ensure!(serial_numbers.insert(serial), "serial number {serial} is there twice");
+        }
+        let seconds = [vda5050.state_every, vda5050.state_interval, vda5050.visualization_every, vda5050.oldest];
+        ensure!(seconds.iter().all(|seconds| (0.0..1e6).contains(seconds)), "intervals are from 0 to 1,000,000 s");
+        ensure!((1.0..=30.0).contains(&vda5050.state_every), "state_every is from 1 to 30 s (6.10)");
+        if let OnBrokerLoss::FinishBase { seconds, metres } = vda5050.on_broker_loss {
+            ensure!(
+                (0.0..1e6).contains(&seconds) && (0.0..1e6).contains(&metres),
+                "limits of finish-base are not negative"
+            );
+        }
+        ensure!(broker.keep_alive >= 5, "keep_alive is 5 s at least");
+        ensure!(broker.probe == 0 || broker.probe_timeout > broker.probe, "probe_timeout is longer than probe");
+        ensure!(
+            broker.certificate_file.is_some() == broker.key_file.is_some(),
+            "a certificate and its key go together"
+        );
+        ensure!(broker.certificate_file.is_none() || broker.ca_file.is_some(), "TLS needs ca_file");
+        ensure!(broker.user.is_some() || broker.password_file.is_none(), "a password needs its user");
+        Ok(())
+    }
+
+    /// How a vehicle is driven.
+    pub fn policy(&self) -> Policy {
+        Policy {
+            can: self.capabilities.clone(),
+            on_broker_loss: self.vda5050.on_broker_loss,
+            resumes_by_itself: self.vda5050.resumes_by_itself,
+            // The interface to vehicles has one actuator for actions.
+            actions_at_once: 1,
+        }
+    }
+
+    /// The factsheet of the series; the gateway writes the header.
+    pub fn factsheet(&self) -> Result<Factsheet> {
+        let file = &self.vda5050.factsheet;
+        let text = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
+        let mut value: serde_json::Value = serde_json::from_slice(&text).with_context(|| file.display().to_string())?;
+        let object = value.as_object_mut().with_context(|| format!("{} is no JSON object", file.display()))?;
+        for (name, any) in [("headerId", 0.into()), ("timestamp", "".into()), ("version", "".into())] {
+            object.insert(name.into(), any);
+        }
+        for name in ["manufacturer", "serialNumber"] {
+            object.insert(name.into(), "".into());
+        }
+        serde_json::from_value(value).with_context(|| file.display().to_string())
+    }
+
+    /// The topics of a vehicle, up to its own name.
+    pub fn prefix(&self, vehicle: &Vehicle) -> String {
+        let Vda5050 { interface_name, manufacturer, .. } = &self.vda5050;
+        format!("{interface_name}/v2/{manufacturer}/{}", vehicle.serial_number)
+    }
+}
+
+fn is_level(text: &str, is_serial: bool) -> bool {
+    let fits = |letter: char| match letter {
+        '_' | '.' | ':' | '-' => true,
+        _ if is_serial => letter.is_ascii_alphanumeric(),
+        _ => !letter.is_control() && !"/+#$".contains(letter),
+    };
+    // A serial number names a file as well.
+    !text.is_empty() && text.len() <= 64 && text.chars().all(fits) && !text.chars().all(|letter| letter == '.')
+}

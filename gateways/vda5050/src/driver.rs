@@ -1,0 +1,87 @@
+//! Drives a [`Machine`]: writes its record, then tells its vehicle.
+
+use std::io;
+use std::time::Duration;
+
+use crate::machine::Machine;
+use crate::record::Keep;
+use crate::state::{Command, Failure, Status};
+
+/// While it moves or handles something, the vehicle is asked so often.
+const ASKED_BUSY: Duration = Duration::from_millis(100);
+/// And while it is idle.
+const ASKED_IDLE: Duration = Duration::from_millis(500);
+
+/// The side to the vehicle.
+pub trait Vehicle {
+    /// How it is; `Ok(None)` without a link.
+    fn status(&mut self) -> Result<Option<Status>, Failure>;
+    /// Tells it something, and waits for its answer.
+    fn tell(&mut self, command: &Command) -> Result<(), Failure>;
+}
+
+/// A machine with its record and its vehicle.
+#[derive(Debug)]
+pub struct Driver<V, K> {
+    /// Decides.
+    pub machine: Machine,
+    vehicle: V,
+    record: K,
+    is_kept: bool,
+    asked: Option<Duration>,
+}
+
+impl<V: Vehicle, K: Keep> Driver<V, K> {
+    /// Nothing is asked or told yet.
+    pub const fn new(machine: Machine, vehicle: V, record: K) -> Self {
+        Self { machine, vehicle, record, is_kept: true, asked: None }
+    }
+
+    /// The side to the vehicle.
+    pub const fn vehicle_mut(&mut self) -> &mut V {
+        &mut self.vehicle
+    }
+
+    /// Asks the vehicle if that is due, and tells it what follows. After an error nothing was told that is not on disk, and no
+    /// state may be published.
+    pub fn turn(&mut self, now: Duration) -> io::Result<()> {
+        self.ask(now);
+        self.keep()?;
+        while let Some(command) = self.machine.next(now) {
+            self.keep()?;
+            let answer = self.vehicle.tell(&command);
+            let failed = answer.is_err();
+            self.machine.answered(&command, answer, now);
+            // What it does now is asked at once.
+            self.asked = None;
+            if failed {
+                break;
+            }
+        }
+        self.keep()
+    }
+
+    /// Writes the record if it has changed.
+    pub fn keep(&mut self) -> io::Result<()> {
+        self.is_kept &= !self.machine.take_changed();
+        if !self.is_kept {
+            self.record.keep(self.machine.record())?;
+            self.is_kept = true;
+        }
+        Ok(())
+    }
+
+    fn ask(&mut self, now: Duration) {
+        let every = if self.machine.is_busy() { ASKED_BUSY } else { ASKED_IDLE };
+        if self.asked.is_some_and(|asked| now.saturating_sub(asked) < every) {
+            return;
+        }
+        self.asked = Some(now);
+        match self.vehicle.status() {
+            Ok(Some(status)) => self.machine.status(status),
+            Ok(None) => self.machine.vehicle_lost(),
+            // It is asked again; without a link it has stopped by itself.
+            Err(_) => {}
+        }
+    }
+}

@@ -1,0 +1,391 @@
+//! One vehicle between its master and CARA: a thread with the vehicle's machine, its link and its client of the broker.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant, SystemTime};
+
+use anyhow::{Context, Result};
+use cara_std::{CommunicationSystem, Identity};
+use rumqttc::{Client, QoS};
+use serde::Serialize;
+
+use crate::config::{self, Config};
+use crate::driver::Driver;
+use crate::errors::{Kind, Refusal};
+use crate::machine::{Machine, Topic};
+use crate::message::{
+    Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State, Visualization, read,
+};
+use crate::mqtt::{Heard, Link, Place};
+use crate::record::Store;
+use crate::vehicle::Linked;
+
+/// The loop comes round so often.
+const TURN: Duration = Duration::from_millis(20);
+/// The loop's heart, for the leases of the vehicle.
+pub const HEART: Duration = Duration::from_millis(500);
+/// What is sent last waits so long for its acknowledgement.
+const LAST_WORDS: Duration = Duration::from_secs(2);
+
+/// Whether the program ends, for all its threads.
+#[derive(Debug, Default)]
+pub struct End {
+    /// It does.
+    pub is_due: AtomicBool,
+    /// Another gateway speaks for the vehicles: nothing is said on `connection`.
+    pub is_silent: AtomicBool,
+}
+
+/// Runs one vehicle until `end`.
+pub fn run(config: &Config, vehicle: &config::Vehicle, system: &CommunicationSystem, end: &End) -> Result<()> {
+    let mut gateway = Gateway::start(config, vehicle, system)?;
+    while !end.is_due.load(Ordering::SeqCst) {
+        let turn = Instant::now();
+        gateway.turn();
+        std::thread::sleep(TURN.saturating_sub(turn.elapsed()));
+    }
+    gateway.stop(end.is_silent.load(Ordering::SeqCst));
+    Ok(())
+}
+
+struct Gateway {
+    config: Config,
+    serial_number: String,
+    prefix: String,
+    factsheet: Factsheet,
+    driver: Driver<Linked, Store>,
+    link: Link,
+    client: Option<Client>,
+    began: Instant,
+    /// A probe was sent, and one came back.
+    probed: [Instant; 2],
+    is_broker_there: bool,
+    /// What topic `connection` says.
+    shown: Option<ConnectionState>,
+    reported: Option<(Report, Instant)>,
+    visualized: Instant,
+    /// Header id of the next last will.
+    will: Arc<AtomicU32>,
+}
+
+impl Gateway {
+    fn start(config: &Config, vehicle: &config::Vehicle, system: &CommunicationSystem) -> Result<Self> {
+        let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
+        let peer = system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;
+        let folder = config.manager.state_folder.join("vda5050");
+        let (store, record) = Store::open(&folder, &vehicle.serial_number)?;
+        let machine = Machine::new(record, config.policy(), Duration::ZERO);
+        let driver = Driver::new(machine, Linked::new(peer, system.heart(HEART)), store);
+        let prefix = config.prefix(vehicle);
+        let will = Arc::new(AtomicU32::new(0));
+        let (serial_number, shared, header_id) = (vehicle.serial_number.clone(), config.clone(), will.clone());
+        let last_words = move || {
+            let header = header(&shared, &serial_number, header_id.load(Ordering::SeqCst));
+            json(&Connection { header, connection_state: ConnectionState::Broken })
+        };
+        let client_id = format!("{}-{}", config.vda5050.manufacturer, vehicle.serial_number);
+        let link = Link::start(Place {
+            broker: config.broker.clone(),
+            client_id,
+            prefix: prefix.clone(),
+            will: Box::new(last_words),
+        })?;
+        let now = Instant::now();
+        Ok(Self {
+            serial_number: vehicle.serial_number.clone(),
+            factsheet: config.factsheet()?,
+            config: config.clone(),
+            prefix,
+            driver,
+            link,
+            client: None,
+            began: now,
+            probed: [now; 2],
+            is_broker_there: false,
+            shown: None,
+            reported: None,
+            visualized: now,
+            will,
+        })
+    }
+
+    fn turn(&mut self) {
+        self.driver.vehicle_mut().beat();
+        while let Ok(heard) = self.link.heard.try_recv() {
+            self.hear(heard);
+        }
+        self.probe();
+        let now = self.began.elapsed();
+        if let Err(error) = self.driver.turn(now) {
+            // Nothing is said that would not be known after a restart.
+            eprintln!("{}: the record cannot be written: {error}", self.serial_number);
+            std::thread::sleep(Duration::from_millis(200));
+            return;
+        }
+        self.publish();
+    }
+
+    fn hear(&mut self, heard: Heard) {
+        match heard {
+            Heard::Connected(client) => {
+                let topics = ["order", "instantActions", "connection", "cara-probe"];
+                for topic in topics {
+                    let _ = client.try_subscribe(format!("{}/{topic}", self.prefix), QoS::AtMostOnce);
+                }
+                self.client = Some(client);
+                self.probed = [Instant::now(); 2];
+                self.shown = None;
+                self.broker(true);
+                let _ = self.send_factsheet();
+            }
+            Heard::Lost(why) => {
+                if self.client.take().is_some() {
+                    eprintln!("{}: the broker is away: {why}", self.serial_number);
+                }
+                self.broker(false);
+            }
+            Heard::Message(topic, is_retained, bytes) => match topic.as_str() {
+                "order" => match self.checked::<Order>("order", is_retained, &bytes) {
+                    Ok(order) => self.driver.machine.order(order),
+                    Err(refusal) => self.driver.machine.refuse(&refusal),
+                },
+                "instantActions" => match self.checked::<InstantActions>("instantActions", is_retained, &bytes) {
+                    Ok(message) => self.driver.machine.instant_actions(message),
+                    Err(refusal) => self.driver.machine.refuse(&refusal),
+                },
+                // An earlier client's last will came late.
+                "connection" => {
+                    let said = read::<Connection>(&bytes).map(|said| said.connection_state);
+                    if said.ok() != self.shown && !is_retained {
+                        self.shown = None;
+                    }
+                }
+                _ => self.probed[1] = Instant::now(),
+            },
+            Heard::Acknowledged => {}
+        }
+    }
+
+    /// A message for this vehicle, of now.
+    fn checked<T: serde::de::DeserializeOwned + HasHeader>(
+        &self,
+        topic: &str,
+        is_retained: bool,
+        bytes: &[u8],
+    ) -> Result<T, Refusal> {
+        let refused = |text: String| Refusal::new(Kind::Validation, text).about("topic", topic);
+        if is_retained {
+            return Err(refused("a retained message is not of now".into()));
+        }
+        let message: T = read(bytes).map_err(|error| refused(error.to_string()))?;
+        let Header { header_id, timestamp, version, manufacturer, serial_number } = message.header();
+        let refused = |text: &str| Err(refused(text.to_owned()).about("headerId", header_id));
+        if (manufacturer, serial_number) != (&self.config.vda5050.manufacturer, &self.serial_number) {
+            return refused("the message is for another vehicle");
+        }
+        if !version.starts_with("2.") {
+            return refused("the version is not 2.x");
+        }
+        if self.config.vda5050.oldest > 0.0 {
+            let Ok(sent) = humantime::parse_rfc3339_weak(timestamp) else {
+                return refused("the timestamp cannot be read");
+            };
+            let age = SystemTime::now().duration_since(sent).unwrap_or_default();
+            if age.as_secs_f64() > self.config.vda5050.oldest {
+                return refused("the message is too old");
+            }
+        }
+        Ok(message)
+    }
+
+    /// Sends probes, and takes a broker that does not return them for one that is away.
+    fn probe(&mut self) {
+        let every = Duration::from_millis(self.config.broker.probe);
+        let Some(client) = &self.client else { return };
+        if every.is_zero() {
+            return;
+        }
+        if self.probed[0].elapsed() >= every {
+            self.probed[0] = Instant::now();
+            let _ = client.try_publish(format!("{}/cara-probe", self.prefix), QoS::AtMostOnce, false, "");
+        }
+        self.broker(self.probed[1].elapsed() < Duration::from_millis(self.config.broker.probe_timeout));
+    }
+
+    fn broker(&mut self, is_there: bool) {
+        if self.is_broker_there != is_there {
+            self.is_broker_there = is_there;
+            self.driver.machine.broker(is_there, self.began.elapsed());
+        }
+    }
+
+    fn publish(&mut self) {
+        if self.client.is_none() {
+            return;
+        }
+        if self.show_connection().and_then(|()| self.send_state()).is_none() {
+            // It is due again.
+            self.reported = None;
+        }
+        if self.driver.machine.take_factsheet_due() {
+            let _ = self.send_factsheet();
+        }
+        self.visualize();
+    }
+
+    /// Topic `connection`: ONLINE while the vehicle is linked. A lost link is a broken connection, and nothing else is known.
+    fn show_connection(&mut self) -> Option<()> {
+        let is_linked = self.driver.machine.is_linked();
+        let state = if is_linked { ConnectionState::Online } else { ConnectionState::Broken };
+        if self.shown == Some(state) {
+            return Some(());
+        }
+        self.send_connection(state)?;
+        self.reported = None;
+        Some(())
+    }
+
+    fn send_connection(&mut self, connection_state: ConnectionState) -> Option<()> {
+        let header = self.header(Topic::Connection)?;
+        self.will.store(header.header_id.saturating_add(1), Ordering::SeqCst);
+        self.send("connection", QoS::AtLeastOnce, true, &Connection { header, connection_state })?;
+        self.shown = Some(connection_state);
+        Some(())
+    }
+
+    fn send_factsheet(&mut self) -> Option<()> {
+        let header = self.header(Topic::Factsheet)?;
+        let factsheet = Factsheet { header, ..self.factsheet.clone() };
+        self.send("factsheet", QoS::AtMostOnce, true, &factsheet)
+    }
+
+    /// Topic `state`: with news, when it was asked for, and every so often.
+    fn send_state(&mut self) -> Option<()> {
+        let Some(report) = self.driver.machine.report() else { return Some(()) };
+        let config::Vda5050 { state_every, state_interval, .. } = self.config.vda5050;
+        let age = self.reported.as_ref().map(|(_, at)| at.elapsed().as_secs_f64());
+        if age.is_some_and(|age| age < state_interval) {
+            return Some(());
+        }
+        let has_news = self.reported.as_ref().is_none_or(|(last, _)| lasting(last) != lasting(&report));
+        let is_due = self.driver.machine.take_report_due();
+        if !(has_news || is_due || age.is_none_or(|age| age >= state_every)) {
+            return Some(());
+        }
+        let header = self.header(Topic::State)?;
+        self.send("state", QoS::AtMostOnce, false, &State { header, report: report.clone() })?;
+        self.reported = Some((report, Instant::now()));
+        Some(())
+    }
+
+    fn visualize(&mut self) {
+        let every = self.config.vda5050.visualization_every;
+        if every <= 0.0 || self.visualized.elapsed().as_secs_f64() < every {
+            return;
+        }
+        let Some(Report { agv_position: Some(at), velocity, .. }) = self.driver.machine.report() else { return };
+        let Some(header) = self.header(Topic::Visualization) else { return };
+        self.visualized = Instant::now();
+        let message = Visualization { header, agv_position: Some(at), velocity };
+        let _ = self.send("visualization", QoS::AtMostOnce, false, &message);
+    }
+
+    /// A header, once its number is kept.
+    fn header(&mut self, topic: Topic) -> Option<Header> {
+        let header_id = self.driver.machine.header_id(topic);
+        self.driver.keep().ok()?;
+        Some(header(&self.config, &self.serial_number, header_id))
+    }
+
+    fn send(&self, topic: &str, quality: QoS, is_retained: bool, message: &impl Serialize) -> Option<()> {
+        let client = self.client.as_ref()?;
+        client.try_publish(format!("{}/{topic}", self.prefix), quality, is_retained, json(message)).ok()
+    }
+
+    /// Says OFFLINE and waits until that has arrived. What moves stops, as its heart goes.
+    fn stop(mut self, is_silent: bool) {
+        self.link.end();
+        if !is_silent && self.send_connection(ConnectionState::Offline).is_some() {
+            let end = Instant::now() + LAST_WORDS;
+            while let Ok(heard) = self.link.heard.recv_timeout(end.saturating_duration_since(Instant::now())) {
+                if matches!(heard, Heard::Acknowledged | Heard::Lost(_)) {
+                    break;
+                }
+            }
+        }
+        if let Some(client) = &self.client {
+            let _ = client.try_disconnect();
+            let _ = self.link.heard.recv_timeout(LAST_WORDS);
+        }
+    }
+}
+
+/// What is news when it changes; the rest changes all the time while a vehicle drives.
+fn lasting(report: &Report) -> Report {
+    let mut report = report.clone();
+    (report.agv_position, report.velocity) = (None, None);
+    report.battery_state.battery_charge = 0.0;
+    report
+}
+
+fn json(message: &impl Serialize) -> Vec<u8> {
+    serde_json::to_vec(message).unwrap_or_default()
+}
+
+fn header(config: &Config, serial_number: &str, header_id: u32) -> Header {
+    Header {
+        header_id,
+        timestamp: humantime::format_rfc3339_millis(SystemTime::now()).to_string(),
+        version: config.vda5050.version.clone(),
+        manufacturer: config.vda5050.manufacturer.clone(),
+        serial_number: serial_number.to_owned(),
+    }
+}
+
+trait HasHeader {
+    fn header(&self) -> &Header;
+}
+
+impl HasHeader for Order {
+    fn header(&self) -> &Header {
+        &self.header
+    }
+}
+
+impl HasHeader for InstantActions {
+    fn header(&self) -> &Header {
+        &self.header
+    }
+}
+
+/// The m_unit whose vehicles these are, not started yet.
+pub fn system(config: &Config) -> Result<CommunicationSystem> {
+    let config::Manager { name, id, fleet, key_file, state_folder, only_this_host } = &config.manager;
+    let mut builder = CommunicationSystem::builder(name, *id)?.fleet(*fleet).state_folder(state_folder);
+    if let Some(file) = key_file {
+        builder = builder.key_file(file);
+    }
+    if *only_this_host {
+        builder = builder.interfaces(cara_std::Interfaces::Loopback);
+    }
+    Ok(builder.build()?)
+}
+
+/// Looks at all that a start needs, and changes nothing: the file, the factsheet, the keys, TLS, and the records.
+pub fn check(config: &Config) -> Result<()> {
+    config.factsheet()?;
+    crate::mqtt::tls(&config.broker)?;
+    let folder = config.manager.state_folder.join("vda5050");
+    for vehicle in &config.vehicle {
+        if folder.join(format!("{}.json", vehicle.serial_number)).exists() {
+            Store::open(Path::new(&folder), &vehicle.serial_number)?;
+        }
+    }
+    let system = system(config)?;
+    for vehicle in &config.vehicle {
+        let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
+        system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;
+    }
+    Ok(())
+}

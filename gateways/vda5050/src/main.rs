@@ -1,0 +1,62 @@
+//! `cara-vda5050`: vehicles of CARA under VDA 5050.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result};
+use cara_std::{StartError, UnitEvent};
+use cara_vda5050::config::Config;
+use cara_vda5050::gateway::{self, End};
+use clap::Parser;
+
+/// Vehicles of CARA under VDA 5050 2.0 and 2.1, over an MQTT broker.
+#[derive(Parser)]
+#[command(version)]
+struct Options {
+    /// The configuration.
+    config: PathBuf,
+    /// Check the configuration, the keys, the factsheet and the records, and end.
+    #[arg(long)]
+    check: bool,
+}
+
+static END: End = End { is_due: AtomicBool::new(false), is_silent: AtomicBool::new(false) };
+
+fn main() -> Result<ExitCode> {
+    let options = Options::parse();
+    let config = Config::read(&options.config)?;
+    if options.check {
+        gateway::check(&config)?;
+        println!("{} vehicles, VDA 5050 {}", config.vehicle.len(), config.vda5050.version);
+        return Ok(ExitCode::SUCCESS);
+    }
+    let system = gateway::system(&config)?;
+    let events = system.events();
+    system.start()?;
+    ctrlc::set_handler(|| END.is_due.store(true, Ordering::SeqCst)).context("cannot take signals")?;
+    let is_fenced = std::thread::scope(|scope| -> Result<bool> {
+        for vehicle in &config.vehicle {
+            let (config, system) = (&config, &system);
+            std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
+                if let Err(error) = gateway::run(config, vehicle, system, &END) {
+                    eprintln!("{}: {error:#}", vehicle.serial_number);
+                    END.is_due.store(true, Ordering::SeqCst);
+                }
+            })?;
+        }
+        println!("up with {} vehicles", config.vehicle.len());
+        while !END.is_due.load(Ordering::SeqCst) {
+            let event = events.recv_timeout(std::time::Duration::from_millis(200));
+            // Another gateway speaks for these vehicles now: this one says nothing more.
+            if matches!(event, Ok(UnitEvent::Fenced { .. })) {
+                END.is_silent.store(true, Ordering::SeqCst);
+                END.is_due.store(true, Ordering::SeqCst);
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    })?;
+    system.stop();
+    Ok(if is_fenced { ExitCode::from(StartError::FENCED_EXIT) } else { ExitCode::SUCCESS })
+}

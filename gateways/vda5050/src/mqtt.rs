@@ -1,0 +1,152 @@
+//! The connection of one vehicle to the broker (6.2, 6.14): one client per vehicle, as a last will is a client's.
+//!
+//! Each connection is a client of its own, so that nothing that was queued before a loss is sent behind it, and files of TLS are read
+//! again.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use rumqttc::{Client, Event, LastWill, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::{ClientConfig, RootCertStore};
+
+use crate::config;
+
+/// The largest message that is read, in bytes.
+const LARGEST: usize = 512 * 1024;
+/// Messages that wait to be sent, and those that wait to be looked at.
+const WAITING: usize = 256;
+/// Between two attempts to connect.
+const BACK_OFF: Duration = Duration::from_secs(1);
+
+/// What came of the broker.
+
+pub enum Heard {
+    /// There is a connection.
+    Connected(Client),
+    /// It has ended, or there is none.
+    Lost(String),
+    /// The last level of its topic, whether it is a retained one, and its bytes.
+    Message(String, bool, Vec<u8>),
+    /// What was sent with quality of service 1 has arrived.
+    Acknowledged,
+}
+
+/// What a client is.
+pub struct Place {
+    /// The broker.
+    pub broker: config::Broker,
+    /// Name of the client: the same for each gateway that speaks for this vehicle, so that the broker knows one.
+    pub client_id: String,
+    /// Its topics without their last level.
+    pub prefix: String,
+    /// The message on topic `connection` if it goes away.
+    pub will: Box<dyn Fn() -> Vec<u8> + Send>,
+}
+
+/// A thread that stays connected.
+pub struct Link {
+    /// What it hears. One that is not emptied loses messages.
+    pub heard: Receiver<Heard>,
+    ends: Arc<AtomicBool>,
+}
+
+impl Link {
+    /// Starts it.
+    pub fn start(place: Place) -> Result<Self> {
+        let (sender, heard) = sync_channel(WAITING);
+        let ends = Arc::new(AtomicBool::new(false));
+        let ended = ends.clone();
+        std::thread::Builder::new().name(format!("mqtt {}", place.client_id)).spawn(move || {
+            while !ended.load(Ordering::SeqCst) {
+                let why = connection(&place, &sender).err().map_or_else(String::new, |error| format!("{error:#}"));
+                if sender.send(Heard::Lost(why)).is_err() {
+                    return;
+                }
+                std::thread::sleep(BACK_OFF);
+            }
+        })?;
+        Ok(Self { heard, ends })
+    }
+
+    /// It does not connect again.
+    pub fn end(&self) {
+        self.ends.store(true, Ordering::SeqCst);
+    }
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// One connection, until it ends.
+fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
+    let (client, mut connection) = Client::new(options(place)?, WAITING);
+    for event in connection.iter() {
+        let heard = match event? {
+            Event::Incoming(Packet::ConnAck(_)) => Heard::Connected(client.clone()),
+            Event::Incoming(Packet::PubAck(_)) => Heard::Acknowledged,
+            Event::Incoming(Packet::Publish(message)) => {
+                let topic = message.topic.strip_prefix(&place.prefix).and_then(|topic| topic.strip_prefix('/'));
+                let Some(topic) = topic else { continue };
+                Heard::Message(topic.to_owned(), message.retain, message.payload.to_vec())
+            }
+            Event::Incoming(Packet::Disconnect) | Event::Outgoing(rumqttc::Outgoing::Disconnect) => return Ok(()),
+            _ => continue,
+        };
+        // One that waits holds the connection back, and the broker with it.
+        sender.send(heard).context("nobody listens")?;
+    }
+    Ok(())
+}
+
+fn options(place: &Place) -> Result<MqttOptions> {
+    let Place { broker, client_id, prefix, will } = place;
+    let mut options = MqttOptions::new(client_id, &broker.host, broker.port);
+    options.set_keep_alive(Duration::from_secs(broker.keep_alive.into()));
+    options.set_clean_session(true).set_max_packet_size(LARGEST, LARGEST);
+    options.set_last_will(LastWill::new(format!("{prefix}/connection"), will(), QoS::AtLeastOnce, true));
+    if let Some(user) = &broker.user {
+        let password = match &broker.password_file {
+            Some(file) => std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?,
+            None => String::new(),
+        };
+        options.set_credentials(user, password.trim_end());
+    }
+    if let Some(tls) = tls(broker)? {
+        options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(Arc::new(tls))));
+    }
+    Ok(options)
+}
+
+/// The TLS that a broker's settings ask for; its files are read now.
+pub fn tls(broker: &config::Broker) -> Result<Option<ClientConfig>> {
+    let Some(ca) = &broker.ca_file else { return Ok(None) };
+    let certificates = |file: &std::path::Path| -> Result<Vec<CertificateDer<'static>>> {
+        let read = CertificateDer::pem_file_iter(file).and_then(Iterator::collect);
+        let certificates: Vec<_> = read.with_context(|| format!("cannot read certificates of {}", file.display()))?;
+        anyhow::ensure!(!certificates.is_empty(), "{} has no certificate", file.display());
+        Ok(certificates)
+    };
+    let mut roots = RootCertStore::empty();
+    for certificate in certificates(ca)? {
+        roots.add(certificate).with_context(|| ca.display().to_string())?;
+    }
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
+    let builder = builder.with_root_certificates(roots);
+    let config = match (&broker.certificate_file, &broker.key_file) {
+        (Some(certificate), Some(key)) => {
+            let own = PrivateKeyDer::from_pem_file(key).with_context(|| format!("cannot read {}", key.display()))?;
+            builder.with_client_auth_cert(certificates(certificate)?, own)?
+        }
+        _ => builder.with_no_client_auth(),
+    };
+    Ok(Some(config))
+}
