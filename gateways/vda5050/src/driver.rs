@@ -29,12 +29,13 @@ pub struct Driver<V, K> {
     record: K,
     is_kept: bool,
     asked: Option<Duration>,
+    failed: Option<String>,
 }
 
 impl<V: Vehicle, K: Keep> Driver<V, K> {
     /// Nothing is asked or told yet.
     pub const fn new(machine: Machine, vehicle: V, record: K) -> Self {
-        Self { machine, vehicle, record, is_kept: true, asked: None }
+        Self { machine, vehicle, record, is_kept: true, asked: None, failed: None }
     }
 
     /// The side to the vehicle.
@@ -51,6 +52,7 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
             self.keep()?;
             let answer = self.vehicle.tell(&command);
             let failed = answer.is_err();
+            self.failed = answer.as_ref().err().map(|failure| format!("{}: {failure}", command.word()));
             self.machine.answered(&command, answer, now);
             // What it does now is asked at once.
             self.asked = None;
@@ -59,6 +61,11 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
             }
         }
         self.keep()
+    }
+
+    /// Why the vehicle did not do what it was told last, if so.
+    pub fn failed(&self) -> Option<&str> {
+        self.failed.as_deref()
     }
 
     /// Writes the record if it has changed.

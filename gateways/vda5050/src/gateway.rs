@@ -23,8 +23,8 @@ use crate::vehicle::Linked;
 
 /// The loop comes round so often.
 const TURN: Duration = Duration::from_millis(20);
-/// The loop's heart, for the leases of the vehicle.
-pub const HEART: Duration = Duration::from_millis(500);
+/// The loop's heart: half of the vehicle's lease.
+const HEART: Duration = Duration::from_millis(crate::vehicle::LEASE_MS / 2);
 /// What is sent last waits so long for its acknowledgement.
 const LAST_WORDS: Duration = Duration::from_secs(2);
 
@@ -63,6 +63,11 @@ struct Gateway {
     is_broker_there: bool,
     /// What topic `connection` says.
     shown: Option<ConnectionState>,
+    /// The header id of that, and whether it has come back.
+    said: u32,
+    is_echoed: bool,
+    /// Why the vehicle did not do something, as it was logged.
+    failed: Option<String>,
     reported: Option<(Report, Instant)>,
     visualized: Instant,
     /// Header id of the next last will.
@@ -104,6 +109,9 @@ impl Gateway {
             probed: [now; 2],
             is_broker_there: false,
             shown: None,
+            said: 0,
+            is_echoed: false,
+            failed: None,
             reported: None,
             visualized: now,
             will,
@@ -122,6 +130,12 @@ impl Gateway {
             eprintln!("{}: the record cannot be written: {error}", self.serial_number);
             std::thread::sleep(Duration::from_millis(200));
             return;
+        }
+        if self.driver.failed() != self.failed.as_deref() {
+            self.failed = self.driver.failed().map(str::to_owned);
+            if let Some(why) = &self.failed {
+                eprintln!("{}: {why}", self.serial_number);
+            }
         }
         self.publish();
     }
@@ -154,16 +168,20 @@ impl Gateway {
                     Ok(message) => self.driver.machine.instant_actions(message),
                     Err(refusal) => self.driver.machine.refuse(&refusal),
                 },
-                // An earlier client's last will came late.
-                "connection" => {
-                    let said = read::<Connection>(&bytes).map(|said| said.connection_state);
-                    if said.ok() != self.shown && !is_retained {
-                        self.shown = None;
-                    }
-                }
+                "connection" => self.hear_connection(&bytes),
                 _ => self.probed[1] = Instant::now(),
             },
             Heard::Acknowledged => {}
+        }
+    }
+
+    /// What the gateway has said last comes back. Behind that, the last will of an earlier client may come, and is contradicted.
+    fn hear_connection(&mut self, bytes: &[u8]) {
+        let Ok(Connection { header, connection_state }) = read(bytes) else { return };
+        if (header.header_id, Some(connection_state)) == (self.said, self.shown) {
+            self.is_echoed = true;
+        } else if self.is_echoed {
+            self.shown = None;
         }
     }
 
@@ -248,6 +266,7 @@ impl Gateway {
 
     fn send_connection(&mut self, connection_state: ConnectionState) -> Option<()> {
         let header = self.header(Topic::Connection)?;
+        (self.said, self.is_echoed) = (header.header_id, false);
         self.will.store(header.header_id.saturating_add(1), Ordering::SeqCst);
         self.send("connection", QoS::AtLeastOnce, true, &Connection { header, connection_state })?;
         self.shown = Some(connection_state);

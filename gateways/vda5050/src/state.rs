@@ -116,6 +116,19 @@ pub enum Command {
     },
 }
 
+impl Command {
+    /// For people.
+    pub const fn word(&self) -> &'static str {
+        match self {
+            Self::Drive { .. } => "drive",
+            Self::Halt => "halt",
+            Self::Act { .. } => "act",
+            Self::EndAction { .. } => "end an action",
+            Self::InitPosition { .. } => "initPosition",
+        }
+    }
+}
+
 /// What it does when the broker is away.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields, tag = "do")]
@@ -153,6 +166,13 @@ pub enum Failure {
     Stopped(String),
     /// There was no answer: it may have been done.
     Lost(String),
+}
+
+impl std::fmt::Display for Failure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (Self::Refused(why) | Self::Stopped(why) | Self::Lost(why)) = self;
+        f.write_str(why)
+    }
 }
 
 impl Record {

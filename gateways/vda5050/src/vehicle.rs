@@ -12,9 +12,11 @@ use crate::order::parameters;
 use crate::state::{Command, Failure, Status};
 
 /// How long the vehicle moves on after the gateway's last sign that it wants it, in milliseconds.
-pub const LEASE_MS: u64 = 400;
-/// How long a call may take.
-const PATIENCE: std::time::Duration = std::time::Duration::from_millis(500);
+pub const LEASE_MS: u64 = 600;
+/// How long the vehicle may take to say how it is; the loop's heart waits meanwhile.
+const PATIENCE: std::time::Duration = std::time::Duration::from_millis(250);
+/// How long it may take to begin something.
+const PATIENCE_TO_BEGIN: std::time::Duration = std::time::Duration::from_millis(500);
 
 /// Codes with which a vehicle refuses a call.
 pub mod refusal {
@@ -94,7 +96,7 @@ pub trait Guided {
     /// to the same node, or has arrived already. `given` says whether x and y, and the angle, are given; `deviation` is the node's,
     /// 0 where it has none; a speed of 0 is no limit.
     #[actuator(drive)]
-    #[lease(ms = 400)]
+    #[lease(ms = 600)]
     fn vda_drive(
         &mut self,
         call: &impl AnyCall<Order = Self::Order>,
@@ -111,7 +113,7 @@ pub trait Guided {
     /// Begins an action, which goes on while its caller wants it. With the number of the last call it changes nothing. `details` are its
     /// parameters, a JSON object, or nothing.
     #[actuator(handling)]
-    #[lease(ms = 400)]
+    #[lease(ms = 600)]
     fn vda_act(
         &mut self,
         call: &impl AnyCall<Order = Self::Order>,
@@ -166,7 +168,7 @@ impl Vehicle for Linked {
     }
 
     fn tell(&mut self, command: &Command) -> Result<(), Failure> {
-        let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() };
+        let options = RequestOptions { timeout: Some(PATIENCE_TO_BEGIN.into()), ..RequestOptions::new() };
         let asked = GuidedClient::at(&self.peer).with(options);
         let answer = match command {
             Command::Drive { number, edge, node } => {
