@@ -24,7 +24,6 @@ const WAITING: usize = 256;
 const BACK_OFF: Duration = Duration::from_secs(1);
 
 /// What came of the broker.
-
 pub enum Heard {
     /// There is a connection.
     Connected(Client),

@@ -97,6 +97,7 @@ pub trait Guided {
     /// 0 where it has none; a speed of 0 is no limit.
     #[actuator(drive)]
     #[lease(ms = 600)]
+    #[allow(clippy::too_many_arguments, reason = "each is a variable of the service")]
     fn vda_drive(
         &mut self,
         call: &impl AnyCall<Order = Self::Order>,

@@ -261,7 +261,8 @@ fn actions_run_side_by_side_where_the_vehicle_can() {
     };
     let (none, soft, hard) = (BlockingType::None, BlockingType::Soft, BlockingType::Hard);
     // (actions with whether they run, how many at once, the next, whether it stands)
-    let rows: [(&[(BlockingType, u64)], usize, Option<usize>, bool); 9] = [
+    type Case<'c> = (&'c [(BlockingType, u64)], usize, Option<usize>, bool);
+    let rows: [Case<'_>; 9] = [
         (&[(none, 0), (soft, 0)], 4, Some(0), true),
         (&[(none, 1), (soft, 0)], 4, Some(1), true),
         (&[(none, 1), (soft, 0)], 1, None, true),

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 34] = [
+pub(crate) const GROUPS: [Group; 35] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -349,6 +349,18 @@ pub(crate) const GROUPS: [Group; 34] = [
         waits: true,
         run: |_| firmware::test_rp2040(),
     },
+    Group {
+        name: "vda5050",
+        what: "the gateway to VDA 5050: schemas, order handling, record, and mosquitto; its clippy, as it is outside of the workspace",
+        budget: 600,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| {
+            let broker = install::program("mosquitto", "mosquitto");
+            needing(broker.and_then(|()| install::program("openssl", "openssl")), vda5050)
+        },
+    },
 ];
 
 impl From<Result<()>> for Outcome {
@@ -488,11 +500,20 @@ fn recordings() -> Result<()> {
 }
 
 fn etcd() -> Result<()> {
+    outside("std-port/etcd/Cargo.toml", "target/etcd", &["--features", "tls"])
+}
+
+fn vda5050() -> Result<()> {
+    outside("gateways/vda5050/Cargo.toml", "target/vda5050", &[])
+}
+
+/// Clippy and the tests of a crate that is a workspace of its own.
+fn outside(manifest: &str, target: &str, of_clippy: &[&str]) -> Result<()> {
     let cargo = |command| {
-        let place = ["--locked", "--manifest-path", "std-port/etcd/Cargo.toml", "--target-dir", "target/etcd"];
+        let place = ["--locked", "--manifest-path", manifest, "--target-dir", target];
         Run::cargo().args([command]).args(place)
     };
-    cargo("clippy").args(["--all-targets", "--features", "tls", "--", "-D", "warnings"]).stream()?;
+    cargo("clippy").args(["--all-targets"]).args(of_clippy).args(["--", "-D", "warnings"]).stream()?;
     cargo("test").args(["--", "--nocapture"]).stream()
 }
 

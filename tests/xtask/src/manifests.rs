@@ -38,6 +38,8 @@ enum Place {
     /// What a program adds to the Linux port, which does not know it.
     Provider,
     CommandLine,
+    /// Speaks for units of CARA to what a plant has.
+    Gateway,
     Examples,
     Tests,
 }
@@ -117,6 +119,7 @@ impl Manifest {
             ("std-port", "etcd") => Some(Place::Provider),
             ("std-port", "cli") => Some(Place::CommandLine),
             ("std-port" | "embassy-port", _) => Some(Place::Port),
+            ("gateways", _) => Some(Place::Gateway),
             ("examples", _) => Some(Place::Examples),
             ("tests", _) => Some(Place::Tests),
             _ => None,
@@ -156,7 +159,7 @@ fn wrong_arrows(manifests: &[Manifest]) -> Vec<String> {
             wrong.push(format!("{file}: the design has no place for this crate"));
             continue;
         };
-        if matches!(from, Place::Core | Place::CoreMember) || manifest.file.starts_with("std-port") {
+        if matches!(from, Place::Core | Place::CoreMember) || ["std-port", "gateways"].iter().any(|folder| manifest.file.starts_with(folder)) {
             let why = "must say unsafe_code = \"forbid\" in its lints";
             wrong.extend((!manifest.forbids_unsafe()).then(|| format!("{file}: {why}")));
         }
@@ -180,7 +183,7 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (Place::CoreMember, to) => matches!(to, Place::Core | Place::CoreMember),
         (Place::Port, Place::Core | Place::CoreMember) => true,
         // What tests of ports stand on: networks, processes, applications.
-        (Place::Port | Place::Provider | Place::CommandLine, Place::Tests | Place::Examples) => for_tests,
+        (Place::Port | Place::Provider | Place::CommandLine | Place::Gateway, Place::Tests | Place::Examples) => for_tests,
         (Place::Port, _) => false,
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.
@@ -188,7 +191,7 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (Place::Provider | Place::CommandLine, Place::Provider) | (Place::Provider, Place::CommandLine) => false,
         (_, Place::Provider) | (Place::CommandLine, Place::CommandLine) => true,
         (Place::Examples, Place::Examples) | (Place::Tests, Place::Tests | Place::Examples) => true,
-        (Place::Tests | Place::Examples, Place::CommandLine) => false,
+        (Place::Tests | Place::Examples | Place::Gateway, Place::CommandLine) | (_, Place::Gateway) => false,
     }
 }
 
