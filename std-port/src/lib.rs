@@ -116,9 +116,11 @@ pub use actuator::Actuator;
 pub use asynchronous::{CallGivenUp, EventStream, EventsLost, SampleStream};
 pub use authority::{Authority, Key};
 pub use builder::{BuildError, Builder};
-pub use cara_core::config::{Constraints, DEPTH, Mode, PLAIN_PORT, Priority, SECURED_PORT, Scheduling};
+pub use cara_core::config::{
+    Constraints, DEPTH, HAND_OVER_TIMEOUT, Mode, PLAIN_PORT, Priority, SECURED_PORT, Scheduling,
+};
 pub use cara_core::distribution::claim::Claim;
-pub use cara_core::distribution::connection_handler::NodeCounter;
+pub use cara_core::distribution::connection_handler::{HandOverStage, NodeCounter};
 pub use cara_core::distribution::failure::Failure;
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec, VariableSpecs};
 pub use cara_core::distribution::hello::{Limits, Manager};

@@ -4,12 +4,13 @@ mod keyed;
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::Path;
+use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
 use cara_std::{
-    CommunicationSystem, Definition, HandOverError, HandOverRefusal, Identity, Interfaces, Manager, Parameters,
-    ParametersView, Served, ServiceError, ServiceOptions, Unit,
+    CommunicationSystem, Definition, HandOverError, HandOverRefusal, HandOverStage, Identity, Interfaces, Manager,
+    Parameters, ParametersView, Served, ServiceError, ServiceOptions, Unit, UnitEvent,
 };
 use keyed::keyed;
 
@@ -61,12 +62,22 @@ fn moves(manager: &CommunicationSystem) -> bool {
     manager.peer("agv").is_ok_and(|agv| agv.block_request("go", &mut Parameters::new()).is_ok())
 }
 
+/// What is reported next of a hand-over.
+fn reported(events: &Receiver<UnitEvent>) -> (Identity, HandOverStage) {
+    loop {
+        if let UnitEvent::HandOver { peer, stage } = events.recv_timeout(PATIENCE).unwrap() {
+            return (peer, stage);
+        }
+    }
+}
+
 #[test]
 fn a_vehicle_goes_over_at_standstill_and_belongs_there_after_a_restart() {
     let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
     let (depot, yard_system) = (manager(fleet, 0), manager(fleet, 1));
     let agv = vehicle(fleet, folder.path());
     until("it moves", || moves(&depot));
+    let (depots, agvs) = (depot.events(), agv.events());
     let peer = depot.peer("agv").unwrap();
     let refused = |refusal| Err(HandOverError::Refused(refusal));
     assert_eq!(peer.hand_over(&yard(), PATIENCE), refused(HandOverRefusal::Moves));
@@ -77,6 +88,10 @@ fn a_vehicle_goes_over_at_standstill_and_belongs_there_after_a_restart() {
     until("it has joined there", || yard_system.number_of_s_units() == 1);
     assert!(!peer.is_connected());
     until("it moves there", || moves(&yard_system));
+    let [_, yard, seven] = nodes();
+    assert_eq!(reported(&depots), (seven, HandOverStage::Leaves));
+    assert_eq!(reported(&agvs), (yard.clone(), HandOverStage::Leaves));
+    assert_eq!(reported(&agvs), (yard, HandOverStage::Moved));
     drop(agv);
     let _agv = vehicle(fleet, folder.path());
     until("it is there again", || moves(&yard_system));

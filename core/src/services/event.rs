@@ -1,6 +1,7 @@
 //! What a unit reports to its application: one type for all ports.
 
 use crate::distribution::claim::Claim;
+use crate::distribution::connection_handler::HandOverStage;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
 use crate::services::lease::{Latch, LeaseEnd};
@@ -73,6 +74,13 @@ pub enum UnitEvent<F, N, E> {
         peer: Identity,
         /// Its claim.
         claim: Claim,
+    },
+    /// A vehicle goes over to another manager. Not on boards.
+    HandOver {
+        /// At the vehicle the manager that it goes to, or back to; at the manager that it leaves, the vehicle.
+        peer: Identity,
+        /// How far it is; at the manager always [`HandOverStage::Leaves`].
+        stage: HandOverStage,
     },
     /// The networks that this unit can use have changed; it searches again by itself. On Linux also reported if there is none at
     /// the start; on a board the first address is not reported, and links end with each change.

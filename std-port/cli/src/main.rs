@@ -30,7 +30,11 @@ fn main() -> ExitCode {
 }
 
 fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
-    if matches!(verb, Verb::Scan(_) | Verb::Watch(_) | Verb::Stream(_) | Verb::Replay(_) | Verb::Doctor(_)) {
+    let ends_at_signals = matches!(
+        verb,
+        Verb::Scan(_) | Verb::Watch(_) | Verb::Stream(_) | Verb::Replay(_) | Verb::Doctor(_) | Verb::HandOver(_)
+    );
+    if ends_at_signals {
         interrupt::end_at_signals()?;
     }
     match verb {
@@ -42,6 +46,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Stop(arguments) => commands::stop::stop(arguments, global),
         Verb::Reset(arguments) => commands::stop::reset(arguments, global),
         Verb::ForgetClaim(arguments) => commands::forget_claim::run(arguments, global),
+        Verb::HandOver(arguments) => commands::hand_over::run(arguments, global),
         Verb::Retire(arguments) => commands::retire::run(arguments, global),
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),

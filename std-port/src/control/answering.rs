@@ -7,15 +7,17 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::time::Instant;
 
 use cara_core::config::Constraints;
+use cara_core::distribution::identity::Role;
 use cara_core::error::Error;
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
 use super::commands::Followed;
+use super::failure::name_of;
 use super::protocol::{Answer, CallQuestion, Failure, Question, unix_ms};
 use super::stop::{self, Which};
 use super::{call, constraint, describe, everybody, hold, select, stream};
-use crate::{CommunicationSystem, Finding, Identity, Peer};
+use crate::{CommunicationSystem, Finding, HandOverError, Identity, Manager, NameAndId, Peer};
 
 /// Where answers go; `Break` when the client is gone.
 pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
@@ -111,6 +113,9 @@ fn attempt<T: Send + 'static>(
             Ok(())
         }
         Question::Retire { node } => retire(system, node),
+        Question::HandOver { node, to, timeout_ms } => {
+            hand_over(system, node, to, Duration::from_millis(*timeout_ms), sink)
+        }
         Question::Functions { node } => functions(system, node, sink),
         Question::Orders { node } => orders(system, node.as_deref(), sink),
         Question::Call(question) => {
@@ -228,6 +233,41 @@ fn retire<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str) -> Res
     }
     let text = format!("{} is connected: only one that is absent is taken off the roster", peer.identity());
     Err(Failure::configuration("Connected", text).into())
+}
+
+fn hand_over<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    node: &str,
+    to: &str,
+    timeout: Duration,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let started = Instant::now();
+    let named: NameAndId = to.parse().map_err(|error| Failure::configuration("BadName", error))?;
+    let to = Manager::new(&named.name, named.id)?;
+    let peer = select::node(system, node)?;
+    if peer.identity().role() == Role::MUnit {
+        let text = format!("{} is an m_unit: only s_units belong to a manager", peer.identity());
+        return Err(Failure::configuration("NoVehicle", text).into());
+    }
+    let outcome = match peer.is_connected() {
+        true => peer.hand_over(&to, timeout).map_err(not_handed_over),
+        false => Err(everybody::not_called(&peer, None)),
+    };
+    send(sink, call::called(&peer, outcome.map(|()| call::Outcome::default()), started))
+}
+
+/// Of a vehicle that was connected.
+fn not_handed_over(error: HandOverError) -> Failure {
+    match error {
+        HandOverError::Refused(refusal) => Failure::peer(&name_of(&refusal), refusal),
+        HandOverError::Link(Error::NotConnected | Error::TimedOut) => {
+            let text = "it was lost before its answer, or does not answer, as boards do: it may be on its way; `cara scan` shows it \
+                        at the manager that has it";
+            Failure::peer("NotKnown", text)
+        }
+        HandOverError::Link(error) => error.into(),
+    }
 }
 
 fn functions<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str, sink: Sink<'_>) -> Result<(), End> {

@@ -10,6 +10,7 @@
 //! | `ask`, `function` | what for; several functions of a stop or a reset with a comma between them |
 //! | `take_over` | `true` where an order of another unit, or of the other origin, was to give way |
 //! | `node` | of which node, as far as it is known |
+//! | `to` | the manager that it is handed over to |
 //! | `outcome` | `ok`, the error's name, or `gone` where the asking ended before the answer; of what was held, how it ended: `ended`, `expired`, `released` by its client, an error; `stopped` where the unit itself was stopped first |
 
 use std::collections::BTreeMap;
@@ -128,20 +129,20 @@ impl Audit {
 fn entry(origin: &str, who: &Who, line: &Line<'_>) -> Value {
     let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let Who { uid, pid, program, name, role } = who;
-    let Line { ask, function, take_over, node, outcome } = line;
+    let Line { ask, function, take_over, node, to, outcome } = line;
     // What a client wrote may be as long as a line of its own: it would push what was logged before out of the file.
-    let [function, node] =
-        [function, node].map(|text| text.map(|text| &text[..text.floor_char_boundary(LONGEST_TEXT)]));
+    let [function, node, to] =
+        [function, node, to].map(|text| text.map(|text| &text[..text.floor_char_boundary(LONGEST_TEXT)]));
     json!({
         "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "name": name, "role": role,
         "ask": ask,
-        "function": function, "take_over": take_over, "node": node, "outcome": outcome,
+        "function": function, "take_over": take_over, "node": node, "to": to, "outcome": outcome,
     })
 }
 
 /// Writes down at once what this process does without a unit.
 pub(super) fn note(path: &Path, ask: &str, node: &str, outcome: &str) -> io::Result<()> {
-    let line = Line { ask, function: None, take_over: false, node: Some(node), outcome };
+    let line = Line { ask, function: None, take_over: false, node: Some(node), to: None, outcome };
     let who = Who { role: Some(Role::Reset), ..Who::own() };
     let entry = entry("operator", &who, &line);
     LogFile::open(path, LONGEST)?.write(format!("{entry}\n").as_bytes())
@@ -153,6 +154,7 @@ struct Line<'l> {
     function: Option<&'l str>,
     take_over: bool,
     node: Option<&'l str>,
+    to: Option<&'l str>,
     outcome: &'l str,
 }
 
@@ -251,7 +253,7 @@ impl ProgramCall {
     fn append(&mut self, outcome: &str) {
         self.is_reported = true;
         let Self { ask, ref function, take_over, ref node, .. } = *self;
-        let line = Line { ask, function: Some(function), take_over, node: Some(node), outcome };
+        let line = Line { ask, function: Some(function), take_over, node: Some(node), to: None, outcome };
         self.audit.append("program", &self.audit.own, &line);
     }
 }
@@ -275,6 +277,8 @@ struct Asked<'q> {
     ask: &'static str,
     call: Option<&'q CallQuestion>,
     node: Option<&'q String>,
+    /// Of a hand-over.
+    to: Option<&'q String>,
     /// What the call starts is kept, and its end is told.
     holds: bool,
 }
@@ -282,9 +286,9 @@ struct Asked<'q> {
 impl<'q> Asked<'q> {
     /// `None` for a question that only looks.
     fn of(question: &'q Question) -> Option<Self> {
-        let of_node = |ask, node| Some(Self { ask, call: None, node, holds: false });
+        let of_node = |ask, node| Some(Self { ask, call: None, node, to: None, holds: false });
         let of_call = |ask, call: &'q CallQuestion| {
-            Some(Self { ask, call: Some(call), node: call.node.as_ref(), holds: ask == "hold" })
+            Some(Self { ask, call: Some(call), node: call.node.as_ref(), to: None, holds: ask == "hold" })
         };
         match question {
             Question::Call(call) => of_call("call", call),
@@ -294,6 +298,9 @@ impl<'q> Asked<'q> {
             Question::Publish { node, .. } => of_node("publish", node.as_ref()),
             Question::Set { node, .. } => of_node("set", node.as_ref()),
             Question::Retire { node } => of_node("retire", Some(node)),
+            Question::HandOver { node, to, .. } => {
+                Some(Self { ask: "hand-over", call: None, node: Some(node), to: Some(to), holds: false })
+            }
             Question::As { .. }
             | Question::Unit
             | Question::Nodes { .. }
@@ -372,10 +379,14 @@ impl<'a> Entry<'a> {
     }
 
     fn append(&self, node: Option<&str>, functions: Option<&str>, outcome: &str) {
-        let Asked { ask, call, node: asked_of, .. } = self.asked;
+        let Asked { ask, call, node: asked_of, to, .. } = self.asked;
         let function = functions.or_else(|| Some(call?.function.as_str()));
         let (node, take_over) = (node.or(asked_of.map(String::as_str)), call.is_some_and(|call| call.take_over));
-        self.audit.append("operator", self.who, &Line { ask, function, take_over, node, outcome });
+        self.audit.append(
+            "operator",
+            self.who,
+            &Line { ask, function, take_over, node, to: to.map(String::as_str), outcome },
+        );
     }
 }
 

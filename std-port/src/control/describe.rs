@@ -181,6 +181,7 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
             Some(peer),
             format!("the claim {claim} is obeyed until the next start: it could not be stored"),
         ),
+        UnitEvent::HandOver { peer, .. } => ("handed_over", Some(peer), "goes over to another manager".to_owned()),
         UnitEvent::ListChanged { peer } => ("list_changed", Some(peer), "published or withdrew functions".to_owned()),
         UnitEvent::NetworkChanged { up } => {
             ("interfaces_changed", None, format!("interfaces that are up: {}", up.join(" ")))

@@ -48,6 +48,16 @@ pub enum Question {
         /// `NAME`, `NAME/ID` or `#ID`.
         node: String,
     },
+    /// Hand a vehicle over to another manager, while nothing of it moves. An [`Answer::Called`] when it has agreed and leaves, or
+    /// why not. Unless it joins the other manager within [`HAND_OVER_TIMEOUT`](cara_core::config::HAND_OVER_TIMEOUT) it comes back.
+    HandOver {
+        /// `NAME`, `NAME/ID` or `#ID`.
+        node: String,
+        /// The other manager's `NAME/ID`.
+        to: String,
+        /// How long to wait for the vehicle's answer.
+        timeout_ms: u64,
+    },
     /// An [`Answer::Function`] for each function that a node has published to this unit.
     Functions {
         /// `NAME`, `NAME/ID` or `#ID`.
@@ -152,7 +162,7 @@ impl Question {
     /// Whether it is carried out only while its client is there: what moves something, or may let it move again, is not wanted
     /// any more by a client that has gone before its turn came, as where the unit's process was stopped meanwhile.
     pub(super) fn needs_its_client(&self) -> bool {
-        matches!(self, Self::Call(_) | Self::Hold(_) | Self::Reset { .. })
+        matches!(self, Self::Call(_) | Self::Hold(_) | Self::Reset { .. } | Self::HandOver { .. })
     }
 
     /// Whether it is answered also where all connections are in use.

@@ -20,7 +20,7 @@ pub enum Role {
     Stop,
     /// Sees everything and changes nothing.
     See,
-    /// Calls and holds functions, and publishes the unit's own.
+    /// Calls and holds functions, publishes the unit's own, and hands vehicles over to other managers.
     Operate,
     /// Does everything: resets, which lets stopped vehicles move again, and changes the roster and the constraints.
     Reset,
@@ -67,7 +67,7 @@ impl Role {
             | Question::Ping { .. } => Self::See,
             Question::Call(call) => Self::of_call(&attributes(system, call), call.take_over),
             Question::Hold(call) => Self::of_call(&attributes(system, call), true),
-            Question::Publish { .. } => Self::Operate,
+            Question::Publish { .. } | Question::HandOver { .. } => Self::Operate,
             // Without the roster a stop of all misses a node silently, and constraints decide how soon a lost one stands.
             Question::Reset { .. } | Question::Retire { .. } | Question::Set { .. } => Self::Reset,
         }

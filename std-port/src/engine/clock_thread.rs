@@ -145,8 +145,17 @@ impl<T: Send + 'static> Engine<T> {
     /// Does what the node wants done about claims.
     pub(super) fn look_at_claims(&self) {
         loop {
-            let event = self.hub.lock().hub.node.take_claim_event();
+            let (handed, event) = {
+                let node = &mut self.hub.lock().hub.node;
+                (node.take_hand_over(), node.take_claim_event())
+            };
+            let has_more = handed.is_some();
+            if let Some((peer, stage)) = handed {
+                tracing::info!(manager = %peer, ?stage, "this vehicle is handed over");
+                self.notify(UnitEvent::HandOver { peer, stage });
+            }
             match event {
+                None if has_more => {}
                 None => return,
                 Some(ClaimEvent::Keep(manager, tagged)) => self.leave_to_writer(Job::Keep(manager, tagged)),
                 Some(ClaimEvent::Raise(above)) => self.leave_to_writer(Job::Raise(above)),

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use cara_core::distribution::connection_handler::HandOverStage;
 use cara_core::distribution::hello::Manager;
 use cara_core::error::Error;
 use cara_core::time::Duration;
@@ -11,6 +12,7 @@ use super::link::LinkCell;
 use super::pinging::{self, Turn};
 use super::reader::Cause;
 use crate::error::HandOverError;
+use crate::event::UnitEvent;
 
 impl<T: Send + 'static> Engine<T> {
     /// Has the turn of a ping meanwhile, so that a link has one question at a time.
@@ -35,7 +37,14 @@ impl<T: Send + 'static> Engine<T> {
         state = link.lock();
         loop {
             if let Some(answer) = state.session.hand_over_answer() {
-                return answer.map_err(HandOverError::Refused);
+                answer.map_err(HandOverError::Refused)?;
+                let peer = state.session.identity().cloned();
+                drop(state);
+                if let Some(peer) = peer {
+                    tracing::info!(vehicle = %peer, manager = %to.name, "handed over");
+                    self.notify(UnitEvent::HandOver { peer, stage: HandOverStage::Leaves });
+                }
+                return Ok(());
             }
             state = pinging::wait(link, state, clock, deadline)?;
         }

@@ -58,6 +58,7 @@ fn each_role_has_its_verbs_and_all_of_them_stop() {
         (Role::Operate, of_hold("drive")),
         (Role::Operate, of_hold("halt")),
         (Role::Operate, Question::Publish { node: None, timeout_ms: 1 }),
+        (Role::Operate, Question::HandOver { node: node(), to: "yard/2".to_owned(), timeout_ms: 1 }),
         (Role::Reset, of_call("free")),
         (Role::Reset, to_all("free")),
         (Role::Reset, of_hold("free")),

@@ -159,7 +159,9 @@ fn wrong_arrows(manifests: &[Manifest]) -> Vec<String> {
             wrong.push(format!("{file}: the design has no place for this crate"));
             continue;
         };
-        if matches!(from, Place::Core | Place::CoreMember) || ["std-port", "gateways"].iter().any(|folder| manifest.file.starts_with(folder)) {
+        if matches!(from, Place::Core | Place::CoreMember)
+            || ["std-port", "gateways"].iter().any(|folder| manifest.file.starts_with(folder))
+        {
             let why = "must say unsafe_code = \"forbid\" in its lints";
             wrong.extend((!manifest.forbids_unsafe()).then(|| format!("{file}: {why}")));
         }
@@ -183,7 +185,9 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (Place::CoreMember, to) => matches!(to, Place::Core | Place::CoreMember),
         (Place::Port, Place::Core | Place::CoreMember) => true,
         // What tests of ports stand on: networks, processes, applications.
-        (Place::Port | Place::Provider | Place::CommandLine | Place::Gateway, Place::Tests | Place::Examples) => for_tests,
+        (Place::Port | Place::Provider | Place::CommandLine | Place::Gateway, Place::Tests | Place::Examples) => {
+            for_tests
+        }
         (Place::Port, _) => false,
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.

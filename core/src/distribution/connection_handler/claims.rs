@@ -307,7 +307,7 @@ impl<P: Port> Node<P> {
             (true, _) => {
                 obeyed.keeping = Keeping::Kept;
                 if is_target {
-                    self.moving.commit();
+                    self.moving.commit(manager);
                 }
             }
             (false, Keeping::Failed(_)) => {}

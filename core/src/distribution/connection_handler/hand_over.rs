@@ -14,6 +14,17 @@ use crate::host::mailman::LinkId;
 use crate::host::port::Port;
 use crate::time::Instant;
 
+/// How far a vehicle is on its way to another manager.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum HandOverStage {
+    /// It has agreed to go, and leaves its manager.
+    Leaves,
+    /// It belongs to the new manager, also after a restart.
+    Moved,
+    /// It has not joined the new manager in time, or could not store that, and goes back.
+    Returns,
+}
+
 /// Where a vehicle is on its way from one manager to another; empty where the build has no hand-over.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Moving([State; HAND_OVER as usize]);
@@ -23,6 +34,9 @@ struct State {
     /// The manager that the unit was configured with, once it was handed over.
     home: Option<Manager>,
     underway: Option<Underway>,
+    /// Not reported yet: that it has left for this manager, and how that ended.
+    left: Option<Identity>,
+    ended: Option<(Identity, HandOverStage)>,
 }
 
 /// A hand-over that is not committed.
@@ -74,15 +88,25 @@ impl Moving {
         true
     }
 
-    /// The claim of the new manager is stored, if it is on its way.
-    pub(super) fn commit(&mut self) {
-        if let Some(state) = self.0.first_mut() {
-            state.underway.take_if(|underway| underway.has_arrived());
+    /// The claim of its manager, the new one if it is on its way, is stored.
+    pub(super) fn commit(&mut self, manager: &Identity) {
+        if let Some(state) = self.0.first_mut()
+            && state.underway.take_if(|underway| underway.has_arrived()).is_some()
+        {
+            state.ended = Some((manager.clone(), HandOverStage::Moved));
         }
     }
 }
 
 impl<P: Port> Node<P> {
+    /// How far this vehicle is on its way to another manager, and that manager, or the one to which it returns; each stage once. To be
+    /// asked for as [`take_claim_event`](Self::take_claim_event) is.
+    pub fn take_hand_over(&mut self) -> Option<(Identity, HandOverStage)> {
+        let state = self.moving.0.first_mut()?;
+        let left = state.left.take().map(|to| (to, HandOverStage::Leaves));
+        left.or_else(|| state.ended.take())
+    }
+
     /// The manager that this unit was configured with and the one that it belongs to, if they differ, once a claim of `storing` is
     /// stored: the port stores them with it in one write, and passes them to [`belong_to`](Self::belong_to) at the next start. A claim
     /// of another manager than the new one commits no hand-over.
@@ -139,6 +163,7 @@ impl<P: Port> Node<P> {
         let Some(state) = self.moving.0.first_mut() else { return Err(HandOverRefusal::Other) };
         state.home.get_or_insert_with(|| from.clone());
         state.underway = Some(Underway { from, stage: Stage::Looks, until: now + HAND_OVER_TIMEOUT });
+        state.left = Some(identity);
         self.turn_to(to);
         // Its last search may have been a long one.
         self.search.attempt = 0;
@@ -187,8 +212,11 @@ impl<P: Port> Node<P> {
             self.counters.count(NodeCounter::ClaimsNotKept);
             return None;
         }
-        let Underway { from, .. } = self.moving.0.first_mut()?.underway.take()?;
-        if let Some(back) = from.identity().filter(|_| has_failed) {
+        let state = self.moving.0.first_mut()?;
+        let Underway { from, .. } = state.underway.take()?;
+        let back = from.identity();
+        state.ended = back.clone().map(|back| (back, HandOverStage::Returns));
+        if let Some(back) = back.filter(|_| has_failed) {
             // The file may say that it belongs to the other one all the same.
             self.claims.want_kept(now, &back);
         }

@@ -28,6 +28,7 @@ pub(crate) use admission::Admission;
 pub use claims::ClaimEvent;
 pub(crate) use claims::MayMove;
 pub use counter::NodeCounter;
+pub use hand_over::HandOverStage;
 pub use known::{Known, NodeState};
 pub use table::Order;
 

@@ -161,6 +161,7 @@ fn wanted(command: &Command, before: &[String]) -> Option<(Wanted, Vec<String>)>
                 Some(next) => value = Some(next.clone()),
                 // The value is what is typed.
                 None if name == "offering" => return Some((Wanted::Function(None), shared)),
+                None if name == "to" => return Some((Wanted::Node, shared)),
                 None => return None,
             }
         }
@@ -176,6 +177,7 @@ fn wanted(command: &Command, before: &[String]) -> Option<(Wanted, Vec<String>)>
         ("call", [node]) => Wanted::Function(Some(node.clone())),
         ("stream", [node]) => Wanted::Stream(node.clone()),
         ("set", [_]) => Wanted::Constraint,
+        ("hand-over", _) => Wanted::Node,
         (
             "functions" | "orders" | "call" | "publish" | "stop" | "reset" | "retire" | "set" | "stream" | "counters"
             | "ping" | "doctor",
@@ -227,6 +229,8 @@ mod tests {
             ("stream agv-1", Wanted::Stream("agv-1".into())),
             ("set .", Wanted::Constraint),
             ("stop", Wanted::Node),
+            ("hand-over agv-1", Wanted::Node),
+            ("hand-over agv-1 --to", Wanted::Node),
         ] {
             assert_eq!(of(line), Some((expected, Vec::new())), "{line}");
         }

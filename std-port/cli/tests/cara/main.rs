@@ -7,6 +7,7 @@ mod constraints;
 mod documents;
 mod failing;
 mod giving_up;
+mod handing;
 mod holding;
 mod hung;
 mod managers;

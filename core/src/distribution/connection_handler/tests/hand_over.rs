@@ -63,7 +63,11 @@ fn what_is_stored_on_joining_is_the_commit() {
     assert_eq!(node.handed_over(&identity(&other())), both, "stored with the claim");
     assert_eq!(node.handed_over(&identity(&manager())), None, "a late claim of the old manager is no commit");
     assert_eq!(node.may_move(at(2_100), &identity(&other())), MayMove::Waits, "nothing moves before");
+    assert_eq!(node.take_hand_over(), Some((identity(&other()), HandOverStage::Leaves)));
+    assert_eq!(node.take_hand_over(), None);
     node.claim_kept(&identity(&other()), claim(5), true);
+    assert_eq!(node.take_hand_over(), Some((identity(&other()), HandOverStage::Moved)));
+    assert_eq!(node.take_hand_over(), None);
     assert_eq!(node.may_move(at(2_200), &identity(&other())), MayMove::Yes);
     assert_eq!(node.handed_over(&identity(&manager())), both);
     node.left(at(31_000), NEW, CloseReason::Silent);
@@ -118,7 +122,9 @@ fn without_the_new_manager_it_goes_back_in_time() {
         node.admit(at(10_999), OLD, address(1, 7_000), &hello(&manager(), 3)),
         Admission::Refuse(Refusal::WrongManager)
     );
+    assert_eq!(node.take_hand_over(), Some((identity(&other()), HandOverStage::Leaves)));
     poll(&mut node, 11_000);
+    assert_eq!(node.take_hand_over(), Some((identity(&manager()), HandOverStage::Returns)));
     assert!(belongs_to(&node, &manager()) && node.handed_over(&identity(&manager())).is_none());
     assert!(node.searches_at() <= at(11_400), "soon, however long it searched for the other one");
     assert_eq!(
