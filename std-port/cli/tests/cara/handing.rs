@@ -17,11 +17,12 @@ const HERE: usize = 0;
 const THERE: usize = 1;
 
 struct Plant {
+    managers: [Option<Running>; 2],
+    vehicles: Vec<Running>,
+    // Behind the processes that use them.
     stage: Stage,
     /// Control sockets, states, files.
     folders: [TempDir; 2],
-    managers: [Option<Running>; 2],
-    vehicles: Vec<Running>,
 }
 
 impl Plant {
@@ -226,7 +227,7 @@ fn round(killed: Killed) -> Duration {
     let mut hand_over = plant.stage.command(&["hand-over", "--all", "--to", "other/2", "--json"]);
     hand_over.env("CARA_CONTROL_DIR", plant.folder(HERE)).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut hand_over = hand_over.spawn().unwrap();
-    std::thread::sleep(Duration::from_micros(RandomState::new().build_hasher().finish() % 100_000));
+    std::thread::sleep(Duration::from_micros(RandomState::new().build_hasher().finish() % 800_000));
     let mut decided = None;
     let mut commands = Commands::none();
     match killed {

@@ -146,11 +146,16 @@ impl Inner {
         let unit = &mut self.units[host.index()];
         let storing = unit.settings.storing;
         let Some(machine) = &mut unit.machine else { return false };
+        if let Some((peer, stage)) = machine.links.hub.node.take_hand_over() {
+            self.log(shared, host, UnitEvent::HandOver { peer, stage });
+            return true;
+        }
         match machine.links.hub.node.take_claim_event() {
             None => return false,
             Some(ClaimEvent::Keep(manager, tagged)) if storing != Storing::Hangs => {
                 if storing == Storing::Works {
                     unit.claims.obeyed.insert(manager.clone(), tagged);
+                    unit.claims.handed = machine.links.hub.node.handed_over(&manager);
                 }
                 machine.links.hub.node.claim_kept(&manager, tagged.claim, storing == Storing::Works);
             }

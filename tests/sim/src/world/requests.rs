@@ -2,6 +2,7 @@
 
 use std::task::Poll;
 
+use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -159,6 +160,15 @@ impl UnitHandle {
         })??;
         self.work(index);
         Ok(())
+    }
+
+    /// Asks a vehicle to go over to another manager. Whether it agrees is seen at the vehicle.
+    pub fn hand_over(&self, peer: impl Into<Peer>, to: &Manager) -> Result<(), Error> {
+        let index = self.link_to(&peer.into())?;
+        let asked = self
+            .machine(|machine, network| machine.links.with(network, index, |session, cx| session.hand_over(cx, to)))?;
+        self.work(index);
+        asked.unwrap_or(Err(Error::NotConnected))
     }
 
     /// What an order of this unit (`call.lease`) has started is finished: it ends, no safe hook runs, and its caller is told so.

@@ -72,6 +72,8 @@ pub(super) struct Settings {
 pub(super) struct Stored {
     pub(super) own: Claim,
     pub(super) obeyed: BTreeMap<Identity, TaggedClaim>,
+    /// The manager of a vehicle that was handed over: the one it was configured with, and the present one.
+    pub(super) handed: Option<(Identity, Identity)>,
 }
 
 /// What becomes of what a unit stores.
@@ -175,6 +177,9 @@ impl UnitState {
         }
         if settings.given.mode == Mode::Secured {
             self.claims.obeyed.iter().for_each(|(manager, tagged)| hub.node.keep_obeyed(now, manager, *tagged));
+            if let Some((home, present)) = &self.claims.handed {
+                hub.node.belong_to(home, present);
+            }
             hub.node.store_claims();
         }
         self.machine = Some(Machine {

@@ -1,0 +1,223 @@
+//! Two managers that hand vehicles over to each other, in runs drawn from seeds: managers and vehicles crash and hang, the network
+//! parts, disks fail. A vehicle executes commands of another manager only where it has agreed to go there, under claims of each that
+//! never decrease, with live orders of one at most. Once all run and reach each other each vehicle has one manager within the time of a
+//! hand-over that turns back.
+//!
+//! `cargo xtask orders` runs more seeds.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::rc::Rc;
+
+use cara_core::config::HAND_OVER_TIMEOUT;
+use cara_core::distribution::claim::Claim;
+use cara_core::distribution::connection_handler::HandOverStage;
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::Parameters;
+use cara_core::random::Random;
+use cara_core::time::Duration;
+use cara_sim::{Crash, Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+
+const MANAGERS: [(&str, u32); 2] = [("depot", 1), ("yard", 2)];
+/// So long everything fails.
+const FAULTS: Duration = Duration::from_secs(60);
+/// A vehicle joins the manager that it searches for within this time; a dial that a cut has swallowed is given up after 6 s.
+const JOINS: Duration = Duration::from_secs(8);
+const LEASE: Duration = Duration::from_millis(400);
+
+const fn millis(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+fn between(random: &mut Random, least: u64, most: u64) -> Duration {
+    millis(least + random.below(most - least))
+}
+
+struct Fleet {
+    world: World,
+    managers: Vec<UnitHandle>,
+    vehicles: Vec<UnitHandle>,
+}
+
+impl Fleet {
+    /// All vehicles are the depot's. Disks of some fail.
+    fn new(seed: u64, vehicles: u32) -> Self {
+        let world = World::secured(seed);
+        let mut random = Random::new(seed ^ 0x4A4D_0E12);
+        let vehicle = |number: u32| {
+            let storing = if random.below(8) == 0 { Storing::Fails } else { Storing::Works };
+            let new = world.s_unit(&format!("agv-{number}"), 10 + number).joins("depot", 1).storing(storing);
+            let lives = Rc::<RefCell<Lives>>::default();
+            let executing = Rc::clone(&lives);
+            let vehicle = new.program(move |unit| drives(unit, &executing)).start();
+            vehicle.on_event(move |_, event| {
+                if let UnitEvent::HandOver { peer, stage: HandOverStage::Leaves } = event {
+                    lives.borrow_mut().agreed = Some(peer.clone());
+                }
+            });
+            vehicle
+        };
+        let vehicles = (0..vehicles).map(vehicle).collect();
+        let managers = MANAGERS.map(|(name, id)| world.m_unit(name, id).start()).into();
+        Self { world, managers, vehicles }
+    }
+
+    /// Lets everybody work for a while; each manager has its vehicles drive now and then, so that some stand.
+    fn run(&mut self, span: Duration) {
+        let end = self.world.now() + span;
+        while self.world.now() < end {
+            for manager in self.managers.iter().filter(|manager| self.is_awake(manager)) {
+                for vehicle in manager.nodes_offering("drive") {
+                    let _ = manager.request(&vehicle, "drive", &Parameters::new());
+                    let _ = manager.release(&vehicle, "drive");
+                }
+            }
+            self.world.run_for(millis(50));
+        }
+    }
+
+    fn is_awake(&self, unit: &UnitHandle) -> bool {
+        let until = self.world.network(|network| network.suspended_until(unit.host()));
+        unit.is_running() && until <= self.world.now()
+    }
+
+    fn something_happens(&mut self, random: &mut Random) {
+        let pick = |random: &mut Random, units: &[UnitHandle]| units[random.below(units.len() as u64) as usize].clone();
+        let (manager, vehicle) = (pick(random, &self.managers), pick(random, &self.vehicles));
+        let crash = if random.below(2) == 0 { Crash::PowerCut } else { Crash::Process };
+        match random.below(9) {
+            0 => {
+                let down = between(random, 100, 9_000);
+                self.world.network(|network| network.crash_for(manager.host(), crash, down));
+            }
+            1 => self.world.suspend(&manager, between(random, 100, 9_000)),
+            2 => {
+                let units = self.managers.iter().chain(&self.vehicles).map(UnitHandle::host);
+                let others: Vec<_> = units.filter(|host| *host != manager.host() && random.below(4) > 0).collect();
+                let direction = if random.below(2) == 0 { Direction::Both } else { Direction::FirstToSecond };
+                let span = between(random, 500, 9_000);
+                self.world.network(|network| network.partition_for(&[manager.host()], &others, direction, span));
+            }
+            3 => self.world.suspend(&vehicle, between(random, 20, 5_000)),
+            4 => {
+                let down = between(random, 50, 3_000);
+                self.world.network(|network| network.crash_for(vehicle.host(), crash, down));
+            }
+            _ => self.hand_over(random),
+        }
+    }
+
+    /// Both managers may be asked at once for all that each of them has.
+    fn hand_over(&self, random: &mut Random) {
+        for (manager, (name, id)) in self.managers.iter().zip(MANAGERS.into_iter().rev()) {
+            let to = Manager::new(name, id).expect("it is short");
+            for vehicle in &self.vehicles {
+                if self.is_awake(manager) && random.below(3) > 0 {
+                    let _ = manager.hand_over(&vehicle.identity(), &to);
+                }
+            }
+        }
+    }
+
+    /// Each vehicle has one manager, which can command it.
+    fn is_whole(&self) -> bool {
+        self.vehicles.iter().all(|vehicle| {
+            let commands = |manager: &&UnitHandle| manager.knows(&vehicle.identity(), "drive");
+            let mut managers = self.managers.iter().filter(commands);
+            let manager = managers.next().filter(|_| managers.next().is_none());
+            manager.is_some_and(|manager| vehicle.is_connected(&manager.identity()))
+        })
+    }
+
+    /// How long it took, in steps of 50 ms.
+    fn until(&mut self, limit: Duration, holds: impl Fn(&Self) -> bool) -> Option<Duration> {
+        let start = self.world.now();
+        while !holds(self) {
+            if self.world.now() >= start + limit {
+                return None;
+            }
+            self.run(millis(50));
+        }
+        Some(self.world.now().since(start))
+    }
+
+    fn logs(&self) -> String {
+        let log = |unit: &UnitHandle| {
+            let log: Vec<_> =
+                unit.log().into_iter().filter(|(_, event)| !matches!(event, LogEvent::Called { .. })).collect();
+            format!("{:?}: {log:?}\n", unit.identity())
+        };
+        self.managers.iter().chain(&self.vehicles).map(log).collect()
+    }
+}
+
+/// What is known of a vehicle in all of its lives.
+#[derive(Default)]
+struct Lives {
+    /// The claim of each manager under which it has executed a command last.
+    claims: BTreeMap<Identity, Claim>,
+    commanded_by: Option<Identity>,
+    /// Where it has agreed to go last.
+    agreed: Option<Identity>,
+}
+
+/// `drive` moves the vehicle. What it executes is checked against what it has executed.
+fn drives(unit: &UnitHandle, lives: &Rc<RefCell<Lives>>) {
+    let live = Rc::<RefCell<Option<Identity>>>::default();
+    let (ended, obeying, lives) = (Rc::clone(&live), unit.clone(), Rc::clone(lives));
+    let drive = Service::new(move |call, _| {
+        let (caller, claim, mut lives) = (&call.caller, obeying.claim(), lives.borrow_mut());
+        let before = lives.claims.insert(caller.clone(), claim).unwrap_or_default();
+        assert!(claim >= before, "a command of {caller} and {claim:?} is executed after one of {before:?}");
+        let changes = lives.commanded_by.replace(caller.clone()).is_some_and(|by| by != *caller);
+        assert!(
+            !changes || lives.agreed.as_ref() == Some(caller),
+            "{caller} commands a vehicle that was not handed over"
+        );
+        let live = live.borrow_mut().replace(caller.clone());
+        assert!(live.is_none_or(|live| live == *caller), "a vehicle is moved by two managers");
+        Ok(())
+    });
+    let drive = drive.lease(LEASE, move |_| *ended.borrow_mut() = None);
+    unit.my_function_list().add_service("drive()", drive).expect("there is room");
+    unit.publish_my_function_list().expect("it runs");
+}
+
+/// How long it took until each had a manager, and how many vehicles have moved and have turned back.
+fn run(seed: u64, vehicles: u32) -> (Duration, [usize; 2]) {
+    let mut fleet = Fleet::new(seed, vehicles);
+    let mut random = Random::new(seed ^ 0x0FA1_77E5);
+    let end = fleet.world.now() + FAULTS;
+    while fleet.world.now() < end {
+        fleet.something_happens(&mut random);
+        fleet.run(between(&mut random, 20, 4_000));
+    }
+    // What was begun ends.
+    fleet.world.network(|network| network.heal_all());
+    let calm = |fleet: &Fleet| fleet.managers.iter().chain(&fleet.vehicles).all(|unit| fleet.is_awake(unit));
+    assert!(fleet.until(Duration::from_secs(10), calm).is_some());
+    let took = fleet.until(HAND_OVER_TIMEOUT + JOINS, Fleet::is_whole);
+    assert!(took.is_some(), "{seed}: not each vehicle has one manager\n{}", fleet.logs());
+    let stage = |wanted: HandOverStage| {
+        let is = |event: &UnitEvent| matches!(event, UnitEvent::HandOver { stage, .. } if *stage == wanted);
+        fleet.vehicles.iter().map(|vehicle| vehicle.count(is)).sum()
+    };
+    (took.unwrap_or_default(), [HandOverStage::Moved, HandOverStage::Returns].map(stage))
+}
+
+fn runs(seeds: u64, vehicles: u32) {
+    let ends = for_each_seed(seeds, |seed| run(seed, vehicles));
+    let longest = ends.iter().map(|end| end.0).max();
+    let [moved, returned] = [0, 1].map(|stage| ends.iter().map(|end| end.1[stage]).sum::<usize>());
+    println!(
+        "{} seeds: {moved} vehicles moved, {returned} turned back; each has one manager within {longest:?}",
+        ends.len()
+    );
+    assert!(ends.len() < 4 || moved > ends.len() && returned > 0, "{moved} {returned}");
+}
+
+#[test]
+fn whatever_fails_a_vehicle_that_is_handed_over_has_one_manager() {
+    runs(4, 5);
+}
