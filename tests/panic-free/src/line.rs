@@ -28,5 +28,5 @@ entry!(line_stream, {
 entry!(line_datagrams, {
     let line: &mut Line = unknown();
     keep(line.send_datagram(*unknown(), *unknown(), unknown_slice()));
-    keep(line.next_datagram());
+    keep((line.has_datagram(), line.next_datagram()));
 });

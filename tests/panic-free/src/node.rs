@@ -69,7 +69,7 @@ entry!(node_hears, {
     node().stand_by(*unknown());
     node().not_raised(*unknown());
     keep((node().is_standby(), node().starts_above(), node().lead(*unknown(), *unknown())));
-    keep((node().has_rival(), node().handed_over(unknown())));
+    keep((node().has_rival(), node().handed_over(unknown()), node().take_hand_over()));
     node().belong_to(unknown(), unknown());
 });
 
