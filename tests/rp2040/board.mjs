@@ -1,9 +1,10 @@
-// A board that runs beside other programs: node board.mjs SOCKET FLASH [UF2…] [--events]
+// A board that runs beside other programs: node board.mjs SOCKET FLASH [UF2…] [--events] [--cut=PHASE:NUMBER]
 //
 // SOCKET takes Ethernet frames as QEMU's `-netdev stream` does, each behind its length in four bytes. FLASH is a file with the
 // flash, made of the UF2 files if it is absent. Standard output has the log as defmt encodes it; with `--events`, standard error has what
 // happens, each with the chip's own time in µs: `pin NUMBER LEVEL`, `flash KIND OFFSET`, and `from` and `to` with the payload's bytes for
-// TCP and UDP. The signal USR2 presses the button. When the other end closes SOCKET, power goes.
+// TCP and UDP. The signal USR2 presses the button. Power goes when the other end closes SOCKET, or `before`, `within` or `after` the flash
+// operation of that number, from 1.
 //
 // The chip's clock follows this computer's, and stands still where this computer is too slow or busy for it.
 
@@ -17,9 +18,11 @@ const [BEHIND, TURN] = [20e6, 2e6];
 /** How long the button is pressed, in ns. */
 const PRESSED = 200e6;
 
+const isOption = (word) => word.startsWith('--');
 const words = process.argv.slice(2);
 const showsEvents = words.includes('--events');
-const [socketPath, flashPath, ...images] = words.filter((word) => word !== '--events');
+const cut = words.find((word) => word.startsWith('--cut='))?.slice('--cut='.length);
+const [socketPath, flashPath, ...images] = words.filter((word) => !isOption(word));
 if (!existsSync(flashPath)) writeFileSync(flashPath, flashOf(...images.map((image) => readFileSync(image))));
 const chip = new Chip(new Uint8Array(readFileSync(flashPath)));
 const flash = openSync(flashPath, 'r+');
@@ -34,10 +37,12 @@ chip.onReset = () => {
   console.error('the watchdog resets the chip');
   process.exit(1);
 };
+let operations = 0;
 chip.onFlash = (kind, offset, length, phase) => {
-  if (phase !== 'after') return;
+  if (phase === 'before') operations++;
   writeSync(flash, chip.flash, offset, length, offset);
-  happens('flash', kind, offset);
+  if (cut === `${phase}:${operations}`) process.exit(0);
+  if (phase === 'after') happens('flash', kind, offset);
 };
 
 const button = chip.rp.gpio[BUTTON];

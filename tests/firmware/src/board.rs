@@ -9,7 +9,7 @@ use std::rc::Rc;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use cara_processes::network;
 use defmt_decoder::{DecodeError, Table};
 use rustix::process::{Pid, Signal, kill_process};
@@ -117,7 +117,16 @@ impl Bench {
 
     /// The same with what happens at the pins of an RP2040.
     pub(crate) fn watched_board(&self, cable: &Cable, who: &Who) -> Result<(Board, Events)> {
-        let mut board = self.start(self.emulator(cable, who)?.arg("--events").stderr(Stdio::piped()), who)?;
+        self.watch(&mut self.emulator(cable, who)?, who)
+    }
+
+    /// The same, whose power goes at a phase of its second write to flash, which stores its manager's claim.
+    pub(crate) fn board_that_loses_power(&self, cable: &Cable, who: &Who, phase: &str) -> Result<(Board, Events)> {
+        self.watch(self.emulator(cable, who)?.arg(format!("--cut={phase}:2")), who)
+    }
+
+    fn watch(&self, emulator: &mut Command, who: &Who) -> Result<(Board, Events)> {
+        let mut board = self.start(emulator.arg("--events").stderr(Stdio::piped()), who)?;
         let output = board.child.stderr.take().context("the emulator has no standard error")?;
         Ok((board, Events::read(output)))
     }
@@ -342,6 +351,16 @@ impl Board {
 
     fn signal(&self, signal: Signal) -> Result<()> {
         kill_process(Pid::from_child(&self.child), signal).with_context(|| format!("{} takes no signal", self.name))
+    }
+
+    /// Does something until it has lost its power by itself.
+    pub(crate) fn loses_power(mut self, mut act: impl FnMut()) -> Result<()> {
+        let deadline = Instant::now() + LONG;
+        while self.child.try_wait()?.is_none() {
+            ensure!(Instant::now() < deadline, "{} runs on", self.name);
+            act();
+        }
+        Ok(())
     }
 
     /// Takes its power.

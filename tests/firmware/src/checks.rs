@@ -4,7 +4,7 @@ mod calls;
 mod limits;
 mod lists;
 pub(crate) mod losses;
-mod restarts;
+pub(crate) mod restarts;
 mod security;
 mod terms;
 
@@ -52,4 +52,11 @@ pub(crate) const RP2040: [Check; 7] = [
     Check { name: "a pulled cable stops it, and it returns", run: losses::cable },
     Check { name: "a killed manager stops it, and a new one finds it", run: losses::manager },
     Check { name: "it comes back from every loss of power", run: restarts::run },
+];
+
+/// Those that run on an RP2040 with keys.
+pub(crate) const RP2040_SECURED: [Check; 3] = [
+    Check { name: "without keys it joins no manager", run: security::no_keys },
+    Check { name: "with keys of others it joins no manager", run: security::other_keys },
+    Check { name: "after its restart it refuses an older manager", run: terms::kept },
 ];

@@ -1,5 +1,4 @@
-//! The image of an RP2040 with a W5500, unchanged, in rp2040js (`tests/rp2040`): the same checks as on the emulated board, in plain
-//! mode, and what the motors' pin does, by the chip's own clock.
+//! The image of an RP2040 with a W5500, unchanged, in rp2040js (`tests/rp2040`): checks of the emulated board, and what the motors' pin does, by the chip's own clock.
 
 mod events;
 mod wire;
@@ -12,8 +11,8 @@ use cara_processes::Process;
 use cara_std::{Error, Renew, RequestOptions};
 
 use crate::board::{Bench, LONG, Who};
+use crate::checks::restarts::works;
 use crate::checks::{self, Check};
-use crate::keys::Keys;
 use crate::manager::{self, Manager, at, drives, patiently, sets_out};
 use crate::{Arguments, run_checks};
 use events::Event;
@@ -23,20 +22,29 @@ pub(crate) use wire::Wire;
 /// Where the emulator's programs are.
 pub(crate) const SCRIPTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../rp2040/");
 
-const CHECKS: [Check; 6] = [
+const CHECKS: [Check; 5] = [
     Check { name: "the motors' pin is on while it drives", run: driving },
     Check { name: "without renewal the pin is off as the lease ends", run: not_renewed },
     Check { name: "a manager freezes: the pin is off as the lease ends", run: frozen },
     Check { name: "a manager is killed: the pin is off at once", run: killed },
     Check { name: "its button calls the manager's mechanic", run: button },
+];
+
+/// What a board does with flash, where it has keys.
+const SECURED: [Check; 2] = [
+    Check { name: "power is cut while it stores a claim", run: claims },
     Check { name: "no cut of power in flash repeats a count of starts", run: starts },
 ];
 
 /// Runs all of it.
 pub(crate) fn run(arguments: &Arguments) -> Result<()> {
-    let cara = arguments.cara.as_deref();
-    let bench = Bench::new(&arguments.image, arguments.logs, Keys::insecure(cara)?)?.rp2040();
-    let passed = run_checks(&CHECKS, &bench, arguments)? + run_checks(&checks::RP2040, &bench, arguments)?;
+    let bench = crate::bench(arguments)?.rp2040();
+    let others: [&[Check]; 2] =
+        if arguments.insecure { [&checks::RP2040, &[]] } else { [&checks::RP2040_SECURED, &SECURED] };
+    let mut passed = run_checks(&CHECKS, &bench, arguments)?;
+    for checks in others {
+        passed += run_checks(checks, &bench, arguments)?;
+    }
     ensure!(passed > 0, "no check has `{}` in its name", arguments.only);
     println!("{passed} checks of an RP2040 passed");
     Ok(())
@@ -138,6 +146,24 @@ fn button(bench: &Bench, _: u32) -> Result<String> {
     board.press()?;
     board.logs("a mechanic comes in 5 minutes")?;
     Ok("pressed once".into())
+}
+
+/// A claim is stored before the first moving call under it. Wherever power is cut then, nothing has moved, and the next life serves.
+fn claims(bench: &Bench, _: u32) -> Result<String> {
+    for phase in ["before", "within", "after"] {
+        let cable = bench.cable()?;
+        let who = Who::agv(17);
+        let manager = Manager::start(&bench.keys)?;
+        let (board, events) = bench.board_that_loses_power(&cable, &who, phase)?;
+        let agv = manager.meet(&who)?;
+        // Until one comes in time on a busy host; the link ends with the board.
+        let mut place = at([1, 0])?;
+        board.loses_power(|| drop(agv.call("go_to", &mut place).wait())).context(phase)?;
+        ensure!(events.count_of_motors() <= 1, "power is cut {phase}, and it has moved");
+        let board = bench.board(&cable, &who)?;
+        works(&manager, &board, &who).context(phase)?;
+    }
+    Ok("before, within and after".into())
 }
 
 /// The image counts its starts where it has keys.

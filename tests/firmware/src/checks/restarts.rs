@@ -118,7 +118,7 @@ fn reach(state: State, manager: &Manager, board: &Board, who: &Who) -> Result<()
 }
 
 /// The board serves as if nothing had been: a fresh one, which stands where it began.
-fn works(manager: &Manager, board: &Board, who: &Who) -> Result<()> {
+pub(crate) fn works(manager: &Manager, board: &Board, who: &Who) -> Result<()> {
     board.logs("has joined")?;
     let agv: Peer = manager.meet(who)?;
     let found = retried(|| position(&agv))?;

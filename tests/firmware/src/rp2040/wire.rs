@@ -14,8 +14,8 @@ use anyhow::{Context, Result};
 use smoltcp::phy::{Device, Medium, RxToken, TunTapInterface, TxToken, wait};
 use smoltcp::time::{Duration as StackDuration, Instant as StackInstant};
 
-/// How often either end is looked at.
-const TICK: StackDuration = StackDuration::from_micros(500);
+/// How often the board's end is looked at. A shorter wait would be none.
+const TICK: StackDuration = StackDuration::from_millis(1);
 /// Bytes of a frame's length.
 const LENGTH: usize = 4;
 
