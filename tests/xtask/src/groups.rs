@@ -343,7 +343,7 @@ pub(crate) const GROUPS: [Group; 35] = [
     Group {
         name: "rp2040",
         what: "an RP2040's image in rp2040js with a W5500, against the Linux manager: calls, the motors' pin, losses of power, cuts in flash",
-        budget: 900,
+        budget: 1_200,
         quick: None,
         by_default: false,
         waits: true,
