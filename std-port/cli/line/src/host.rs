@@ -95,14 +95,7 @@ impl Host {
                 Ok(listener)
             })?;
         }
-        let socket = keep(&mut self.datagrams, PORTS, from, || {
-            let socket = socket(SocketType::DGRAM)?;
-            // A board's datagrams come from the discovery port itself, which all units of the host share.
-            sockopt::set_socket_reuseaddr(&socket, true)?;
-            sockopt::set_socket_broadcast(&socket, true)?;
-            bind(&socket, &SocketAddrV4::new(address, from))?;
-            Ok(socket.into())
-        })?;
+        let socket = keep(&mut self.datagrams, PORTS, from, || for_datagrams(address, from))?;
         let to = if to == 0 { (ALL, self.discovery_port) } else { (Ipv4Addr::LOCALHOST, to) };
         // The first attempt may report that an earlier datagram met no reader.
         let _ = socket.send_to(bytes, to).or_else(|_| socket.send_to(bytes, to));
@@ -133,6 +126,15 @@ impl Host {
         prepare(&stream)?;
         Ok(stream)
     }
+}
+
+/// A socket for the other unit's datagrams. A board's come from the discovery port itself, which all units of the host share.
+fn for_datagrams(address: Ipv4Addr, port: u16) -> io::Result<UdpSocket> {
+    let socket = socket(SocketType::DGRAM)?;
+    sockopt::set_socket_reuseaddr(&socket, true)?;
+    sockopt::set_socket_broadcast(&socket, true)?;
+    bind(&socket, &SocketAddrV4::new(address, port))?;
+    Ok(socket.into())
 }
 
 fn socket(kind: SocketType) -> io::Result<OwnedFd> {
@@ -191,6 +193,14 @@ mod tests {
             keep(&mut open, 2, port, || Ok(port)).unwrap();
         }
         assert_eq!(open, [(1, 1), (3, 3)]);
+    }
+
+    #[test]
+    fn datagrams_may_come_from_the_discovery_port() {
+        let address = Ipv4Addr::new(127, 67, 255, 2);
+        let host = Host::open(address, 0, Fleet(1)).unwrap();
+        let port = host.shared.local_addr().unwrap().port();
+        for_datagrams(address, port).unwrap();
     }
 
     /// A device on the line must not reach what else the host runs.
