@@ -65,7 +65,8 @@ object! {
     }
     ActionParameter { key: String, value: Value }
     /// Topic `instantActions` (6.9).
-    InstantActions { #[serde(flatten)] header: Header, actions: Vec<Action> }
+    /// Some masters of 2.0 have the member's name of 1.1.
+    InstantActions { #[serde(flatten)] header: Header, #[serde(alias = "instantActions")] actions: Vec<Action> }
     /// Topic `connection` (6.14).
     Connection { #[serde(flatten)] header: Header, connection_state: ConnectionState }
     /// Topic `visualization` (6.13).

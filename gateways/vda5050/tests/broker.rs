@@ -351,6 +351,30 @@ fn a_master_drives_a_vehicle() {
     }
 }
 
+/// The master control of vda-5050-lib, which speaks 2.0, as a process of its own.
+#[test]
+#[ignore = "fetches the master by npm"]
+fn a_master_by_others_drives_a_vehicle() {
+    let plant = Plant::with("{ do = \"stop\" }", "2.0.0", |_| Default::default());
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("masters");
+    std::fs::create_dir_all(&folder).unwrap();
+    for file in ["package.json", "master.js"] {
+        std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/masters").join(file), folder.join(file))
+            .unwrap();
+    }
+    let mut npm = Command::new("npm");
+    assert!(npm.args(["install", "--silent"]).current_dir(&folder).status().unwrap().success());
+    let mut node = Command::new("node");
+    let mut master = Process::start(node.args(["master.js", &plant.port.to_string()]).current_dir(&folder));
+    let mut ended = None;
+    until("the master ends", || {
+        ended = master.child.try_wait().unwrap();
+        ended.is_some()
+    });
+    assert!(ended.unwrap().success(), "{:?}\n{:?}", master.lines(), plant.vehicle.lines());
+    assert_eq!([plant.count("drive "), plant.count("act ")], [5, 1], "{:?}", plant.vehicle.lines());
+}
+
 #[test]
 fn messages_that_are_not_for_this_vehicle_now_move_nothing() {
     let plant = Plant::start("{ do = \"stop\" }");

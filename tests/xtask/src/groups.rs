@@ -351,14 +351,15 @@ pub(crate) const GROUPS: [Group; 35] = [
     },
     Group {
         name: "vda5050",
-        what: "the gateway to VDA 5050: schemas, order handling, record, and mosquitto; its clippy, as it is outside of the workspace",
+        what: "the gateway to VDA 5050: schemas, order handling, record, mosquitto, and a master by others; its clippy, as it is outside of the workspace",
         budget: 600,
         quick: None,
         by_default: false,
         waits: true,
         run: |_| {
             let broker = install::program("mosquitto", "mosquitto");
-            needing(broker.and_then(|()| install::program("openssl", "openssl")), vda5050)
+            let tools = broker.and_then(|()| install::program("openssl", "openssl"));
+            needing(tools.and_then(|()| install::program("npm", "npm")), vda5050)
         },
     },
 ];
@@ -500,21 +501,21 @@ fn recordings() -> Result<()> {
 }
 
 fn etcd() -> Result<()> {
-    outside("std-port/etcd/Cargo.toml", "target/etcd", &["--features", "tls"])
+    outside("std-port/etcd/Cargo.toml", "target/etcd", &["--features", "tls"], &[])
 }
 
 fn vda5050() -> Result<()> {
-    outside("gateways/vda5050/Cargo.toml", "target/vda5050", &[])
+    outside("gateways/vda5050/Cargo.toml", "target/vda5050", &[], &["--include-ignored"])
 }
 
 /// Clippy and the tests of a crate that is a workspace of its own.
-fn outside(manifest: &str, target: &str, of_clippy: &[&str]) -> Result<()> {
+fn outside(manifest: &str, target: &str, of_clippy: &[&str], of_tests: &[&str]) -> Result<()> {
     let cargo = |command| {
         let place = ["--locked", "--manifest-path", manifest, "--target-dir", target];
         Run::cargo().args([command]).args(place)
     };
     cargo("clippy").args(["--all-targets"]).args(of_clippy).args(["--", "-D", "warnings"]).stream()?;
-    cargo("test").args(["--", "--nocapture"]).stream()
+    cargo("test").args(["--", "--nocapture"]).args(of_tests).stream()
 }
 
 fn present(file: &str) -> Result<()> {
