@@ -22,6 +22,9 @@ pub struct Entry {
     pub action: Action,
     /// Where it stands.
     pub place: Place,
+    /// Of an action at once: which message it came in, as some masters use an id again.
+    #[serde(default)]
+    pub message: String,
     /// What is reported.
     pub status: ActionStatus,
     /// What it has yielded, or why it failed.
@@ -48,6 +51,7 @@ impl Entry {
         Self {
             action,
             place,
+            message: String::new(),
             status: ActionStatus::Waiting,
             result: None,
             is_triggered: false,

@@ -9,12 +9,15 @@ use crate::actions::{Entry, Place, block_driving, startable};
 use crate::errors::{Kind, Refusal};
 use crate::message::{Action, ActionScope, ActionStatus, EStop, InstantActions, OperatingMode, Order, Report};
 use crate::order::{Held, Verdict, judge, performable};
-use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status};
+use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status, copy_of};
 
 /// Most errors that are reported at a time; the oldest go.
 pub const ERRORS: usize = 16;
 /// Most actions at once that are remembered after they have ended; the oldest go.
 pub const INSTANT_ACTIONS: usize = 64;
+/// Actions at once that the gateway itself does.
+const OWN_ACTIONS: [&str; 6] =
+    ["startPause", "stopPause", "cancelOrder", "stateRequest", "factsheetRequest", "initPosition"];
 /// How long the vehicle is left alone after it has refused something.
 const BACK_OFF: Duration = Duration::from_millis(500);
 
@@ -219,9 +222,8 @@ impl Machine {
                 ..Record::default()
             };
             let instant = old.actions.into_iter().filter(|entry| !entry.is_of_order());
-            std::iter::once(old.order_id)
-                .chain(instant.map(|entry| entry.action.action_id))
-                .for_each(|id| self.record.spend(id));
+            self.record.spend(old.order_id);
+            instant.for_each(|entry| self.record.spend_action(entry));
         } else {
             let horizon: Vec<Place> = self.record.actions.iter().map(|entry| entry.place).collect();
             let mut stays = horizon.iter().map(|place| !self.is_in_horizon(*place)).collect::<Vec<_>>().into_iter();
@@ -289,11 +291,11 @@ impl Machine {
         self.has_changed = true;
     }
 
-    /// A message on topic `instantActions`. One whose id is known changes nothing.
+    /// A message on topic `instantActions`. A copy of one changes nothing.
     pub fn instant_actions(&mut self, message: InstantActions) {
+        let stamp = format!("{} {}", message.header.header_id, message.header.timestamp);
         for action in message.actions {
-            let is_known = |entry: &Entry| entry.action.action_id == action.action_id;
-            if self.record.actions.iter().any(is_known) || self.record.spent.contains(&action.action_id) {
+            if !self.is_due(&action, &stamp) {
                 continue;
             }
             if self.record.actions.len() >= self.policy.can.max_actions + INSTANT_ACTIONS {
@@ -302,12 +304,41 @@ impl Machine {
             }
             self.has_changed = true;
             self.is_report_due = true;
-            let mut entry = Entry::new(action, Place::Instant);
+            let mut entry = Entry { message: stamp.clone(), ..Entry::new(action, Place::Instant) };
             self.begin(&mut entry);
             self.record.actions.push(entry);
         }
         self.forget_instant_actions();
         self.settle();
+    }
+
+    /// Whether an action at once is new. What the gateway itself does has the same effect each time, and some masters send it under
+    /// the same id again, so that it counts by its message; what the vehicle does counts by its id.
+    fn is_due(&mut self, action: &Action, stamp: &str) -> bool {
+        let id = &action.action_id;
+        if self.record.spent.contains(&copy_of(id, stamp)) {
+            return false;
+        }
+        let is_own = OWN_ACTIONS.contains(&action.action_type.as_str());
+        let known = self.record.actions.iter().position(|entry| entry.action.action_id == *id);
+        if let Some(known) = known {
+            let entry = &self.record.actions[known];
+            let is_same = !entry.is_of_order() && entry.action.action_type == action.action_type;
+            if is_same && (entry.message == stamp || is_own && !entry.status.has_ended()) {
+                return false;
+            }
+            if is_same && is_own {
+                let before = self.record.actions.remove(known);
+                self.record.spend(copy_of(id, &before.message));
+                return true;
+            }
+        }
+        let is_new = known.is_none() && (is_own || !self.record.spent.contains(id));
+        if !is_new {
+            let refusal = Refusal::new(Kind::Validation, "an action of this id was sent before");
+            self.refuse(&refusal.about("topic", "instantActions").about("actionId", id));
+        }
+        is_new
     }
 
     fn begin(&mut self, entry: &mut Entry) {
@@ -416,7 +447,7 @@ impl Machine {
         });
         self.record.actions = kept;
         let gone: Vec<Entry> = gone;
-        gone.into_iter().for_each(|entry| self.record.spend(entry.action.action_id));
+        gone.into_iter().for_each(|entry| self.record.spend_action(entry));
     }
 
     /// The vehicle has said how it is. The first status of a link says what has become of what the link before had begun.

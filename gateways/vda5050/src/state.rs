@@ -175,13 +175,24 @@ impl std::fmt::Display for Failure {
     }
 }
 
+/// By what a copy of an instant action is known.
+pub(crate) fn copy_of(id: &str, message: &str) -> String {
+    format!("{id} {message}")
+}
+
 impl Record {
     /// An order or an instant action is over.
     pub(crate) fn spend(&mut self, id: String) {
         /// Most that are remembered.
-        const SPENT: usize = 128;
+        const SPENT: usize = 256;
         self.spent.push(id);
         self.spent.drain(..self.spent.len().saturating_sub(SPENT));
+    }
+
+    /// The same of an action at once: neither its id nor its message counts again.
+    pub(crate) fn spend_action(&mut self, entry: Entry) {
+        self.spend(copy_of(&entry.action.action_id, &entry.message));
+        self.spend(entry.action.action_id);
     }
 
     /// Whether the order has nodes left or actions that have not ended; those at once do not count.

@@ -378,6 +378,47 @@ fn instant_actions_are_done_once() {
     assert_eq!((pair.vehicle.began.as_slice(), pair.vehicle.reached.len()), (["i4".to_owned()].as_slice(), 2));
 }
 
+/// vda5050-sdk sends each pause and each cancel under the same id.
+#[test]
+fn an_id_of_a_new_message_counts_again_for_what_the_gateway_does() {
+    let mut pair = Pair::new("a");
+    let mut header_id = 10;
+    let mut again = |kind: &str, id: &str| {
+        header_id += 1;
+        let mut message = instant(kind, id);
+        message.header.header_id = header_id;
+        message
+    };
+    for round in 0..3 {
+        let (from, to) = if round % 2 == 0 { ("a", "c") } else { ("c", "a") };
+        pair.machine.order(order(&format!("o{round}"), 0, 0, &format!("{from}! {to}!")));
+        pair.turn();
+        let pause = again("startPause", "pause");
+        pair.machine.instant_actions(pause.clone());
+        pair.turns(2);
+        assert!(pair.machine.record().is_paused && pair.actions().contains(&"pause FINISHED".to_owned()), "{round}");
+        pair.machine.instant_actions(again("stopPause", "resume"));
+        pair.machine.instant_actions(pause);
+        assert!(!pair.machine.record().is_paused, "a copy");
+        if round == 1 {
+            pair.machine.instant_actions(again("cancelOrder", "cancel"));
+            pair.turns(2);
+            assert_eq!((pair.left().as_str(), pair.vehicle.status.is_driving), ("", false));
+            // Driven on by hand.
+            pair.vehicle.status.position = Fake::at("a").status.position;
+            pair.machine.status(pair.vehicle.status.clone());
+        }
+        pair.turns(10);
+    }
+    assert!(pair.errors().is_empty() && pair.left().is_empty());
+    // What the vehicle does is done once.
+    for _ in 0..2 {
+        pair.machine.instant_actions(again("beep", "beep"));
+        pair.turns(5);
+    }
+    assert_eq!((pair.vehicle.began.len(), pair.errors()), (1, vec!["validationError"]));
+}
+
 #[test]
 fn init_position_waits_for_no_order() {
     let mut pair = Pair::new("a");
