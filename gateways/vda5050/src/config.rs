@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use serde::Deserialize;
 
-use crate::message::Factsheet;
-use crate::order::Capabilities;
+use crate::machine::OWN_ACTIONS;
+use crate::message::{ActionScope, AgvAction, Factsheet, OptionalParameter, Support};
+use crate::order::{Capabilities, ID_BYTES};
 use crate::state::{OnBrokerLoss, Policy};
 
 /// All of it.
@@ -203,7 +204,7 @@ impl Config {
         }
     }
 
-    /// The factsheet of the series; the gateway writes the header.
+    /// The factsheet of the series. The gateway writes the header, and what it knows itself: limits, optional members and actions.
     pub fn factsheet(&self) -> Result<Factsheet> {
         let file = &self.vda5050.factsheet;
         let text = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
@@ -215,7 +216,48 @@ impl Config {
         for name in ["manufacturer", "serialNumber"] {
             object.insert(name.into(), "".into());
         }
-        serde_json::from_value(value).with_context(|| file.display().to_string())
+        let mut factsheet: Factsheet = serde_json::from_value(value).with_context(|| file.display().to_string())?;
+        self.complete(&mut factsheet);
+        Ok(factsheet)
+    }
+
+    fn complete(&self, factsheet: &mut Factsheet) {
+        let can = &self.capabilities;
+        let limits = &mut factsheet.protocol_limits;
+        (limits.max_string_lens.id_len, limits.max_string_lens.enum_len) =
+            (Some(ID_BYTES as u32), Some(ID_BYTES as u32));
+        let nodes = u32::try_from(can.max_nodes).unwrap_or(u32::MAX);
+        let lens = &mut limits.max_array_lens;
+        (lens.order_nodes, lens.order_edges) = (Some(nodes), Some(nodes.saturating_sub(1)));
+        limits.timing.min_state_interval = self.vda5050.state_interval;
+        limits.timing.default_state_interval = Some(self.vda5050.state_every);
+        let position = if can.needs_positions { Support::Required } else { Support::Supported };
+        let known = [
+            ("order.nodes.nodePosition", position),
+            ("order.nodes.nodePosition.theta", Support::Supported),
+            ("order.nodes.nodePosition.allowedDeviationXY", Support::Supported),
+            ("order.nodes.nodePosition.allowedDeviationTheta", Support::Supported),
+            ("order.edges.maxSpeed", Support::Supported),
+        ];
+        let features = &mut factsheet.protocol_features;
+        features.optional_parameters = known
+            .map(|(parameter, support)| OptionalParameter { parameter: parameter.into(), support, description: None })
+            .into();
+        let own = OWN_ACTIONS.map(|name| (name, vec![ActionScope::Instant]));
+        let of_vehicle = can.actions.iter().map(|(name, kind)| (name.as_str(), kind.scopes.clone()));
+        for (action_type, action_scopes) in own.into_iter().chain(of_vehicle) {
+            match features.agv_actions.iter_mut().find(|action| action.action_type == action_type) {
+                Some(action) => action.action_scopes = action_scopes,
+                None => {
+                    let action_type = action_type.to_owned();
+                    features.agv_actions.push(AgvAction { action_type, action_scopes, ..AgvAction::default() });
+                }
+            }
+        }
+        let is_there = |action: &AgvAction| {
+            OWN_ACTIONS.contains(&action.action_type.as_str()) || can.actions.contains_key(&action.action_type)
+        };
+        features.agv_actions.retain(is_there);
     }
 
     /// The topics of a vehicle, up to its own name.

@@ -16,7 +16,7 @@ pub const ERRORS: usize = 16;
 /// Most actions at once that are remembered after they have ended; the oldest go.
 pub const INSTANT_ACTIONS: usize = 64;
 /// Actions at once that the gateway itself does.
-const OWN_ACTIONS: [&str; 6] =
+pub const OWN_ACTIONS: [&str; 6] =
     ["startPause", "stopPause", "cancelOrder", "stateRequest", "factsheetRequest", "initPosition"];
 /// How long the vehicle is left alone after it has refused something.
 const BACK_OFF: Duration = Duration::from_millis(500);

@@ -351,7 +351,7 @@ pub(crate) const GROUPS: [Group; 35] = [
     },
     Group {
         name: "vda5050",
-        what: "the gateway to VDA 5050: schemas, order handling, record, mosquitto, and a master by others; its clippy, as it is outside of the workspace",
+        what: "the gateway to VDA 5050: schemas, order handling, record, mosquitto, and masters by others; its clippy, as it is outside of the workspace",
         budget: 600,
         quick: None,
         by_default: false,
