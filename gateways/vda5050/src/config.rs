@@ -274,5 +274,9 @@ fn is_level(text: &str, is_serial: bool) -> bool {
         _ => !letter.is_control() && !"/+#$".contains(letter),
     };
     // A serial number names a file as well.
-    !text.is_empty() && text.len() <= 64 && text.chars().all(fits) && !text.chars().all(|letter| letter == '.')
+    !text.is_empty()
+        && text.len() <= 64
+        && text.trim() == text
+        && text.chars().all(fits)
+        && !text.chars().all(|letter| letter == '.')
 }

@@ -363,9 +363,10 @@ impl Machine {
             "initPosition" if self.is_executing() => {
                 (ActionStatus::Failed, Some("an order is being executed".to_owned()))
             }
-            "initPosition" => running,
-            _ => match performable(&entry.action, ActionScope::Instant, &self.policy.can) {
-                Ok(_) => {
+            "initPosition" if self.is_linked() => running,
+            "initPosition" => (ActionStatus::Failed, Some("the vehicle is not connected".to_owned())),
+            _ => match self.performs(&entry.action) {
+                Ok(()) => {
                     entry.is_triggered = true;
                     (ActionStatus::Waiting, None)
                 }
@@ -376,6 +377,16 @@ impl Machine {
             },
         };
         (entry.status, entry.result) = (status, result);
+    }
+
+    /// Whether the vehicle does this at once: it does nothing late.
+    fn performs(&self, action: &Action) -> Result<(), Refusal> {
+        let refused = |text: &str| Err(Refusal::new(Kind::Order, text).about("actionId", &action.action_id));
+        match &self.status {
+            None => refused("the vehicle is not connected"),
+            Some(status) if !is_controlled(status.mode) => refused("the vehicle is not in an automatic mode"),
+            Some(_) => performable(action, ActionScope::Instant, &self.policy.can).map(drop),
+        }
     }
 
     /// `cancelOrder` (6.6.3): what waits fails, what runs is ended where that can be; then the vehicle stands, and the order is over.

@@ -113,16 +113,21 @@ fn new(order: &Order, held: &Held<'_>, can: &Capabilities) -> Result<(), Refusal
     Err(Refusal::new(Kind::Order, "the vehicle is not at the first node").about("nodeId", &first.node_id))
 }
 
-/// The vehicle stands on the node, or within its deviation (6.6.1).
+/// The vehicle stands on the node, or within its deviation (6.6.1). Where it is counts more than where it was last.
 fn is_reachable(node: &Node, held: &Held<'_>, can: &Capabilities) -> bool {
-    if !held.last_node.0.is_empty() && node.node_id == held.last_node.0 && !held.is_cancelled {
-        return true;
-    }
+    let is_last = !held.last_node.0.is_empty() && node.node_id == held.last_node.0;
     let (Some(at), Some((x, y, map))) = (&node.node_position, held.position) else {
-        // Without positions the identifier is all there is.
-        return node.node_id == held.last_node.0;
+        // A cancelled order may have ended between two nodes.
+        return is_last && !held.is_cancelled;
     };
-    let allowed = at.allowed_deviation_xy.filter(|allowed| *allowed > 0.0).unwrap_or(can.tolerance);
+    let deviation = at.allowed_deviation_xy.unwrap_or(0.0);
+    let allowed = if is_last {
+        deviation.max(can.tolerance)
+    } else if deviation > 0.0 {
+        deviation
+    } else {
+        can.tolerance
+    };
     at.map_id == map && (at.x - x).hypot(at.y - y) <= allowed
 }
 
@@ -255,6 +260,8 @@ fn positioned(node: &Node, can: &Capabilities) -> Result<(), Refusal> {
 fn unusable(edge: &Edge) -> Option<&'static str> {
     let Edge { max_height, min_height, orientation, direction, rotation_allowed, max_rotation_speed, .. } = edge;
     let asked = [
+        // To the vehicle 0 is no limit.
+        ("maxSpeed", edge.max_speed.is_some_and(|speed| speed <= 0.0)),
         ("maxHeight", max_height.is_some()),
         ("minHeight", min_height.is_some()),
         ("orientation", orientation.is_some()),

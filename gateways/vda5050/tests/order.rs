@@ -116,6 +116,17 @@ fn each_box_of_the_order_handling() {
             }),
             "",
         ),
+        ("a speed of nothing", nothing, edge(|edge| edge.max_speed = Some(0.0)), "orderError"),
+        (
+            "from the last node, after it was moved by hand",
+            |pair| {
+                done(pair);
+                pair.vehicle.status.position = Fake::at("d").status.position;
+                pair.machine.status(pair.vehicle.status.clone());
+            },
+            order("o2", 0, 0, "b! c!"),
+            "orderError",
+        ),
         ("too many nodes", nothing, order("o1", 0, 0, &"a! ".repeat(21)), "orderError"),
         ("too many actions", nothing, order("o1", 0, 0, &"a!:pick,beep,drop ".repeat(7)), "orderError"),
         // Boxes 2, 3 and 4: a new order.
@@ -417,6 +428,22 @@ fn an_id_of_a_new_message_counts_again_for_what_the_gateway_does() {
         pair.turns(5);
     }
     assert_eq!((pair.vehicle.began.len(), pair.errors()), (1, vec!["validationError"]));
+}
+
+#[test]
+fn nothing_is_done_late() {
+    let mut pair = Pair::new("a");
+    pair.machine.vehicle_lost();
+    for (kind, id) in [("beep", "i1"), ("initPosition", "i2")] {
+        pair.machine.instant_actions(instant(kind, id));
+    }
+    assert_eq!(pair.actions(), ["i1 FAILED", "i2 FAILED"]);
+    pair.vehicle.status.mode = OperatingMode::Manual;
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.machine.instant_actions(instant("beep", "i3"));
+    pair.vehicle.status.mode = OperatingMode::Automatic;
+    pair.turns(5);
+    assert_eq!((pair.actions()[2].as_str(), pair.vehicle.began.len()), ("i3 FAILED", 0));
 }
 
 #[test]
