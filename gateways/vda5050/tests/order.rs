@@ -2,10 +2,13 @@
 
 mod fake;
 
+use std::time::Duration;
+
+use cara_vda5050::machine::Machine;
 use cara_vda5050::message::{
     ActionScope, BlockingType, Corridor, EStop, Edge, NodePosition, OperatingMode, Order, Trajectory,
 };
-use cara_vda5050::state::{OnBrokerLoss, Policy};
+use cara_vda5050::state::{Command, Failure, OnBrokerLoss, Policy};
 use fake::{Fake, Pair, instant, order, policy};
 
 const VERSIONS: [&str; 2] = ["2.0.0", "2.1.0"];
@@ -428,6 +431,46 @@ fn an_id_of_a_new_message_counts_again_for_what_the_gateway_does() {
         pair.turns(5);
     }
     assert_eq!((pair.vehicle.began.len(), pair.errors()), (1, vec!["validationError"]));
+}
+
+/// As behind a record of a backup: the vehicle takes no number that is lower than its last.
+#[test]
+fn numbers_go_on_above_those_of_the_vehicle() {
+    let mut pair = Pair::new("a");
+    (pair.vehicle.status.drive, pair.vehicle.status.action) = (50, 70);
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.machine.order(order("o1", 0, 0, "a!:beep b!"));
+    pair.turns(10);
+    assert_eq!((pair.left().as_str(), pair.vehicle.status.action, pair.vehicle.status.drive), ("", 71, 72));
+}
+
+#[test]
+fn a_drive_without_an_answer_is_given_up_before_it_is_asked_again() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b!"));
+    let drive = pair.machine.next(pair.now).unwrap();
+    assert!(matches!(drive, Command::Drive { number: 1, .. }));
+    pair.machine.answered(&drive, Err(Failure::Lost("time-out".into())), pair.now);
+    let halt = pair.machine.next(pair.now).unwrap();
+    assert_eq!(halt, Command::Halt);
+    pair.machine.answered(&halt, Ok(()), pair.now);
+    assert_eq!(pair.machine.next(pair.now), None, "not at once");
+    assert_eq!(pair.machine.next(pair.now + Duration::from_secs(1)), Some(drive));
+}
+
+/// Started again, the gateway waits for its broker, and needs no stopPause.
+#[test]
+fn before_the_first_connection_nothing_was_stopped() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b!"));
+    let policy = Policy { on_broker_loss: OnBrokerLoss::Stop, ..policy() };
+    pair.machine = Machine::new(pair.machine.record().clone(), policy, pair.now);
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.turns(5);
+    assert_eq!((pair.vehicle.reached.len(), pair.machine.record().is_paused), (0, false));
+    pair.machine.broker(true, pair.now);
+    pair.turns(5);
+    assert_eq!(pair.left(), "");
 }
 
 #[test]
