@@ -21,11 +21,20 @@ struct Options {
     check: bool,
 }
 
+/// Exit code for a configuration that cannot be used, as no restart mends it.
+const WRONG_FILE: u8 = 2;
+
 static END: End = End { is_due: AtomicBool::new(false), is_silent: AtomicBool::new(false) };
 
 fn main() -> Result<ExitCode> {
     let options = Options::parse();
-    let config = Config::read(&options.config)?;
+    let config = match Config::read(&options.config) {
+        Ok(config) => config,
+        Err(error) => {
+            eprintln!("{error:#}");
+            return Ok(ExitCode::from(WRONG_FILE));
+        }
+    };
     if options.check {
         gateway::check(&config)?;
         println!("{} vehicles, VDA 5050 {}", config.vehicle.len(), config.vda5050.version);

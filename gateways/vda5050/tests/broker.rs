@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use cara_std::keys::{FleetKeys, Store};
 use cara_std::{Fleet, Identity};
 use cara_vda5050::config::Config;
-use cara_vda5050::message::{InstantActions, Order};
+use cara_vda5050::message::{Connection, ConnectionState, InstantActions, Order};
 use cara_vda5050::vehicle::LEASE_MS;
 use fake::{instant, order};
 use rumqttc::{Client, Event, MqttOptions, Packet, QoS};
@@ -473,6 +473,19 @@ fn a_gateway_that_is_killed_stops_the_vehicle_and_goes_on_afterwards() {
     // Ended in order, it says so.
     plant.gateway.as_ref().unwrap().signal(Signal::TERM);
     plant.wait_for("OFFLINE", |plant| plant.connection() == "OFFLINE");
+}
+
+#[test]
+fn a_last_will_that_comes_late_is_contradicted() {
+    let plant = Plant::start("{ do = \"stop\" }");
+    // The gateway has heard itself.
+    sleep(Duration::from_secs(1));
+    let broken = Connection { connection_state: ConnectionState::Broken, ..Connection::default() };
+    plant.publish("connection", true, &broken);
+    let has_come =
+        |plant: &Plant| plant.heard.lock().unwrap()["connection"].iter().any(|(said, _)| said["manufacturer"] == "");
+    plant.wait_for("the will", has_come);
+    plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE");
 }
 
 #[test]
