@@ -11,7 +11,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 
 use super::audit::{ProgramCall, Who, changes_something};
-use super::protocol::{Answer, By, CallQuestion, Question, unix_ms};
+use super::protocol::{Answer, Argument, By, CallQuestion, Question, unix_ms};
 use super::values;
 use crate::Identity;
 use crate::locks::Rank;
@@ -48,21 +48,23 @@ impl Commands {
     }
 
     /// Reports what was asked for and one of its outcomes; `None` if its client has gone before.
-    pub(super) fn report(&self, by: &By, question: &Question, outcome: Option<Answer>) {
-        let command = Answer::Command {
-            unix_ms: unix_ms(),
-            by: by.clone(),
-            question: Box::new(question.clone()),
-            outcome: outcome.map(Box::new),
-        };
+    pub(super) fn report(&self, by: By, question: Question, outcome: Option<Answer>) {
+        let (question, outcome) = (Box::new(question), outcome.map(Box::new));
+        let mut command = Some(Answer::Command { unix_ms: unix_ms(), by, question, outcome });
         let mut followers = Rank::Leaf.lock(&self.followers);
-        followers.retain(|follower| match follower.sender.try_send(command.clone()) {
-            Ok(()) => true,
-            Err(TrySendError::Full(_)) => {
-                follower.lost.fetch_add(1, Ordering::Relaxed);
-                true
+        let mut left = followers.len();
+        followers.retain(|follower| {
+            left -= 1;
+            // The last one gets it without a copy.
+            let Some(command) = (if left == 0 { command.take() } else { command.clone() }) else { return true };
+            match follower.sender.try_send(command) {
+                Ok(()) => true,
+                Err(TrySendError::Full(_)) => {
+                    follower.lost.fetch_add(1, Ordering::Relaxed);
+                    true
+                }
+                Err(TrySendError::Disconnected(_)) => false,
             }
-            Err(TrySendError::Disconnected(_)) => false,
         });
         self.are_followed.store(!followers.is_empty(), Ordering::Relaxed);
     }
@@ -78,7 +80,7 @@ pub(super) struct Asked<'a> {
 }
 
 impl<'a> Asked<'a> {
-    /// `None` where nobody follows, and for a question that only looks.
+    /// `None` without a follower, and for a question that only looks.
     pub(super) fn of(commands: &'a Commands, who: &Who, question: &'a Question) -> Option<Self> {
         let is_reported = commands.are_followed() && changes_something(question);
         is_reported.then(|| Self { commands, by: who.by(), question, is_over: false })
@@ -102,7 +104,7 @@ impl<'a> Asked<'a> {
     }
 
     fn report(&self, outcome: Option<&Answer>) {
-        self.commands.report(&self.by, self.question, outcome.cloned());
+        self.commands.report(self.by.clone(), self.question.clone(), outcome.cloned());
     }
 }
 
@@ -130,17 +132,15 @@ impl Recorded {
 
     /// Its arguments.
     pub(crate) fn asks(&mut self, arguments: &ParametersView) {
-        if let Some(FollowedCall { definition, question: Question::Call(call), .. }) = self.followed.as_deref_mut() {
-            call.arguments = values::arguments(definition.signature().arguments(), arguments);
+        if let Some(call) = &mut self.followed {
+            call.arguments = values::arguments(call.definition.signature().arguments(), arguments);
         }
     }
 
     /// Its results.
     pub(crate) fn answers(&mut self, results: &ParametersView) {
-        if let Some(FollowedCall { definition, outcome: Answer::Called { results: found, .. }, .. }) =
-            self.followed.as_deref_mut()
-        {
-            *found = values::arguments(definition.signature().results(), results);
+        if let Some(call) = &mut self.followed {
+            call.results = values::arguments(call.definition.signature().results(), results);
         }
     }
 
@@ -155,40 +155,49 @@ impl Recorded {
     }
 }
 
-/// A call of the unit's own program that somebody follows.
+/// A call of the unit's own program that is followed.
 #[derive(Debug)]
 pub(crate) struct FollowedCall {
     commands: Arc<Commands>,
     definition: Definition,
-    question: Question,
-    outcome: Answer,
+    node: Identity,
+    take_over: bool,
+    arguments: Vec<Argument>,
+    results: Vec<Argument>,
     started: Instant,
     is_over: bool,
 }
 
 impl FollowedCall {
     pub(crate) fn of(commands: &Arc<Commands>, node: &Identity, definition: Definition, take_over: bool) -> Self {
-        let function = definition.name().to_owned();
-        let call = CallQuestion { node: Some(node.to_string()), function, take_over, ..CallQuestion::default() };
-        let (node, id, results, functions) = (node.name().to_owned(), node.id(), Vec::new(), Vec::new());
-        Self {
-            commands: commands.clone(),
-            definition,
-            question: Question::Call(call),
-            outcome: Answer::Called { node, id, results, call: None, error: None, took_us: 0, functions },
-            started: Instant::now(),
-            is_over: false,
-        }
+        let (commands, node, started) = (commands.clone(), node.clone(), Instant::now());
+        let (arguments, results, is_over) = (Vec::new(), Vec::new(), false);
+        Self { commands, definition, node, take_over, arguments, results, started, is_over }
     }
 
     fn ended(&mut self, ended: Result<Option<u32>, Error>) {
+        let outcome = Answer::Called {
+            node: self.node.name().to_owned(),
+            id: self.node.id(),
+            results: std::mem::take(&mut self.results),
+            call: ended.as_ref().copied().unwrap_or_default(),
+            error: ended.err().map(Into::into),
+            took_us: self.started.elapsed().as_micros() as u64,
+            functions: Vec::new(),
+        };
+        self.report(Some(outcome));
+    }
+
+    fn report(&mut self, outcome: Option<Answer>) {
         self.is_over = true;
-        if let Answer::Called { call, error, took_us, .. } = &mut self.outcome {
-            *call = ended.as_ref().copied().unwrap_or_default();
-            *error = ended.err().map(Into::into);
-            *took_us = self.started.elapsed().as_micros() as u64;
-        }
-        self.commands.report(&By::default(), &self.question, Some(self.outcome.clone()));
+        let question = CallQuestion {
+            node: Some(self.node.to_string()),
+            function: self.definition.name().to_owned(),
+            arguments: std::mem::take(&mut self.arguments),
+            take_over: self.take_over,
+            ..CallQuestion::default()
+        };
+        self.commands.report(By::default(), Question::Call(question), outcome);
     }
 }
 
@@ -196,7 +205,7 @@ impl FollowedCall {
 impl Drop for FollowedCall {
     fn drop(&mut self) {
         if !self.is_over {
-            self.commands.report(&By::default(), &self.question, None);
+            self.report(None);
         }
     }
 }
@@ -249,11 +258,11 @@ mod tests {
         let (followed, lost) = commands.follow(1);
         let by = Who::own().by();
         for _ in 0..3 {
-            commands.report(&by, &Question::Search, None);
+            commands.report(by.clone(), Question::Search, None);
         }
         assert_eq!((followed.try_iter().count(), lost.load(Ordering::Relaxed)), (1, 2));
         drop(followed);
-        commands.report(&by, &Question::Search, None);
+        commands.report(by.clone(), Question::Search, None);
         assert!(!commands.are_followed());
     }
 }

@@ -1,5 +1,5 @@
-//! What is recorded of calls by the unit's own program: the audit log has those that move, stop or reset something, and whoever
-//! follows commands gets all. An operator's are recorded where they are asked for.
+//! What is recorded of calls by the unit's own program: the audit log has those that move, stop or reset something, and the
+//! followers of commands get all. An operator's are recorded where they are asked for.
 
 #[cfg(feature = "control")]
 pub(super) use crate::control::Recorded;
@@ -7,8 +7,6 @@ pub(super) use crate::control::Recorded;
 #[cfg(feature = "control")]
 use std::sync::Arc;
 
-#[cfg(feature = "control")]
-use cara_core::distribution::function::Definition;
 #[cfg(not(feature = "control"))]
 use cara_core::distribution::parameters::ParametersView;
 #[cfg(not(feature = "control"))]
@@ -19,7 +17,7 @@ use super::link::LinkCell;
 #[cfg(feature = "control")]
 use crate::control::{Audit, Commands, FollowedCall, ProgramCall};
 
-/// Without operators there is no audit log, and nobody follows.
+/// Without operators there is no audit log, and no follower.
 #[cfg(not(feature = "control"))]
 #[derive(Debug)]
 pub(super) enum Recorded {}
@@ -58,14 +56,13 @@ impl Notes {
         let (attributes, definition) = {
             let link = link.lock();
             let known = link.session.their_function_list().named(function);
-            let definition = known.filter(|_| is_followed).map(|known| known.signature.to_string());
+            let definition = known.filter(|_| is_followed).map(|known| known.signature.to_definition());
             (known.map(|known| *known.attributes), definition)
         };
         let peer = link.peer.get();
         let node = || peer.map(|peer| peer.identity.to_string()).unwrap_or_default();
         let audited =
             self.audit.as_ref().and_then(|audit| ProgramCall::of(audit, function, attributes, options.take_over, node));
-        let definition = definition.and_then(|text| Definition::parse(&text).ok());
         let followed = peer
             .zip(definition)
             .map(|(peer, definition)| FollowedCall::of(&self.commands, &peer.identity, definition, options.take_over));

@@ -268,7 +268,7 @@ fn who_follows_commands_gets_arguments_and_outcomes_also_of_the_program() {
     let is_event = |answer: &Answer| matches!(answer, Answer::Event { .. });
     let mut next = || answers.find_map(|answer| Some(answer.unwrap()).filter(|answer| !is_event(answer)));
     let position = || vec![argument("position", 2, ArgumentValue::Int(vec![1, 2]))];
-    let question = Question::Call(call(Some("agv"), "go_to", position()));
+    let question = Question::Call(call(Some("agv"), "echo", every_type()));
     let answered = ask(&mut other, question.clone()).unwrap();
     ask(&mut other, Question::Unit).unwrap();
     let Answer::Command { by, question: asked, outcome, .. } = next().unwrap() else { panic!("no command") };
