@@ -46,7 +46,7 @@ pub(crate) fn run(orders: &Orders) -> Result<ExitCode> {
         ("orders", "many_vehicles", orders.large),
         ("standby", "each_vehicle_has_a_manager_soon", orders.seeds),
         ("standby", "two_hundred_vehicles", orders.large),
-        ("handed", "a_vehicle_that_is_handed_over", orders.seeds),
+        ("handed", "a_vehicle_that_is_handed_over", orders.seeds.div_ceil(10)),
     ];
     for (program, test, seeds) in tests {
         let start = Instant::now();
