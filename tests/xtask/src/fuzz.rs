@@ -128,8 +128,8 @@ fn drive(program: &Path, name: &str, longest: &str, limit: &str, folder: &Path) 
 
 fn told(output: &str) -> Option<Told> {
     let number = |text: &str| text.split_whitespace().next()?.parse::<u64>().ok();
-    let coverage = output.lines().filter_map(|line| number(line.split_once(" cov: ")?.1)).last()?;
-    let status = output.lines().filter_map(|line| number(line.strip_prefix('#')?)).last()?;
+    let coverage = output.lines().filter_map(|line| number(line.split_once(" cov: ")?.1)).next_back()?;
+    let status = output.lines().filter_map(|line| number(line.strip_prefix('#')?)).next_back()?;
     let total = output.lines().find_map(|line| number(line.strip_prefix("stat::number_of_executed_units:")?));
     let input = output.lines().find_map(|line| line.split_once("Test unit written to "));
     let mut lines = output.lines().skip_while(|line| !line.contains(" panicked at "));
