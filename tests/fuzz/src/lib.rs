@@ -2,6 +2,7 @@
 //! that must hold does not. `cargo xtask fuzz` runs them; the inputs in `corpus` and `crashes` are replayed by `tests/replay.rs`.
 
 mod discovery;
+mod files;
 mod handshake;
 mod peer;
 mod play;
@@ -31,6 +32,7 @@ pub const TARGETS: &[Target] = &[
     Target { name: "discovery", run: discovery::run, longest: 256 },
     Target { name: "unit", run: whole::run, longest: 200 },
     Target { name: "values", run: values::run, longest: 512 },
+    Target { name: "files", run: files::run, longest: 400 },
     Target { name: "serial", run: serial::run, longest: 400 },
 ];
 

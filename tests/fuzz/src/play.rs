@@ -42,7 +42,7 @@ impl Play {
         self.unit.hub.node.identity().role() == Role::MUnit
     }
 
-    /// The hello of a peer: of the unit's counterpart, or of somebody else.
+    /// The hello of a peer: of the unit's counterpart, or of another unit.
     pub(crate) fn hello(&mut self, who: u8) -> Hello {
         let who = if who == 0 { u8::from(!self.is_manager()) } else { who };
         let identity = identity(who);

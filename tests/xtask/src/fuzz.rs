@@ -107,6 +107,8 @@ fn build(root: &Path, target: &Path) -> Result<PathBuf> {
     let wrapper = root.join("tests/fuzz/libfuzzer/instrument.sh");
     let manifest = root.join("tests/fuzz/libfuzzer/Cargo.toml");
     let cargo = Run::cargo().within(root).env("RUSTC_WRAPPER", &wrapper.to_string_lossy());
+    // Code that is built in pieces runs slower.
+    let cargo = cargo.env("CARGO_INCREMENTAL", "0");
     let cargo = cargo.args(["build", "--quiet", "--locked", "--release", "--target", TRIPLE, "--manifest-path"]);
     cargo.args([&manifest]).args([Path::new("--target-dir"), target]).stream()?;
     Ok(target.join(TRIPLE).join("release/cara-libfuzzer"))

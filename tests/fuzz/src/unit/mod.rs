@@ -144,7 +144,7 @@ pub(crate) struct Link {
     pub(crate) inbox: Vec<u8>,
     /// Calls whose handlers have not answered, and how often their motors were stopped when they began.
     pub(crate) held: Vec<(Incoming, Stops)>,
-    unanswered: Vec<(Incoming, Result<i64, Error>)>,
+    unanswered: Vec<(Incoming, Result<i64, Error>, Option<Stops>)>,
     /// The unit's own calls that have not ended, and whether each waits for a reply.
     pub(crate) asked: BTreeMap<u32, bool>,
     /// By call: the latest time at which the peer can have wanted it, as it said.
@@ -476,8 +476,8 @@ impl Unit {
         let Some(link) = &mut self.links[index] else { return false };
         let unanswered = std::mem::take(&mut link.unanswered);
         let count = unanswered.len();
-        for (call, result) in unanswered {
-            self.answer(index, call, result, None);
+        for (call, result, stops) in unanswered {
+            self.answer(index, call, result, stops);
         }
         self.links[index].as_ref().is_some_and(|link| link.unanswered.len() < count)
     }
@@ -495,22 +495,17 @@ impl Unit {
         }
         let lent = result.map(|_| results.as_view());
         let answered = self.with(index, |link, cx| link.session.answer(cx, call.ticket, lent));
-        match answered {
-            Some(Err(_)) => {
-                if let Some(link) = &mut self.links[index] {
-                    link.unanswered.push((call, result));
+        // Only results for a reset that was made after the last stop end a latch, also while they wait for capacity.
+        if answered.is_some() && resets && result.is_ok() {
+            for (at, reset) in self.motors.iter_mut().enumerate() {
+                let is_meant = motor.is_none_or(|motor| motor == at);
+                if is_meant && stops.is_none_or(|stops| stops[at] == reset.stops) {
+                    reset.is_stopped = reset.lease.is_inhibited();
                 }
             }
-            // Only an answer with results, to a reset that was made after the last stop, ends a latch.
-            Some(Ok(())) if resets && result.is_ok() => {
-                for (at, reset) in self.motors.iter_mut().enumerate() {
-                    let is_meant = motor.is_none_or(|motor| motor == at);
-                    if is_meant && stops.is_none_or(|stops| stops[at] == reset.stops) {
-                        reset.is_stopped = reset.lease.is_inhibited();
-                    }
-                }
-            }
-            _ => {}
+        }
+        if let (Some(Err(_)), Some(link)) = (answered, &mut self.links[index]) {
+            link.unanswered.push((call, result, stops));
         }
     }
 
@@ -623,7 +618,7 @@ impl Unit {
         hub.node.datagram(*now, from, bytes, &keys.codes);
     }
 
-    /// Whether everybody may do everything, nobody anything, or little is allowed.
+    /// Everything is allowed, nothing, everything but seldom, or a little.
     pub(crate) fn set_table(&mut self, kind: u8) {
         use cara_core::services::access::{Functions, Rate};
         let slow = Rate::new(1, Duration::from_millis(100));
