@@ -28,7 +28,7 @@ const CHUNK: u64 = 1 << 20;
 pub(crate) struct Limits {
     /// Bytes after which the next file begins.
     pub(crate) size: u64,
-    /// Files besides the one that is written.
+    /// Files besides the one that is written, at least one.
     pub(crate) keep: usize,
 }
 
@@ -123,6 +123,9 @@ impl Files {
 
     fn next(&mut self) -> McapResult<()> {
         self.finish()?;
+        if self.state.is_given_up() {
+            return Err(mcap::McapError::AttemptedWriteAfterFailure);
+        }
         loop {
             match shift(&self.path, self.limits.keep).and_then(|()| create(&self.path)) {
                 Ok(file) => return self.begin(file),
@@ -170,14 +173,12 @@ fn shift(path: &Path, keep: usize) -> io::Result<()> {
         0 => path.to_owned(),
         number => path.with_added_extension(number.to_string()),
     };
+    let keep = keep.max(1);
     let free = (0..keep).find(|number| !numbered(*number).exists()).unwrap_or(keep);
-    if free == keep && keep == 0 && path.exists() {
-        return fs::remove_file(path);
-    }
     (0..free).rev().try_for_each(|number| fs::rename(numbered(number), numbered(number + 1)))
 }
 
-/// A file on a disk that may be full: whoever writes waits until it takes the bytes, or the recording is given up.
+/// A file on a disk that may be full: a write waits until it takes the bytes, or the recording is given up.
 struct Patient {
     file: File,
     state: Arc<State>,

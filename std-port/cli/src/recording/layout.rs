@@ -66,7 +66,7 @@ fn of(topic: &'static str, published: u64, body: Value) -> Message {
     Message { topic: topic.into(), form: String::new(), body: without_nulls(body), published }
 }
 
-/// Generations are no secret; where the file is concerns nobody who reads a recording elsewhere.
+/// Generations are no secret. The path of the file means nothing on another host, where a recording may be read.
 fn without_keys(unit: &UnitInfo) -> UnitInfo {
     let mut unit = unit.clone();
     unit.keys.iter_mut().for_each(|keys| keys.file = None);

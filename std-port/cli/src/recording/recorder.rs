@@ -1,4 +1,4 @@
-//! The recorder: whoever reports something puts it into a bounded queue and goes on; a thread writes it.
+//! The recorder: a report goes into a bounded queue, which holds up no thread that reports; a thread of its own writes it.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -43,7 +43,7 @@ impl Recorder {
     pub(crate) fn start(path: &Path, limits: Limits, about: BTreeMap<String, String>) -> anyhow::Result<Self> {
         let state = Arc::<State>::default();
         let files = Files::open(path, limits, about, state.clone())?;
-        let mut writer = Writer { files, state: state.clone(), lost: 0, unflushed: 0 };
+        let mut writer = Writer { files, state: state.clone(), lost: 0, unflushed: 0, is_over: false };
         Ok(Self { queue: LineQueue::new("recorder", move |line, lost| writer.take(line, lost))?, state })
     }
 
@@ -126,10 +126,14 @@ impl State {
         *self.held_up.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 
+    pub(super) fn is_given_up(&self) -> bool {
+        self.given_up.load(Ordering::Relaxed)
+    }
+
     /// The system refuses to write: waits before the next try. An error once the recording is given up.
     pub(super) fn is_held_up(&self, error: io::Error, pause: Duration) -> io::Result<()> {
         *self.held_up.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
-        if self.given_up.load(Ordering::Relaxed) {
+        if self.is_given_up() {
             return Err(error);
         }
         std::thread::sleep(pause);
@@ -149,6 +153,8 @@ struct Writer {
     lost: u64,
     /// Messages since the last chunk ended.
     unflushed: u64,
+    /// The last file has ended: what other threads still report would begin another one.
+    is_over: bool,
 }
 
 impl Writer {
@@ -156,6 +162,7 @@ impl Writer {
     fn take(&mut self, line: &[u8], lost: u64) -> io::Result<()> {
         let lost = lost + self.state.too_long.load(Ordering::Relaxed);
         match line {
+            _ if self.is_over => Ok(()),
             FLUSH => self.flush(),
             END => self.end(lost),
             line => self.write(line, lost),
@@ -172,6 +179,7 @@ impl Writer {
     }
 
     fn end(&mut self, lost: u64) -> io::Result<()> {
+        self.is_over = true;
         let messages = self.state.messages.load(Ordering::Relaxed);
         let body = json!({ "event": "ended", "messages": messages, "lost_in_all": lost });
         let ended = self.note_losses(lost).and_then(|()| self.files.write(&layout::about_itself(body, now()), now()));

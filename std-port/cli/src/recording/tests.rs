@@ -173,6 +173,17 @@ fn what_ends_anywhere_is_read_up_to_there_and_no_damage_panics() {
 }
 
 #[test]
+fn what_is_reported_after_the_end_begins_no_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let recorder = start(&folder.path().join("a.mcap"), ALL);
+    let other = recorder.clone();
+    assert_eq!(whole(recorder), 0);
+    other.take(&event("late"));
+    assert_eq!(whole(other), 0);
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+}
+
+#[test]
 fn a_message_that_is_too_long_is_counted_and_the_recording_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.mcap");
@@ -189,8 +200,9 @@ fn a_message_that_is_too_long_is_counted_and_the_recording_says_so() {
 #[test]
 fn where_the_keys_are_is_not_recorded() {
     let unit = serde_json::json!({
-        "answer": "unit", "name": "depot", "id": 1, "role": "m_unit", "fleet": 0, "version": 2, "discovery_port": 1, "tcp_port": 1,
-        "epoch": "1", "uptime_ms": 1, "interfaces": [], "connected": 0, "keys": { "file": "/etc/cara/secret.keys", "generations": [1] },
+        "answer": "unit", "name": "depot", "id": 1, "role": "m_unit", "fleet": 0, "version": 2,
+        "discovery_port": 1, "tcp_port": 1, "epoch": "1", "uptime_ms": 1, "interfaces": [], "connected": 0,
+        "keys": { "file": "/etc/cara/secret.keys", "generations": [1] },
         "constraints": {
             "request_timeout_us": 1, "minimum_interval_us": 1, "maximum_nodes": 1, "message_size": 1, "chunk_size": 1,
             "keep_alive_us": 1, "calls_per_peer": 1,
