@@ -125,7 +125,9 @@ impl Gateway {
         }
         self.probe();
         let now = self.began.elapsed();
-        if let Err(error) = self.driver.turn(now) {
+        let turned = self.driver.turn(now);
+        self.driver.vehicle_mut().give_up(turned.is_err());
+        if let Err(error) = turned {
             // Nothing is said that would not be known after a restart.
             eprintln!("{}: the record cannot be written: {error}", self.serial_number);
             std::thread::sleep(Duration::from_millis(200));

@@ -139,17 +139,26 @@ pub trait Guided {
 pub struct Linked {
     peer: Peer,
     heart: Heart,
+    /// Nothing is renewed any more.
+    is_given_up: bool,
 }
 
 impl Linked {
     /// What moves is renewed as the heart beats.
     pub const fn new(peer: Peer, heart: Heart) -> Self {
-        Self { peer, heart }
+        Self { peer, heart, is_given_up: false }
     }
 
     /// The gateway's loop has come round.
     pub fn beat(&mut self) {
-        self.heart.beat();
+        if !self.is_given_up {
+            self.heart.beat();
+        }
+    }
+
+    /// While the record cannot be written, no stop may wait for it: the vehicle stops by its lease.
+    pub const fn give_up(&mut self, is_given_up: bool) {
+        self.is_given_up = is_given_up;
     }
 }
 
@@ -160,7 +169,7 @@ impl Vehicle for Linked {
         }
         let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() };
         let condition = GuidedClient::at(&self.peer).with(options).vda_condition().wait();
-        self.heart.beat();
+        self.beat();
         let condition = condition.map_err(|error| failure(&error))?;
         let latch = self.peer.actuator_state("vda_drive").and_then(|state| state.latch);
         let boot = self.peer.epoch().map_or(0, |epoch| epoch.0);
@@ -191,7 +200,7 @@ impl Vehicle for Linked {
             Command::Halt => return released(self.peer.release("vda_drive")),
             Command::EndAction { .. } => return released(self.peer.release("vda_act")),
         };
-        self.heart.beat();
+        self.beat();
         answer.map_err(|error| failure(&error))
     }
 }
