@@ -29,7 +29,7 @@ pub(crate) struct Fuzz {
     /// Writes the fewest inputs that reach all that was reached to `tests/fuzz/corpus`, from where tests replay them.
     #[arg(long)]
     write: bool,
-    /// Plants the bugs of `tests/fuzz/planted` in a clone of the last commit, one at a time; each has to be found in so many runs.
+    /// Plants the bugs of `tests/fuzz/planted` in a clone of the last commit, one at a time; each has to be found in N runs.
     #[arg(long, conflicts_with_all = ["time", "write"])]
     planted: bool,
 }

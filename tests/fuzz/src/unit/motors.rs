@@ -18,7 +18,7 @@ pub(crate) struct Motor {
     pub(crate) is_stopped: bool,
     /// How often it was stopped.
     pub(crate) stops: u32,
-    /// Its order ended, and its hook ran, when a function was replaced or removed: for another function of it the hook runs once more.
+    /// Its order ended, and its hook ran, when a function was replaced or removed: for another function the hook runs once more.
     is_cleared: bool,
 }
 
