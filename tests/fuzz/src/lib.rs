@@ -1,5 +1,6 @@
 //! What libFuzzer drives, and what a plain test replays: each [target](TARGETS) is a function of bytes that panics where
-//! something that must hold does not. `cargo xtask fuzz` runs them; the inputs in `corpus` and `crashes` are replayed by `tests/replay.rs`.
+//! something that must hold does not. `cargo xtask fuzz` runs them; the inputs in `corpus` and `crashes` are replayed by
+//! `tests/replay.rs`.
 
 mod discovery;
 mod files;

@@ -1,4 +1,4 @@
-//! A whole unit by a script: links are accepted, dialled, joined and cut, datagrams come, calls are made, motors move, time passes.
+//! A whole unit by a script: links are accepted, dialled and cut, datagrams come, calls are made, motors move, time passes.
 
 use cara_core::config::Mode;
 

@@ -1,4 +1,4 @@
-//! A unit behind scripts: the core's machines, driven as the front page of `cara_core::services` says, and checked after each step.
+//! A unit behind scripts: the core's machines, driven as the front page of `cara_core::services` says, checked after each step.
 
 mod motors;
 pub(crate) mod services;
