@@ -22,7 +22,12 @@ pub(crate) fn run(data: &[u8]) {
                     play.carry(index);
                 }
             }
-            19 => play.arrive(index, script.bytes()),
+            19 => {
+                if let Some(link) = &mut play.unit.links[index] {
+                    link.is_loose = true;
+                }
+                play.arrive(index, script.bytes());
+            }
             _ if play.unit.links[index].is_some() => {}
             20..23 => {
                 let who = script.below(6);
