@@ -153,7 +153,7 @@ impl Play {
         for (moving, of) in self.unit.motors.iter().filter_map(|motor| motor.mover(index)) {
             let is_meant = slot.map_or(moving == *call, |slot| slot == of && moving <= *call);
             if is_meant {
-                link.released.insert(moving);
+                link.released.insert((moving, of));
             }
         }
     }

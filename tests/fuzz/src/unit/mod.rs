@@ -152,15 +152,15 @@ pub(crate) struct Link {
     /// Bytes have come that need not be what the peer has said: then anything may have been wanted when something came last.
     pub(crate) is_loose: bool,
     came: Instant,
-    /// Calls that moved something when the peer released them.
-    pub(crate) released: BTreeSet<u32>,
+    /// Calls that moved something when the peer released them, with their functions: ids of two classes may be equal.
+    pub(crate) released: BTreeSet<(u32, Slot)>,
     pub(crate) joined: bool,
 }
 
 impl Link {
     /// Until when the peer can have wanted a call.
-    fn wanted(&self, call: u32) -> Instant {
-        if self.inbox.is_empty() && self.released.contains(&call) {
+    fn wanted(&self, call: u32, slot: Slot) -> Instant {
+        if self.inbox.is_empty() && self.released.contains(&(call, slot)) {
             return Instant::START;
         }
         let said = self.said.get(&call).copied().unwrap_or(Instant::START);

@@ -102,7 +102,7 @@ impl Unit {
         let Self { motors, links, now, .. } = self;
         for (motor, length) in motors.iter_mut().zip(LEASES) {
             motor.look(*now, |open, call| {
-                Some(links.get(open.link)?.as_ref()?.wanted(call) + Duration::from_millis(length))
+                Some(links.get(open.link)?.as_ref()?.wanted(call, open.slot) + Duration::from_millis(length))
             });
         }
     }
