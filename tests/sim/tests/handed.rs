@@ -5,6 +5,8 @@
 //!
 //! `cargo xtask orders` runs more seeds.
 
+mod faults;
+
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
@@ -17,7 +19,8 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::random::Random;
 use cara_core::time::Duration;
-use cara_sim::{Crash, Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+use cara_sim::{Crash, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+use faults::{Fallible, Fault, between, is_awake, millis};
 
 const MANAGERS: [(&str, u32); 2] = [("depot", 1), ("yard", 2)];
 /// So long everything fails.
@@ -26,19 +29,39 @@ const FAULTS: Duration = Duration::from_secs(60);
 const JOINS: Duration = Duration::from_secs(8);
 const LEASE: Duration = Duration::from_millis(400);
 
-const fn millis(millis: u64) -> Duration {
-    Duration::from_millis(millis)
-}
-
-fn between(random: &mut Random, least: u64, most: u64) -> Duration {
-    millis(least + random.below(most - least))
-}
-
 struct Fleet {
     world: World,
     managers: Vec<UnitHandle>,
     vehicles: Vec<UnitHandle>,
     lives: Vec<Rc<RefCell<Lives>>>,
+}
+
+impl Fallible for Fleet {
+    fn world(&mut self) -> &mut World {
+        &mut self.world
+    }
+
+    fn managers(&self) -> &[UnitHandle] {
+        &self.managers
+    }
+
+    fn vehicles(&self) -> &[UnitHandle] {
+        &self.vehicles
+    }
+
+    /// Lets everybody work for a while; each manager has its vehicles drive now and then, so that some stand.
+    fn run(&mut self, span: Duration) {
+        let end = self.world.now() + span;
+        while self.world.now() < end {
+            for manager in self.managers.iter().filter(|manager| is_awake(&self.world, manager)) {
+                for vehicle in manager.nodes_offering("drive") {
+                    let _ = manager.request(&vehicle, "drive", &Parameters::new());
+                    let _ = manager.release(&vehicle, "drive");
+                }
+            }
+            self.world.run_for(millis(50));
+        }
+    }
 }
 
 impl Fleet {
@@ -64,49 +87,17 @@ impl Fleet {
         Self { world, managers, vehicles, lives }
     }
 
-    /// Lets everybody work for a while; each manager has its vehicles drive now and then, so that some stand.
-    fn run(&mut self, span: Duration) {
-        let end = self.world.now() + span;
-        while self.world.now() < end {
-            for manager in self.managers.iter().filter(|manager| self.is_awake(manager)) {
-                for vehicle in manager.nodes_offering("drive") {
-                    let _ = manager.request(&vehicle, "drive", &Parameters::new());
-                    let _ = manager.release(&vehicle, "drive");
-                }
-            }
-            self.world.run_for(millis(50));
-        }
-    }
-
-    fn is_awake(&self, unit: &UnitHandle) -> bool {
-        let until = self.world.network(|network| network.suspended_until(unit.host()));
-        unit.is_running() && until <= self.world.now()
-    }
-
     fn something_happens(&mut self, random: &mut Random) {
-        let pick = |random: &mut Random, units: &[UnitHandle]| units[random.below(units.len() as u64) as usize].clone();
-        let (manager, vehicle) = (pick(random, &self.managers), pick(random, &self.vehicles));
-        let crash = if random.below(2) == 0 { Crash::PowerCut } else { Crash::Process };
-        match random.below(9) {
-            0 => {
-                let down = between(random, 100, 9_000);
-                self.world.network(|network| network.crash_for(manager.host(), crash, down));
-            }
-            1 => self.world.suspend(&manager, between(random, 100, 9_000)),
-            2 => {
-                let units = self.managers.iter().chain(&self.vehicles).map(UnitHandle::host);
-                let others: Vec<_> = units.filter(|host| *host != manager.host() && random.below(4) > 0).collect();
-                let direction = if random.below(2) == 0 { Direction::Both } else { Direction::FirstToSecond };
-                let span = between(random, 500, 9_000);
-                self.world.network(|network| network.partition_for(&[manager.host()], &others, direction, span));
-            }
-            3 => self.world.suspend(&vehicle, between(random, 20, 5_000)),
-            4 => {
-                let down = between(random, 50, 3_000);
-                self.world.network(|network| network.crash_for(vehicle.host(), crash, down));
-            }
-            _ => self.hand_over(random),
-        }
+        let victims = self.victims(random);
+        let fault = match random.below(9) {
+            0 => Fault::ManagerCrashes,
+            1 => Fault::ManagerHangs,
+            2 => Fault::ManagerIsCutOff,
+            3 => Fault::VehicleHangs,
+            4 => Fault::VehicleCrashes,
+            _ => return self.hand_over(random),
+        };
+        self.suffer(&victims, fault, random);
     }
 
     /// Both managers may be asked at once for all that each of them has.
@@ -114,7 +105,7 @@ impl Fleet {
         for (manager, (name, id)) in self.managers.iter().zip(MANAGERS.into_iter().rev()) {
             let to = Manager::new(name, id).expect("it is short");
             for vehicle in &self.vehicles {
-                if self.is_awake(manager) && random.below(3) > 0 {
+                if is_awake(&self.world, manager) && random.below(3) > 0 {
                     let _ = manager.hand_over(&vehicle.identity(), &to);
                 }
             }
@@ -137,25 +128,13 @@ impl Fleet {
         self.lives.iter().for_each(|lives| lives.borrow_mut().recent = None);
     }
 
-    /// How long it took, in steps of 50 ms.
-    fn until(&mut self, limit: Duration, holds: impl Fn(&Self) -> bool) -> Option<Duration> {
-        let start = self.world.now();
-        while !holds(self) {
-            if self.world.now() >= start + limit {
-                return None;
-            }
-            self.run(millis(50));
-        }
-        Some(self.world.now().since(start))
-    }
-
     fn logs(&self) -> String {
         let log = |unit: &UnitHandle| {
             let log: Vec<_> =
                 unit.log().into_iter().filter(|(_, event)| !matches!(event, LogEvent::Called { .. })).collect();
             format!("{:?}: {log:?}\n", unit.identity())
         };
-        self.managers.iter().chain(&self.vehicles).map(log).collect()
+        self.units().map(log).collect()
     }
 }
 
@@ -205,7 +184,7 @@ fn run(seed: u64, vehicles: u32) -> ([Duration; 2], [usize; 2]) {
     }
     // What was begun ends.
     fleet.world.network(|network| network.heal_all());
-    let calm = |fleet: &Fleet| fleet.managers.iter().chain(&fleet.vehicles).all(|unit| fleet.is_awake(unit));
+    let calm = |fleet: &Fleet| fleet.units().all(|unit| is_awake(&fleet.world, unit));
     assert!(fleet.until(Duration::from_secs(10), calm).is_some());
     fleet.forget();
     let has_one = |fleet: &Fleet| fleet.commanding().all(|managers| managers.len() == 1);

@@ -4,6 +4,8 @@
 //!
 //! `cargo xtask orders` runs more seeds.
 
+mod faults;
+
 use std::cell::Cell;
 use std::rc::Rc;
 
@@ -11,8 +13,9 @@ use cara_core::config::Constraints;
 use cara_core::distribution::claim::Claim;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::random::Random;
-use cara_core::time::{Duration, Instant};
-use cara_sim::{Crash, Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+use cara_core::time::Duration;
+use cara_sim::{Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+use faults::{Fallible, Fault, between, is_awake, millis};
 
 /// So long everything fails, and so long a manager may take to command alone afterwards, with the highest claim: one that vehicles
 /// refuse raises its own first, once in 30 s.
@@ -20,14 +23,6 @@ const FAULTS: Duration = Duration::from_secs(30);
 const STARTS: Duration = Duration::from_secs(35);
 /// And so long all vehicles to obey it. Nearly all do within 3 s; but a dial that a cut has swallowed is given up after 6 s only.
 const JOINS: Duration = Duration::from_secs(8);
-
-const fn millis(millis: u64) -> Duration {
-    Duration::from_millis(millis)
-}
-
-fn between(random: &mut Random, least: u64, most: u64) -> Duration {
-    millis(least + random.below(most - least))
-}
 
 #[derive(Clone, Copy)]
 struct Size {
@@ -40,6 +35,33 @@ struct Fleet {
     world: World,
     managers: Vec<UnitHandle>,
     vehicles: Vec<UnitHandle>,
+}
+
+impl Fallible for Fleet {
+    fn world(&mut self) -> &mut World {
+        &mut self.world
+    }
+
+    fn managers(&self) -> &[UnitHandle] {
+        &self.managers
+    }
+
+    fn vehicles(&self) -> &[UnitHandle] {
+        &self.vehicles
+    }
+
+    /// Lets everybody work for a while; who commands has all of its vehicles drive.
+    fn run(&mut self, span: Duration) {
+        let end = self.world.now() + span;
+        while self.world.now() < end {
+            for manager in self.managers.iter().filter(|manager| is_awake(&self.world, manager)) {
+                for vehicle in manager.nodes_offering("drive") {
+                    let _ = manager.request(&vehicle, "drive", &Parameters::new());
+                }
+            }
+            self.world.run_for(millis(50));
+        }
+    }
 }
 
 impl Fleet {
@@ -80,46 +102,16 @@ impl Fleet {
         Self { world, managers, vehicles }
     }
 
-    /// Lets everybody work for a while; who commands has all of its vehicles drive.
-    fn run(&mut self, span: Duration) {
-        let end = self.world.now() + span;
-        while self.world.now() < end {
-            for manager in &self.managers {
-                let hangs = self.world.network(|network| network.suspended_until(manager.host())) > self.world.now();
-                if hangs || !manager.is_running() {
-                    continue;
-                }
-                for vehicle in manager.nodes_offering("drive") {
-                    let _ = manager.request(&vehicle, "drive", &Parameters::new());
-                }
-            }
-            self.world.run_for(millis(50));
-        }
-    }
-
     fn something_happens(&mut self, random: &mut Random) {
-        let pick = |random: &mut Random, units: &[UnitHandle]| units[random.below(units.len() as u64) as usize].clone();
-        let (manager, vehicle) = (pick(random, &self.managers), pick(random, &self.vehicles));
-        let crash = if random.below(2) == 0 { Crash::PowerCut } else { Crash::Process };
-        match random.below(8) {
-            0 | 1 => {
-                let down = between(random, 100, 9_000);
-                self.world.network(|network| network.crash_for(manager.host(), crash, down));
-            }
-            2 | 3 => self.world.suspend(&manager, between(random, 100, 9_000)),
-            4 | 5 => {
-                let units = self.managers.iter().chain(&self.vehicles).map(UnitHandle::host);
-                let others: Vec<_> = units.filter(|host| *host != manager.host() && random.below(4) > 0).collect();
-                let direction = if random.below(2) == 0 { Direction::Both } else { Direction::FirstToSecond };
-                let span = between(random, 500, 9_000);
-                self.world.network(|network| network.partition_for(&[manager.host()], &others, direction, span));
-            }
-            6 => self.world.suspend(&vehicle, between(random, 20, 5_000)),
-            _ => {
-                let down = between(random, 50, 3_000);
-                self.world.network(|network| network.crash_for(vehicle.host(), crash, down));
-            }
-        }
+        let victims = self.victims(random);
+        let fault = match random.below(8) {
+            0 | 1 => Fault::ManagerCrashes,
+            2 | 3 => Fault::ManagerHangs,
+            4 | 5 => Fault::ManagerIsCutOff,
+            6 => Fault::VehicleHangs,
+            _ => Fault::VehicleCrashes,
+        };
+        self.suffer(&victims, fault, random);
     }
 
     /// The one that commands, if it is one.
@@ -132,25 +124,13 @@ impl Fleet {
         self.vehicles.iter().all(|agv| leader.knows(agv, "drive") && agv.claim() == leader.claim())
     }
 
-    /// How long it took, in steps of 50 ms.
-    fn until(&mut self, limit: Duration, holds: impl Fn(&Self) -> bool) -> Option<Duration> {
-        let start: Instant = self.world.now();
-        while !holds(self) {
-            if self.world.now() >= start + limit {
-                return None;
-            }
-            self.run(millis(50));
-        }
-        Some(self.world.now().since(start))
-    }
-
     fn logs(&self) -> String {
         let log = |unit: &UnitHandle| {
             let log: Vec<_> =
                 unit.log().into_iter().filter(|(_, event)| !matches!(event, LogEvent::Called { .. })).collect();
             format!("{:?} {}: {log:?}\n", unit.claim(), unit.is_standby())
         };
-        self.managers.iter().chain(&self.vehicles).map(log).collect()
+        self.units().map(log).collect()
     }
 }
 
@@ -165,14 +145,7 @@ fn run(seed: u64, size: Size) -> (Duration, Duration, usize, usize) {
     }
     // What was begun ends.
     fleet.world.network(|network| network.heal_all());
-    let calm = |fleet: &Fleet| {
-        let units = || fleet.managers.iter().chain(&fleet.vehicles);
-        let awake = |unit: &UnitHandle| {
-            let until = fleet.world.network(|network| network.suspended_until(unit.host()));
-            unit.is_running() && until <= fleet.world.now()
-        };
-        units().all(awake)
-    };
+    let calm = |fleet: &Fleet| fleet.units().all(|unit| is_awake(&fleet.world, unit));
     assert!(fleet.until(Duration::from_secs(10), calm).is_some());
     let highest = |fleet: &Fleet| fleet.vehicles.iter().map(UnitHandle::claim).max().unwrap_or_default();
     let starts = fleet.until(STARTS, |fleet| fleet.leader().is_some_and(|leader| leader.claim() >= highest(fleet)));

@@ -425,14 +425,21 @@ impl Unit {
         }
     }
 
+    /// Lets a session do what is due; whether there was anything.
+    fn poll(&mut self, index: usize) -> bool {
+        let mut worked = false;
+        while let Some(Some(event)) = self.with(index, |link, cx| link.session.poll(cx)) {
+            worked = true;
+            self.happened(index, event);
+        }
+        worked
+    }
+
     /// Lets a link do what it can; whether there was anything.
     fn work(&mut self, index: usize) -> bool {
         let mut worked = false;
         loop {
-            while let Some(Some(event)) = self.with(index, |link, cx| link.session.poll(cx)) {
-                worked = true;
-                self.happened(index, event);
-            }
+            worked |= self.poll(index);
             let mut arguments = std::mem::take(&mut self.arguments).unwrap_or_default();
             let receipt = self.with(index, |link, cx| {
                 link.came = if link.inbox.is_empty() { link.came } else { cx.now };
@@ -459,10 +466,7 @@ impl Unit {
     fn run_calls(&mut self, index: usize) -> bool {
         let mut worked = false;
         loop {
-            while let Some(Some(event)) = self.with(index, |link, cx| link.session.poll(cx)) {
-                worked = true;
-                self.happened(index, event);
-            }
+            worked |= self.poll(index);
             let mut arguments = std::mem::take(&mut self.arguments).unwrap_or_default();
             let call = self.with(index, |link, cx| link.session.next_call(cx, &mut *arguments)).flatten();
             self.arguments = Some(arguments);
