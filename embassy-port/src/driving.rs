@@ -27,7 +27,7 @@ use crate::event::{Name, UnitEvent};
 use crate::link::Link;
 use crate::machine::{Machine, Started};
 use crate::mail::Connection;
-use crate::port::{Board, LinkSession};
+use crate::port::{Board, HANDS_OVER, LinkSession};
 #[cfg(feature = "streams")]
 use crate::readings::came;
 use crate::replies::ended;
@@ -169,9 +169,16 @@ impl<T> Machine<T> {
         if !self.moves()
             && let Some((manager, tagged)) = self.unstored.take()
         {
-            let key = self.proof.key_of(&manager);
+            let away = self.hub.node.handed_over(&manager);
+            let key = match away {
+                Some((home, present)) if HANDS_OVER && present == manager => self.proof.key_away(&present, &home),
+                _ => self.proof.key_of(&manager),
+            };
             let stored = self.store.zip(key).is_some_and(|(store, key)| store(&StoredClaim { tagged, key }));
             self.hub.node.claim_kept(&manager, tagged.claim, stored);
+        }
+        if HANDS_OVER && let Some((peer, stage)) = self.hub.node.take_hand_over() {
+            self.notify(UnitEvent::HandOver { peer, stage });
         }
     }
 
@@ -188,8 +195,13 @@ impl<T> Machine<T> {
             self.hub.node.set_claim(tagged);
         }
         if let Some(manager) = manager.filter(|_| self.store.is_some() && self.proof.mode() == Mode::Secured) {
-            if self.proof.has_key(manager, &obeyed.key) && obeyed.tagged.claim != Claim::NONE {
-                self.hub.node.keep_obeyed(now(), manager, obeyed.tagged);
+            let away = if HANDS_OVER { self.proof.manager_away(manager, &obeyed.key) } else { None };
+            if let Some(present) = &away {
+                self.hub.node.belong_to(manager, present);
+            }
+            let is_known = away.is_some() || self.proof.has_key(manager, &obeyed.key);
+            if is_known && obeyed.tagged.claim != Claim::NONE {
+                self.hub.node.keep_obeyed(now(), away.as_ref().unwrap_or(manager), obeyed.tagged);
             }
             self.hub.node.store_claims();
         }

@@ -26,6 +26,9 @@ impl Port for Board {
     const TAKES_DATAGRAM_REQUESTS: bool = cfg!(feature = "datagram-requests");
 }
 
+/// Whether a unit can be handed over to another manager.
+pub(crate) const HANDS_OVER: bool = cfg!(feature = "hand-over");
+
 pub(crate) type LinkSession = Session<Board>;
 pub(crate) type LinkContext<'c> = Context<'c, Board>;
 pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;

@@ -42,7 +42,7 @@ mod secured {
     use cara_core::config::Mode;
     use cara_core::distribution::claim::KEY_FINGERPRINT_BYTES;
     use cara_core::distribution::hello::Hello;
-    use cara_core::distribution::identity::Identity;
+    use cara_core::distribution::identity::{Identity, Role};
     use cara_core::services::Keys;
     use cara_secure::channel::TAG_BYTES;
     use cara_secure::keyring::{Codes, Keyring};
@@ -135,6 +135,23 @@ mod secured {
             ring.pair(peer).is_some_and(|(used, other)| is_key(&used) || other.as_ref().is_some_and(is_key))
         }
 
+        /// What the claim of a manager is stored with by a unit whose home is another one, as [`StoredClaim::key`] says.
+        pub(crate) fn key_away(&self, manager: &Identity, home: &Identity) -> Option<[u8; KEY_FINGERPRINT_BYTES]> {
+            Some(both(self.key_of(manager)?, self.key_of(home)?))
+        }
+
+        /// The manager whose claim a unit with this home stored with such a key.
+        pub(crate) fn manager_away(&self, home: &Identity, key: &[u8; KEY_FINGERPRINT_BYTES]) -> Option<Identity> {
+            let Self::Keys { codes: Codes::Keyed(ring), .. } = self else { return None };
+            let keys = |peer: &Identity| {
+                let (used, other) = ring.pair(peer).unzip();
+                [used, other.flatten()].map(|key| key.map(|key| key.fingerprint())).into_iter().flatten()
+            };
+            let is_of = |peer: &&Identity| keys(peer).any(|their| keys(home).any(|own| both(their, own) == *key));
+            let managers = (0..).map_while(|index| ring.0.peer(index)).filter(|peer| peer.role() == Role::MUnit);
+            managers.filter(|peer| *peer != home).find(is_of).cloned()
+        }
+
         /// Whether the step that has ended computed a proof: other tasks have their turn before the next one.
         pub(crate) fn has_computed(&mut self) -> bool {
             match self {
@@ -142,6 +159,10 @@ mod secured {
                 Self::Keys { computes, .. } => core::mem::take(computes),
             }
         }
+    }
+
+    fn both(one: [u8; KEY_FINGERPRINT_BYTES], other: [u8; KEY_FINGERPRINT_BYTES]) -> [u8; KEY_FINGERPRINT_BYTES] {
+        core::array::from_fn(|index| one.get(index).zip(other.get(index)).map_or(0, |(one, other)| one ^ other))
     }
 
     impl Keys<Board> for Proof {
@@ -205,6 +226,14 @@ mod plain {
             false
         }
 
+        pub(crate) const fn key_away(&self, _: &Identity, _: &Identity) -> Option<[u8; KEY_FINGERPRINT_BYTES]> {
+            None
+        }
+
+        pub(crate) const fn manager_away(&self, _: &Identity, _: &[u8; KEY_FINGERPRINT_BYTES]) -> Option<Identity> {
+            None
+        }
+
         pub(crate) const fn has_computed(&mut self) -> bool {
             false
         }
@@ -214,5 +243,55 @@ mod plain {
         fn credentials(&mut self, _: &Hello) -> Option<()> {
             None
         }
+    }
+}
+
+#[cfg(all(test, feature = "secure"))]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    extern crate std;
+
+    use cara_core::distribution::identity::Identity;
+    use cara_secure::keyring::Keyring;
+    use cara_secure::keys::{DiscoveryKey, PairKey};
+    use cara_secure::random::Random;
+
+    use super::Security;
+
+    struct Managers {
+        discovery: DiscoveryKey,
+        peers: [Identity; 3],
+    }
+
+    impl Keyring for Managers {
+        fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
+            (&self.discovery, None)
+        }
+
+        /// The first has a key beside the one in use.
+        fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
+            let index = self.peers.iter().position(|known| known == peer)? as u8;
+            Some((PairKey::new([index + 1; 32]), (index == 0).then(|| PairKey::new([9; 32]))))
+        }
+
+        fn peer(&self, index: usize) -> Option<&Identity> {
+            self.peers.get(index)
+        }
+    }
+
+    #[test]
+    fn a_stored_key_tells_the_manager_that_a_board_was_handed_over_to() {
+        let peers = [Identity::m_unit("a", 1), Identity::m_unit("b", 2), Identity::m_unit("c", 3)].map(Result::unwrap);
+        let ring =
+            std::boxed::Box::leak(std::boxed::Box::new(Managers { discovery: DiscoveryKey::new([0; 32]), peers }));
+        let [a, b, c] = &ring.peers;
+        let Security(proof) = Security::keys(ring, Random::constant());
+        let away = proof.key_away(b, a).unwrap();
+        assert_eq!(proof.manager_away(a, &away).as_ref(), Some(b));
+        assert_eq!(proof.manager_away(b, &proof.key_away(a, b).unwrap()).as_ref(), Some(a));
+        assert_eq!(proof.manager_away(c, &away), None, "it was configured with another manager since");
+        assert!(![a, b, c].iter().any(|manager| proof.has_key(manager, &away)));
+        assert_eq!(proof.manager_away(a, &proof.key_of(a).unwrap()), None, "not handed over");
+        assert_eq!(proof.manager_away(a, &Default::default()), None, "nothing is stored");
     }
 }

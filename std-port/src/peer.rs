@@ -214,7 +214,8 @@ impl<T: Send + 'static> Peer<T> {
     /// unless it has joined the other one there. Its latches and last orders stay with it. `Ok`: it has left; where it is now, the other
     /// manager knows. It stays there until that manager hands it over again, or [`forget_claims`](crate::control::forget_claims).
     ///
-    /// [`HandOverError::Link`] with [`Error::TimedOut`]: it has not answered in time, or knows no hand-over, as boards do. With
+    /// [`HandOverError::Link`] with [`Error::TimedOut`]: it has not answered in time, or knows no hand-over, as boards
+    /// without that feature. With
     /// [`Error::NotConnected`]: it was not there, or left before its answer came, and may be on its way.
     pub fn hand_over(&self, to: &Manager, timeout: impl Into<Duration>) -> Result<(), HandOverError> {
         self.engine.hand_over_to(&self.link()?, to, timeout.into())

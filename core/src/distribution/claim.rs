@@ -90,7 +90,8 @@ pub const KEY_FINGERPRINT_BYTES: usize = 6;
 pub struct StoredClaim {
     /// The claim.
     pub tagged: TaggedClaim,
-    /// The fingerprint of that key.
+    /// The fingerprint of that key. Of a vehicle that was handed over, XORed with that of the key with the manager that it was
+    /// configured with: it says both, and counts with neither alone.
     pub key: [u8; KEY_FINGERPRINT_BYTES],
 }
 

@@ -75,7 +75,7 @@ pub enum UnitEvent<F, N, E> {
         /// Its claim.
         claim: Claim,
     },
-    /// A vehicle goes over to another manager. Not on boards.
+    /// A vehicle goes over to another manager. On boards at the vehicle only, with the feature `hand-over`.
     HandOver {
         /// At the vehicle the manager that it goes to, or back to; at the manager that it leaves, the vehicle.
         peer: Identity,

@@ -27,7 +27,8 @@ use crate::{Field, Settings, TextError, text};
 /// Most generations of keys that a board holds: the one in use, and while a fleet changes its keys the one beside it.
 pub const GENERATIONS: usize = 2;
 
-/// The keys of a board with at most `PEERS` peers: one for a vehicle, which has one manager.
+/// The keys of a board with at most `PEERS` peers: one for a vehicle, which has one manager, and one more for each that it can be
+/// handed over to.
 #[derive(Debug)]
 pub struct Keys<const PEERS: usize = 1> {
     secret: DeviceSecret,
@@ -61,7 +62,9 @@ pub enum KeysError {
     #[error("the keys are not as `cara provision` writes them: write them again")]
     Unsound,
     /// More keys than fit into this board's table or into a copy.
-    #[error("a board holds {GENERATIONS} generations of keys, a vehicle with one peer, any other with as many as fit")]
+    #[error(
+        "a board holds {GENERATIONS} generations of keys, a vehicle with one peer unless its image can be handed over, any other with as many as fit"
+    )]
     Full,
     /// The text of the settings cannot be parsed.
     #[error("{0}")]
@@ -213,6 +216,10 @@ impl<const PEERS: usize> Keyring for Keys<PEERS> {
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
         let mut keys = self.pairs(peer).map(|(_, key)| key.clone());
         keys.next().map(|key| (key, keys.next()))
+    }
+
+    fn peer(&self, index: usize) -> Option<&Identity> {
+        self.peers.get(index).map(|peer| &peer.identity)
     }
 }
 

@@ -355,6 +355,14 @@ fn keys_of_another_unit_are_refused() {
     store.keys_mut().add(&agv(), &[depot(), hall]).unwrap();
     store.save().unwrap();
     refused(folder.path(), &with(&[]), 2, "say --manager depot/1 or --manager hall/2");
+    done(folder.path(), &with(&["--manager", "depot/1", "--manager", "hall/2"]));
+    let page = fs::read(folder.path().join("x")).unwrap();
+    let (settings, both) = newest::<2>(&page, &[]).unwrap();
+    assert_eq!((settings.manager.unwrap().name.as_str(), both.peers().count()), ("depot", 2), "to be handed over");
+    assert_eq!(newest::<1>(&page, &[]).map(drop), Err(KeysError::Full));
+    let plain =
+        ["rp2040", "--name", "agv-17", "--id", "17", "--manager", "depot/1", "--manager", "hall/2", "--insecure"];
+    refused(folder.path(), &plain, 2, "with keys only");
     done(folder.path(), &with(&["--manager", "hall/2"]));
     let peers: Vec<_> = held(&folder.path().join("x")).1.peers().map(ToString::to_string).collect();
     assert_eq!(peers, ["hall/2"]);

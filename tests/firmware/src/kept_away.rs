@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use cara_security::kept_away::{Attack, median_and_worst};
 use cara_std::keys::KeyRing;
 use cara_std::sys::datagram::Datagrams;
-use cara_std::{Fleet, Interfaces, SECURED_PORT, UnitEvent};
+use cara_std::{Fleet, Interfaces, SECURED_PORT};
 use clap::Args;
 
 use crate::board::{Bench, Cable, FLEET, Who};
@@ -74,7 +74,7 @@ fn joins(bench: &Bench, cable: &Cable, manager: &Manager, who: &Who) -> Result<u
     manager.forget_events();
     let since = Instant::now();
     let board = bench.board(cable, who)?;
-    manager.event("join", |event| matches!(event, UnitEvent::Joined { peer } if peer.name() == who.name))?;
+    manager.joined(who)?;
     let took = since.elapsed().as_millis();
     board.cut_power()?;
     Ok(took)

@@ -20,12 +20,17 @@ use crate::signals::remove_at_end;
 /// The manager of all boards by default.
 pub(crate) const MANAGER: &str = "depot/1";
 
+/// The one that a board can be handed over to, where it has keys with two.
+pub(crate) const OTHER: &str = "yard/2";
+
 /// Keys of a manager and its boards.
 pub(crate) struct Keys {
     cara: PathBuf,
     /// The keys, and what boards have been told. It goes when this does.
     folder: TempDir,
     kind: Kind,
+    /// Boards have keys with [`OTHER`] as well.
+    has_other: bool,
 }
 
 /// Bytes of a vehicle's name by which files are told apart: the image has room for 128 bytes of a path.
@@ -43,11 +48,23 @@ enum Kind {
 impl Keys {
     /// Draws keys for a manager and its vehicles, each as NAME/ID. They match no others.
     pub(crate) fn draw(cara: Option<&Path>, fleet: u32, manager: &str, vehicles: &[&str]) -> Result<Rc<Self>> {
-        let keys = Self::new(cara, Kind::Drawn)?;
-        let (fleet, manager) = (fleet.to_string(), format!("{manager}@m_unit"));
-        let arguments = ["keys", "new-fleet", "--fleet", &fleet, &manager];
-        keys.run(arguments.into_iter().chain(vehicles.iter().copied()))?;
-        Ok(Rc::new(keys))
+        Self::new(cara, Kind::Drawn)?.drawn(fleet, &[manager], vehicles)
+    }
+
+    /// The same of a board that can be handed over to [`OTHER`].
+    pub(crate) fn of_two_managers(cara: Option<&Path>) -> Result<Rc<Self>> {
+        let keys = Self { has_other: true, ..Self::new(cara, Kind::Drawn)? };
+        keys.drawn(FLEET, &[MANAGER, OTHER], &["agv-17/17"])
+    }
+
+    fn drawn(self, fleet: u32, managers: &[&str], vehicles: &[&str]) -> Result<Rc<Self>> {
+        let (fleet, managers) = (
+            fleet.to_string(),
+            managers.iter().flat_map(|manager| [format!("{manager}@m_unit"), format!("--manager={manager}")]),
+        );
+        let words = ["keys", "new-fleet", "--fleet", &fleet].map(str::to_owned).into_iter().chain(managers);
+        self.run(words.chain(vehicles.iter().map(|vehicle| (*vehicle).to_owned())))?;
+        Ok(Rc::new(self))
     }
 
     /// Keys of the boards that are tested.
@@ -84,7 +101,7 @@ impl Keys {
         let folder = tempfile::Builder::new().prefix("boards").permissions(owner_only).tempdir();
         let folder = folder.context("cannot make a folder for keys")?;
         remove_at_end(folder.path());
-        Ok(Self { cara, folder, kind })
+        Ok(Self { cara, folder, kind, has_other: false })
     }
 
     /// The command, which finds these keys, and control sockets of this run only.
@@ -113,6 +130,12 @@ impl Keys {
         let (name, id) = MANAGER.split_once('/')?;
         let manager = Identity::m_unit(name, id.parse().ok()?).ok()?;
         (self.kind == Kind::Drawn).then(|| self.file_of(&manager, FLEET))
+    }
+
+    /// The keys of [`OTHER`].
+    pub(crate) fn other_file(&self) -> Result<PathBuf> {
+        let (name, id) = OTHER.split_once('/').context("NAME/ID")?;
+        Ok(self.file_of(&Identity::m_unit(name, id.parse()?)?, FLEET))
     }
 
     /// Where they are.
@@ -148,6 +171,7 @@ impl Keys {
         let (id, fleet) = (id.to_string(), fleet.to_string());
         let mut words: Vec<&OsStr> = ["provision", board, "--name", name, "--id", &id, "--manager", manager]
             .into_iter()
+            .chain(self.has_other.then_some(["--manager", OTHER]).into_iter().flatten())
             .chain(["--fleet", &fleet, "--address", address])
             .chain(manager_address.iter().flat_map(|address| ["--manager-address", address]))
             .chain(self.words().iter().copied())

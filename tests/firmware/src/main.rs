@@ -8,6 +8,7 @@ mod board;
 mod checks;
 mod count;
 mod faults;
+mod hand_over;
 mod kept_away;
 mod keys;
 mod line;
@@ -109,6 +110,8 @@ enum Part {
     Streams(streams::Streams),
     /// Runs a board on a serial line; for an image with SLIP, or with a line without IP.
     Serial(serial::Serial),
+    /// Hands a board over between two managers; for an image that can be.
+    HandOver,
     /// Runs an RP2040 with a W5500 in rp2040js; for its image, in plain mode.
     Rp2040,
     /// Starts a session: a board, its manager and a prompt for `cara`.
@@ -163,6 +166,10 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::KeptAway(options)) => kept_away::run(&bench(arguments)?, options),
         Some(Part::Streams(options)) => streams::run(&bench(arguments)?, options),
         Some(Part::Serial(options)) => serial::run(&bench(arguments)?, options),
+        Some(Part::HandOver) => {
+            let keys = Keys::of_two_managers(arguments.cara.as_deref())?;
+            hand_over::run(&Bench::new(&arguments.image, arguments.logs, keys)?)
+        }
         Some(Part::Rp2040) => rp2040::run(arguments),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),

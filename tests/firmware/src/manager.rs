@@ -88,6 +88,12 @@ impl Manager {
         events.try_iter().for_each(drop);
     }
 
+    /// Whether such an event has come that nobody has looked at; all of those are passed over.
+    pub(crate) fn has_seen(&self, wanted: impl Fn(&UnitEvent) -> bool) -> bool {
+        let events = self.events.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        events.try_iter().filter(wanted).count() > 0
+    }
+
     /// Waits until a board has been given up because nothing came from it any more.
     pub(crate) fn missed(&self, who: &Who) -> Result<()> {
         let is = |event: &UnitEvent| matches!(event, UnitEvent::Left { peer, .. } if peer.name() == who.name);
@@ -95,6 +101,12 @@ impl Manager {
         let silent = matches!(event, UnitEvent::Left { reason: CloseReason::Silent, .. });
         ensure!(silent, "it was not missed: {event:?}");
         Ok(())
+    }
+
+    /// Waits until a board has joined, also again.
+    pub(crate) fn joined(&self, who: &Who) -> Result<()> {
+        let is = |event: &UnitEvent| matches!(event, UnitEvent::Joined { peer } if peer.name() == who.name);
+        self.event("join", is).map(drop)
     }
 
     /// Waits until a board has left.

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow};
-use cara_std::{Parameters, Peer, UnitEvent};
+use cara_std::{Parameters, Peer};
 use clap::Args;
 
 use crate::board::{Bench, LONG, Who};
@@ -43,7 +43,7 @@ pub(crate) fn run(bench: &Bench, Serial { native, baud, idle, noise }: &Serial) 
     let manager = Manager::start(&bench.keys)?;
     let start = Instant::now();
     let board = bench.board_on_line(&line, &who)?;
-    manager.event("joining", |event| matches!(event, UnitEvent::Joined { peer } if peer.name() == who.name))?;
+    manager.joined(&who)?;
     let joined = start.elapsed();
     let agv = manager.meet(&who)?;
     println!("{baud} baud: joined {} ms from power on", joined.as_millis());

@@ -130,6 +130,15 @@ pub(crate) fn line() -> Outcome {
     })
 }
 
+/// Hands the emulated board over between two Linux managers.
+pub(crate) fn hand_over() -> Outcome {
+    emulated(|| {
+        let board = boards::find(TESTED)?;
+        install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+        tests(&board.build(&boards::HANDED)?)?.args(["hand-over"]).code()
+    })
+}
+
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.
 pub(crate) fn attack(figures: &Path) -> Result<Option<String>> {
     attacked(&["security".as_ref(), "--json".as_ref(), figures.as_os_str()])

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 35] = [
+pub(crate) const GROUPS: [Group; 36] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -330,6 +330,15 @@ pub(crate) const GROUPS: [Group; 35] = [
         by_default: false,
         waits: true,
         run: |_| firmware::line(),
+    },
+    Group {
+        name: "hand-over",
+        what: "the emulated board handed over between two Linux managers, through losses of its power and of its manager",
+        budget: 120,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| firmware::hand_over(),
     },
     Group {
         name: "etcd",

@@ -8,12 +8,16 @@ use cara_settings::Settings;
 #[cfg(feature = "secure")]
 use cara_settings::boots::ClaimStore;
 #[cfg(feature = "secure")]
-use cara_settings::keys::{Keys, KeysError};
+use cara_settings::keys::KeysError;
 use cara_settings::page::{self, PageError};
 
 #[cfg(feature = "secure")]
 use crate::claims;
 use crate::info;
+
+/// The keys of a vehicle, with as many managers as it can have.
+#[cfg(feature = "secure")]
+pub type Keys = cara_settings::keys::Keys<{ if cfg!(feature = "hand-over") { 2 } else { 1 } }>;
 
 /// What a vehicle was provisioned with.
 pub struct Provision {
@@ -53,7 +57,7 @@ impl Provision {
         }
         match keys() {
             Ok(keys) => return Some(Self { settings, proof: Proof::Keys(keys) }),
-            Err(KeysError::Full) => info!("the keys are more than this board has room for: one manager's"),
+            Err(KeysError::Full) => info!("the keys are those of more managers than this image has room for"),
             Err(KeysError::Absent | KeysError::Page(_)) => {
                 info!("there are no keys, and this board joins no manager without: give cara provision its --keys FILE")
             }

@@ -147,8 +147,8 @@ fn clock() -> u64 {
 mod secured {
     use cara_embassy::Security;
     use cara_settings::Settings;
-    use cara_settings::keys::{Keys, KeysError, of_text};
-    use cara_vehicle::provision::{Provision, halves};
+    use cara_settings::keys::{KeysError, of_text};
+    use cara_vehicle::provision::{Keys, Provision, halves};
 
     use static_cell::StaticCell;
 

@@ -25,9 +25,10 @@ pub(super) struct Given {
     /// The board's ID number.
     #[arg(long, requires = "name")]
     id: Option<u32>,
-    /// The m_unit that it belongs to. Without one the board is an m_unit itself.
+    /// The m_unit that it belongs to. Without one the board is an m_unit itself. Further ones are those that it can be handed over
+    /// to, where its image has room for their keys.
     #[arg(long, value_name = "NAME/ID")]
-    manager: Option<NameAndId>,
+    manager: Vec<NameAndId>,
     /// Where the manager is, for networks on which broadcasts do not pass.
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address_of_manager)]
     manager_address: Option<SocketAddrV4>,
@@ -110,13 +111,17 @@ impl Given {
         if global.insecure && ring.is_some() {
             return Err(Ended::usage("a board in plain mode has no keys: say either --keys or --insecure"));
         }
-        let manager = self.manager(ring)?;
-        let identity = self.identity(manager.is_some(), ring)?;
+        let managers = self.managers(ring)?;
+        if ring.is_none() && managers.len() > 1 {
+            return Err(Ended::usage("a board is handed over with keys only: give its --keys, or one --manager"));
+        }
+        let identity = self.identity(!managers.is_empty(), ring)?;
         let fleet = global.fleet.map(Fleet).or(ring.map(KeyRing::fleet)).unwrap_or(Fleet(0));
-        ring.map_or(Ok(()), |ring| agree(ring, &identity, fleet, manager.as_ref()))?;
+        ring.map_or(Ok(()), |ring| agree(ring, &identity, fleet, &managers))?;
+        let manager = managers.first().map(|first| Manager::new(first.name(), first.id()));
         let settings = Settings {
             identity,
-            manager,
+            manager: manager.transpose().map_err(|error| Ended::usage(error.to_string()))?,
             manager_address: self.manager_address,
             fleet,
             network: self.network()?,
@@ -136,13 +141,16 @@ impl Given {
         Identity::new(name, id, role).map_err(|error| Ended::usage(format!("--name {name}: {error}")))
     }
 
-    fn manager(&self, ring: Option<&KeyRing>) -> anyhow::Result<Option<Manager>> {
-        let Some(NameAndId { name, id }) = &self.manager else {
+    /// Its manager, and those that it can be handed over to.
+    pub(super) fn managers(&self, ring: Option<&KeyRing>) -> anyhow::Result<Vec<Identity>> {
+        if self.manager.is_empty() {
             let vehicle = ring.filter(|ring| ring.identity().role() == Role::SUnit);
-            return vehicle.map(manager_of).transpose();
+            return Ok(vehicle.map(manager_of).transpose()?.into_iter().collect());
+        }
+        let identity = |NameAndId { name, id }: &NameAndId| {
+            Identity::m_unit(name, *id).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
         };
-        let named = Manager::new(name, *id);
-        named.map(Some).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
+        self.manager.iter().map(identity).collect()
     }
 
     fn network(&self) -> anyhow::Result<Network> {
@@ -173,9 +181,9 @@ impl Given {
 }
 
 /// The only m_unit that a vehicle has keys with.
-fn manager_of(ring: &KeyRing) -> anyhow::Result<Manager> {
+fn manager_of(ring: &KeyRing) -> anyhow::Result<Identity> {
     match ring.peers().as_slice() {
-        [only] => Manager::new(only.name(), only.id()).map_err(|error| Ended::usage(error.to_string())),
+        [only] => Ok((*only).clone()),
         [] => Err(Ended::usage(format!(
             "{} has keys for no peer: give it an m_unit with `cara keys derive`",
             full_name(ring.identity())
@@ -187,8 +195,8 @@ fn manager_of(ring: &KeyRing) -> anyhow::Result<Manager> {
     }
 }
 
-/// Keys are of no use to another unit than theirs, and without the one with the manager.
-fn agree(ring: &KeyRing, identity: &Identity, fleet: Fleet, manager: Option<&Manager>) -> anyhow::Result<()> {
+/// Keys are of no use to another unit than theirs, and without those with its managers.
+fn agree(ring: &KeyRing, identity: &Identity, fleet: Fleet, managers: &[Identity]) -> anyhow::Result<()> {
     if (ring.identity(), ring.fleet()) != (identity, fleet) {
         let (found, wanted) = (full_name(ring.identity()), full_name(identity));
         let text = format!(
@@ -199,12 +207,7 @@ fn agree(ring: &KeyRing, identity: &Identity, fleet: Fleet, manager: Option<&Man
         );
         return Err(Ended::usage(text));
     }
-    let Some(manager) = manager.and_then(|manager| Identity::m_unit(&manager.name, manager.id).ok()) else {
-        return Ok(());
-    };
-    if ring.pair(&manager).is_some() {
-        return Ok(());
-    }
+    let Some(manager) = managers.iter().find(|manager| ring.pair(manager).is_none()) else { return Ok(()) };
     let (node, fleet) = (full_name(identity), fleet.0);
     let command = format!("cara keys derive --fleet {fleet} {node} --manager {manager}");
     Err(Ended::usage(format!("{node} has no key with {manager}: `{command}`")))

@@ -87,7 +87,8 @@ fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
     }
     let ring = arguments.keys.as_deref().map(secrets::load).transpose()?;
     let settings = arguments.given.settings(board, global, ring.as_ref())?;
-    let secrets = ring.as_ref().map(|ring| Secrets::draw(ring, &settings)).transpose()?;
+    let managers = arguments.given.managers(ring.as_ref())?;
+    let secrets = ring.as_ref().map(|ring| Secrets::draw(ring, &managers)).transpose()?;
     let content = Content { settings, secrets };
     match &arguments.output {
         _ if *board == text::EMULATED => text::write(&content, arguments.output.as_deref(), global),

@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use cara_core::distribution::identity::Identity;
-use cara_settings::Settings;
 use cara_settings::keys::{KEYS_BYTES, Keys, KeysError};
 use cara_std::keys::{DeviceSecret, KeyRing, Owner, draw, full_name};
 use zeroize::Zeroizing;
@@ -19,11 +18,11 @@ const PEERS: usize = KEYS_BYTES / 32;
 pub(super) struct Secrets(Zeroizing<Vec<u8>>);
 
 impl Secrets {
-    /// The keys of the unit that settings tell, with a secret that is drawn now.
-    pub(super) fn draw(ring: &KeyRing, settings: &Settings) -> anyhow::Result<Self> {
+    /// A board's keys, those with its managers if it has any, and with a secret that is drawn now.
+    pub(super) fn draw(ring: &KeyRing, managers: &[Identity]) -> anyhow::Result<Self> {
         let secret = DeviceSecret::new(*draw().map_err(failed)?);
         let mut keys = Keys::<PEERS>::new(secret, ring.generation(), ring.discovery().clone());
-        fill(&mut keys, ring, settings).map_err(|error| Ended::usage(error.to_string()))?;
+        fill(&mut keys, ring, managers).map_err(|error| Ended::usage(error.to_string()))?;
         // All of it at once: a list that grows leaves keys behind.
         let mut bytes = Zeroizing::new([0; KEYS_BYTES]);
         let length = keys.encode(&mut bytes).map_err(|error| Ended::usage(error.to_string()))?;
@@ -40,13 +39,9 @@ impl Secrets {
     }
 }
 
-/// A vehicle gets the keys with its manager alone, whatever else its file has.
-fn fill<const N: usize>(keys: &mut Keys<N>, ring: &KeyRing, settings: &Settings) -> Result<(), KeysError> {
-    let manager = settings.manager.as_ref().and_then(|manager| Identity::m_unit(&manager.name, manager.id).ok());
-    let peers: Vec<_> = match &manager {
-        Some(manager) => vec![manager],
-        None => ring.peers(),
-    };
+/// A vehicle gets the keys with its managers alone, whatever else its file has.
+fn fill<const N: usize>(keys: &mut Keys<N>, ring: &KeyRing, managers: &[Identity]) -> Result<(), KeysError> {
+    let peers = if managers.is_empty() { ring.peers() } else { managers.iter().collect() };
     for (generation, discovery) in ring.discoveries() {
         if generation != ring.generation() {
             keys.push_beside(generation, discovery.clone())?;

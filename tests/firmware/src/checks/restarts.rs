@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use cara_std::{Peer, UnitEvent};
+use cara_std::Peer;
 
 use crate::board::{Bench, Board, Who};
 use crate::manager::{Manager, at, drives, position, sets_out};
@@ -101,7 +101,7 @@ fn reach(state: State, manager: &Manager, board: &Board, who: &Who) -> Result<()
     if state == State::Searching {
         return Ok(());
     }
-    manager.event("joining", |event| matches!(event, UnitEvent::Joined { peer } if peer.name() == who.name))?;
+    manager.joined(who)?;
     if state == State::Joined {
         return Ok(());
     }

@@ -100,6 +100,8 @@ pub(crate) const WAREHOUSE: Image =
 pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
 /// The AGV of the emulated board with random numbers that are the same in each life, and with a service that takes lists.
 pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random,lists"), ..AGV };
+/// The AGV of the emulated board that can be handed over to a second manager.
+pub(crate) const HANDED: Image = Image { name: "agv-hand-over", feature: Some("hand-over"), ..AGV };
 /// The AGV of the emulated board on a serial line.
 pub(crate) const SLIP: Image = Image { name: "agv-slip", feature: Some("slip"), ..AGV };
 /// The AGV of the emulated board on a serial line without IP.
