@@ -21,12 +21,13 @@ pub(crate) enum Owner {
 }
 
 /// Parts of file names and their owners. Code without an owner, such as the standard library, counts for its caller.
-const OWNERS: [(&str, Owner); 11] = [
+const OWNERS: [(&str, Owner); 12] = [
     ("smoltcp-", Owner::Network),
     ("embassy-net-", Owner::Network),
     ("managed-", Owner::Network),
     ("embassy-executor", Owner::Board),
     ("embassy-time", Owner::Board),
+    ("examples/firmware/emulated/", Owner::Board),
     ("examples/firmware/lm3s6965evb/", Owner::Board),
     ("cortex-m-rt", Owner::Board),
     ("core/src/", Owner::Cara),

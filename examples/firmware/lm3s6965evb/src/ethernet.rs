@@ -168,7 +168,7 @@ impl RxToken for Received<'_> {
         let end = (length.saturating_sub(CHECKSUM_BYTES)).clamp(LENGTH_BYTES, LENGTH_BYTES + FRAME_BYTES);
         let frame = &mut self.buffer[LENGTH_BYTES..end];
         #[cfg(feature = "faults")]
-        crate::faults::received(frame);
+        cara_emulated::faults::received(frame);
         act(frame)
     }
 }

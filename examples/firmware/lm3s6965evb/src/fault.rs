@@ -5,9 +5,6 @@ use cortex_m::peripheral::SCB;
 
 use crate::{motor, watchdog};
 
-/// Exit code of a program that cannot start: starting again would not help.
-pub const NOT_STARTED: i32 = 101;
-
 /// This board.
 pub(crate) struct Board;
 
@@ -24,7 +21,7 @@ impl cara_board::Board for Board {
 
     fn ended(reason: Reason, place: Place<'_>) {
         #[cfg(feature = "faults")]
-        crate::faults::ended(reason);
+        cara_emulated::faults::ended(reason);
         match reason {
             Reason::Panic => cara_vehicle::error!("panic at {=str}:{=u32}", place.file, place.at),
             Reason::Fault => cara_vehicle::error!("fault at {=u32:#x}", place.at),

@@ -1,32 +1,27 @@
-//! What the board lm3s6965evb needs below embassy: Ethernet controller, serial line, clock, executor, stack paint, faults, watchdog,
-//! motors, and its settings. The board exists for QEMU's sake: an emulated Cortex-M3 on which firmware is tested.
+//! What the board lm3s6965evb needs below embassy: Ethernet controller, serial line, clock, faults, watchdog and motors; the rest is
+//! that of every emulated board. The board exists for QEMU's sake: an emulated Cortex-M3 on which firmware is tested.
 //!
 //! "Data sheet" is Texas Instruments, *Stellaris LM3S6965 Microcontroller*, DS-LM3S6965; register names are as there.
 
 #![no_std]
 
-pub mod arguments;
-#[cfg(feature = "secure")]
-mod boots;
 pub mod clock;
-#[cfg(feature = "faults")]
-pub mod creep;
 #[cfg(feature = "net")]
 pub mod ethernet;
-pub mod executor;
 pub mod fault;
-#[cfg(feature = "faults")]
-pub mod faults;
-#[cfg(feature = "lists")]
-pub mod lists;
 pub mod motor;
 mod register;
 pub mod reset;
-pub mod stack;
 #[cfg(any(feature = "line", feature = "slip"))]
 pub mod uart;
 pub mod watchdog;
 pub mod wiring;
+
+#[cfg(feature = "lists")]
+pub use cara_emulated::lists;
+pub use cara_emulated::{arguments, executor, stack};
+#[cfg(feature = "faults")]
+pub use cara_emulated::{creep, faults};
 
 /// Starts the clock and paints the stack; call it first, once.
 ///

@@ -1,14 +1,11 @@
 //! The motors' enable, a pin, and the interrupt that decides about it each millisecond, as [`cara_board`] says (data sheet,
 //! General-Purpose Input/Outputs; General-Purpose Timers).
 
-use embassy_time::Duration;
+use cara_emulated::{TICK, may_move};
 use lm3s6965::{Interrupt, interrupt};
 
 use crate::fault::Board;
 use crate::register::{PORT_F, Register, SYSTEM, TIMER_1, unmask};
-
-/// How often the interrupt looks.
-pub const TICK: Duration = Duration::from_millis(1);
 
 const RCGC1: Register = SYSTEM.at(0x104);
 const RCGC1_TIMER_1: u32 = 1 << 17;
@@ -69,16 +66,7 @@ pub(crate) fn switch(on: bool) {
     let before = is_on();
     PIN_DATA.write(if on { PIN } else { 0 });
     #[cfg(feature = "faults")]
-    crate::faults::switched(before, on);
-}
-
-/// Whether the motors may run now.
-fn may_move() -> bool {
-    #[cfg(feature = "faults")]
-    if crate::creep::may_move() {
-        return true;
-    }
-    cara_vehicle::may_move()
+    cara_emulated::faults::switched(before, on);
 }
 
 #[allow(unsafe_code)]
@@ -89,9 +77,9 @@ mod handlers {
     fn TIMER_1A() {
         GPTMICR.write(TIMEOUT);
         #[cfg(feature = "faults")]
-        crate::faults::tick();
+        cara_emulated::faults::tick();
         cara_board::tick::<Board>(may_move());
         #[cfg(feature = "faults")]
-        crate::faults::ticked();
+        cara_emulated::faults::ticked();
     }
 }

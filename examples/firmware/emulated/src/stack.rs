@@ -26,7 +26,7 @@ pub struct Stack {
 
 /// Paints what is not in use.
 #[inline(never)]
-pub(crate) fn paint() {
+pub fn paint() {
     let end = cortex_m::register::msp::read() as usize - MARGIN;
     let mut place = &raw mut _stack_end;
     while (place as usize) < end {

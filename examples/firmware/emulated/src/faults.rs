@@ -22,8 +22,8 @@ use critical_section::Mutex;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::signal::Signal;
 
+use crate::TICK;
 use crate::creep::{self, CREEPING};
-use crate::motor;
 
 /// Makes the board fail: 0 notes that something outside is about to fail, 1 hangs in the handler, 2 starves all tasks,
 /// 3 panics, 4 calls itself until the stack is full, 5 has a frame larger than the stack, 6 presses the bumper in an
@@ -113,7 +113,7 @@ pub fn offer(vehicle: Vehicle) -> Result<(), Error> {
     creep::offer(vehicle)?;
     vehicle.publish_my_function_list()?;
     vehicle.on_manager_lost(lost);
-    let [lease, poll, tick] = [GO_TO_LEASE.as_micros(), POLL.as_micros(), motor::TICK.as_micros()];
+    let [lease, poll, tick] = [GO_TO_LEASE.as_micros(), POLL.as_micros(), TICK.as_micros()];
     defmt::info!("bound: lease={=u64} poll={=u64} tick={=u64}", lease, poll, tick);
     Ok(())
 }
@@ -172,7 +172,7 @@ fn lease_words() -> [u32; LEASE_WORDS] {
 }
 
 /// The program has ended, and why: has an overflow written over the lease?
-pub(crate) fn ended(reason: Reason) {
+pub fn ended(reason: Reason) {
     if reason == Reason::StackOverflow {
         let kept = lease_words() == Record::change(|record| record.lease);
         defmt::info!("the lease's words are {=str}", if kept { "as they were" } else { "overwritten" });
@@ -229,7 +229,7 @@ pub(crate) fn sleeps(it_does: bool) {
 }
 
 /// The motors' interrupt looks: has the lease of what moves become longer since the last tick?
-pub(crate) fn tick() {
+pub fn tick() {
     Record::change(|record| {
         let now = now();
         if record.reaches <= now || moves_beyond(record.reaches) {
@@ -240,7 +240,7 @@ pub(crate) fn tick() {
             }
         }
         let gap = now.since(record.ticked);
-        let tick = CoreDuration::from_micros(motor::TICK.as_micros());
+        let tick = CoreDuration::from_micros(TICK.as_micros());
         record.late = if record.sleeps {
             CoreDuration::from_micros(gap.as_micros().saturating_sub(tick.as_micros()))
         } else {
@@ -252,7 +252,7 @@ pub(crate) fn tick() {
 
 /// A frame was taken from the network's controller. What is in it is sealed, and told by its length: renewals and
 /// keep-alives come in datagrams as well, and say nothing of when a stop came.
-pub(crate) fn received(frame: &[u8]) {
+pub fn received(frame: &[u8]) {
     const IPV4: [u8; 2] = [8, 0];
     const UDP: u8 = 17;
     /// The call of `stop`, and the release of an order.
@@ -264,7 +264,7 @@ pub(crate) fn received(frame: &[u8]) {
 }
 
 /// The motors' interrupt has looked: the latest moment before its next look, as an interrupt of a bumper may have it.
-pub(crate) fn ticked() {
+pub fn ticked() {
     // There is no swap on this processor; a press that is asked for in between is seen with the next tick.
     if PRESSING.load(Ordering::Acquire) {
         PRESSING.store(false, Ordering::Release);
@@ -274,7 +274,7 @@ pub(crate) fn ticked() {
 }
 
 /// The motors were, and are, on.
-pub(crate) fn switched(before: bool, on: bool) {
+pub fn switched(before: bool, on: bool) {
     if before == on {
         return;
     }

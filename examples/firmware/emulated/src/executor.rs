@@ -8,7 +8,8 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use embassy_executor::{Spawner, raw};
 use static_cell::StaticCell;
 
-use crate::fault;
+/// Exit code of a program that cannot start: starting again would not help.
+const NOT_STARTED: i32 = 101;
 
 /// A task has been woken since the executor last looked.
 static WOKEN: AtomicBool = AtomicBool::new(false);
@@ -24,7 +25,7 @@ pub fn run(spawn: impl FnOnce(Spawner) -> Result<(), &'static str>) -> ! {
     let executor = EXECUTOR.init_with(|| raw::Executor::new(null_mut()));
     if let Err(text) = spawn(executor.spawner()) {
         cara_vehicle::error!("{=str}", text);
-        semihosting::process::exit(fault::NOT_STARTED)
+        semihosting::process::exit(NOT_STARTED)
     }
     loop {
         #[cfg(feature = "faults")]

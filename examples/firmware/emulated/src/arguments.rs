@@ -1,10 +1,10 @@
-//! What this board is told: an emulator's board has no flash that outlives it, so its settings come as arguments of the
+//! What an emulated board is told: it has no flash that outlives it, so its settings come as arguments of the
 //! command line (QEMU: `-semihosting-config …,arg=agv,arg="name=agv-17 id=17 manager=depot/1 address=dhcp"`), in the
 //! text form of [`Settings`].
 //!
-//! Words that only this board knows:
+//! Words that only such a board knows:
 //!
-//! - `file=PATH`: more words stand in a file of the host, as `cara provision lm3s6965evb --output PATH` writes it. Keys
+//! - `file=PATH`: more words stand in a file of the host, as `cara provision BOARD --output PATH` writes it. Keys
 //!   do, because a list of the host's processes shows arguments;
 //! - `boots=PATH`: the file of the host that stands for the two pages of flash of the board's boot counter and its
 //!   term;

@@ -1,0 +1,32 @@
+//! What the boards that QEMU emulates have in common: settings from QEMU's arguments, a file of the host in place of flash, clock,
+//! executor, stack paint, access to registers, and services for tests. A board adds its controller, timers, pins and watchdog.
+
+#![no_std]
+
+pub mod arguments;
+#[cfg(feature = "secure")]
+mod boots;
+pub mod clock;
+#[cfg(feature = "faults")]
+pub mod creep;
+pub mod executor;
+#[cfg(feature = "faults")]
+pub mod faults;
+#[cfg(feature = "lists")]
+pub mod lists;
+pub mod register;
+pub mod stack;
+
+use embassy_time::Duration;
+
+/// How often the motors' interrupt looks.
+pub const TICK: Duration = Duration::from_millis(1);
+
+/// Whether the motors may run now, for their interrupt.
+pub fn may_move() -> bool {
+    #[cfg(feature = "faults")]
+    if creep::may_move() {
+        return true;
+    }
+    cara_vehicle::may_move()
+}
