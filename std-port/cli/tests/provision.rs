@@ -390,7 +390,7 @@ fn the_emulated_board_is_told_by_text() {
     refused(folder.path(), &reported("lm3s6965evb", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
     let shown = done(folder.path(), &["--read", "argument"]);
     let expected =
-        "lm3s6965evb: name=agv-17 id=17 manager=depot/1 fleet=7 address=dhcp, keys of generation 1 with depot/1";
+        "emulated board: name=agv-17 id=17 manager=depot/1 fleet=7 address=dhcp, keys of generation 1 with depot/1";
     assert_eq!(shown, format!("{expected}@m_unit\n"));
     let json = done(folder.path(), &["--read", "plain", "--json"]);
     assert!(json.contains(r#""generation":null"#) && json.contains(r#""keys":null"#), "{json}");

@@ -16,6 +16,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use crate::keys::{Keys, MANAGER as DEPOT};
 use crate::line::{self, Line};
+use crate::machine::Machine;
 use crate::rp2040::{self, Events, Wire};
 use crate::trace::Trace;
 
@@ -35,26 +36,23 @@ pub(crate) struct Bench {
     constant: Option<PathBuf>,
     /// The board's clock counts instructions.
     counts: bool,
-    /// Boards are an RP2040 with a W5500.
-    is_rp2040: bool,
+    /// What its boards are.
+    machine: Machine,
     /// How many there are, also of other benches on this bridge.
     cables: Rc<Cell<u8>>,
     /// Of the boards, and of their manager.
     pub(crate) keys: Rc<Keys>,
 }
 
-/// Where a board's clock counts instructions, each takes 2 to this power of nanoseconds: 1.6 cycles of its 12.5 MHz.
-pub(crate) const INSTRUCTION: u32 = 7;
-
 impl Bench {
     /// Makes the network.
-    pub(crate) fn new(image: &Path, shows_logs: bool, keys: Rc<Keys>) -> Result<Self> {
+    pub(crate) fn new(machine: Machine, image: &Path, shows_logs: bool, keys: Rc<Keys>) -> Result<Self> {
         network::run("ip link set lo up")?;
         network::run("ip link add bridge0 type bridge")?;
         network::run(&format!("ip address add {MANAGER} brd + dev bridge0"))?;
         network::run("ip link set bridge0 up")?;
         let (table, image, cables) = (table_of(image)?, image.to_owned(), Rc::default());
-        Ok(Self { image, table, shows_logs, constant: None, counts: false, is_rp2040: false, cables, keys })
+        Ok(Self { image, table, shows_logs, constant: None, counts: false, machine, cables, keys })
     }
 
     /// Times on its boards are counted in instructions, and do not depend on how busy this machine is.
@@ -67,21 +65,21 @@ impl Bench {
         &self.image
     }
 
-    /// Its boards are an RP2040 with a W5500.
-    pub(crate) fn rp2040(self) -> Self {
-        Self { is_rp2040: true, ..self }
+    /// What its boards are.
+    pub(crate) fn machine(&self) -> Machine {
+        self.machine
     }
 
     /// Whether its boards can be told to draw the same numbers in each life.
     pub(crate) fn takes_seeds(&self) -> bool {
-        !self.is_rp2040
+        self.machine != Machine::Rp2040
     }
 
     /// The same bench for boards that are told other things.
     pub(crate) fn with(&self, keys: Rc<Keys>) -> Self {
         let (image, table, cables) = (self.image.clone(), Arc::clone(&self.table), Rc::clone(&self.cables));
-        let Self { shows_logs, counts, is_rp2040, .. } = *self;
-        Self { image, table, shows_logs, constant: self.constant.clone(), counts, is_rp2040, cables, keys }
+        let Self { shows_logs, counts, machine, .. } = *self;
+        Self { image, table, shows_logs, constant: self.constant.clone(), counts, machine, cables, keys }
     }
 
     /// Has that image beside.
@@ -103,7 +101,7 @@ impl Bench {
         let name = format!("tap{number}");
         network::run(&format!("ip tuntap add name {name} mode tap"))?;
         network::run(&format!("ip link set {name} master bridge0"))?;
-        let wire = self.is_rp2040.then(|| Wire::lay(&name, self.keys.folder())).transpose()?;
+        let wire = (self.machine == Machine::Rp2040).then(|| Wire::lay(&name, self.keys.folder())).transpose()?;
         let cable = Cable { name, number, wire };
         cable.plug_in()?;
         Ok(cable)
@@ -111,7 +109,7 @@ impl Bench {
 
     /// Puts power on a board.
     pub(crate) fn board(&self, cable: &Cable, who: &Who) -> Result<Board> {
-        let said = if self.is_rp2040 { Stdio::inherit() } else { Stdio::null() };
+        let said = if self.machine == Machine::Rp2040 { Stdio::inherit() } else { Stdio::null() };
         self.start(self.emulator(cable, who)?.stderr(said), who)
     }
 
@@ -150,28 +148,34 @@ impl Bench {
         let Cable { name, number, wire } = cable;
         let address = format!("{}/24", address(cable));
         if let Some(wire) = wire {
-            let (settings, flash) = self.keys.reported("rp2040", who, &address)?;
+            let (settings, flash) = self.keys.reported(self.machine.name(), who, &address)?;
             let mut command = first("node");
             command.arg(rp2040::SCRIPTS.to_owned() + "board.mjs").arg(wire.socket()).arg(flash);
             command.arg(self.image.with_extension("uf2")).arg(settings);
             return Ok(command);
         }
-        let nic = format!("tap,ifname={name},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}");
+        let model = self.machine.controller();
+        let nic = format!("tap,ifname={name},script=no,downscript=no,model={model},mac=52:54:00:00:00:{number:02x}");
         self.emulator_with(&["-serial", "none", "-nic", &nic], &address, who)
     }
 
     fn emulator_with(&self, network: &[&str], address: &str, who: &Who) -> Result<Command> {
-        let (reported, boots) = self.keys.reported("lm3s6965evb", who, address)?;
+        let (reported, boots) = self.keys.reported(self.machine.name(), who, address)?;
         let seed = who.seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
         let reported = format!("file={} boots={}{seed}", reported.display(), boots.display());
         let mut command = first("qemu-system-arm");
         command
-            .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none"])
+            .args(["-M", self.machine.name(), "-display", "none", "-monitor", "none"])
             .arg("-semihosting-config")
             .arg(format!("enable=on,target=native,arg=agv,arg={reported}"))
             .arg("-kernel")
             .arg(&self.image)
-            .args(self.counts.then(|| ["-icount".to_owned(), format!("shift={INSTRUCTION}")]).into_iter().flatten())
+            .args(
+                self.counts
+                    .then(|| ["-icount".to_owned(), format!("shift={}", self.machine.instruction())])
+                    .into_iter()
+                    .flatten(),
+            )
             .args(network);
         Ok(command)
     }

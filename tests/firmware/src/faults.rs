@@ -16,7 +16,7 @@ mod stopping;
 use anyhow::{Result, ensure};
 use clap::Args;
 
-use crate::board::{Bench, INSTRUCTION};
+use crate::board::Bench;
 use kind::{Bound, KINDS, Kind};
 pub(crate) use processes::stand_alone;
 pub(crate) use shared::stand_alone as stand_alone_shared;
@@ -81,7 +81,7 @@ pub(crate) fn run(bench: Bench, faults: &Faults) -> Result<()> {
         let bound = target.bound(kind)?;
         let stops =
             (0..faults.each).map(|number| target.fail(kind, number, &mut dice)).collect::<Result<Vec<Stop>>>()?;
-        let row = Row::of(kind, target.name(), bound, &stops);
+        let row = Row::of(kind, target.name(), bound, &stops, bench.machine().instruction());
         println!("{row}");
         if row.longest > row.bound.micros && (target.has_own_clock() || !faults.busy_host) {
             late.push(kind.name);
@@ -91,7 +91,7 @@ pub(crate) fn run(bench: Bench, faults: &Faults) -> Result<()> {
     println!("\n{HEAD}");
     rows.iter().for_each(|row| println!("{row}"));
     let faults: usize = rows.iter().map(|row| row.faults).sum();
-    println!("\n{faults} faults; one instruction is {} ns of the board's clock", 1 << INSTRUCTION);
+    println!("\n{faults} faults; one instruction is {} ns of the board's clock", 1 << bench.machine().instruction());
     ensure!(late.is_empty(), "motors went on beyond the bound: {}", late.join(", "));
     Ok(())
 }
@@ -107,20 +107,22 @@ struct Row {
     bound: Bound,
     faults: usize,
     longest: u64,
+    /// As a power of two, in nanoseconds.
+    instruction: u32,
 }
 
 impl Row {
-    fn of(kind: &'static Kind, on: &'static str, bound: Bound, stops: &[Stop]) -> Self {
+    fn of(kind: &'static Kind, on: &'static str, bound: Bound, stops: &[Stop], instruction: u32) -> Self {
         let longest = stops.iter().map(|stop| kind.took(stop)).max().unwrap_or(0);
-        Self { kind, on, bound, faults: stops.len(), longest }
+        Self { kind, on, bound, faults: stops.len(), longest, instruction }
     }
 }
 
 impl std::fmt::Display for Row {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { kind, on, bound, faults, longest } = self;
+        let Self { kind, on, bound, faults, longest, instruction } = self;
         let millis = |micros: i64| micros as f64 / 1_000.0;
-        let instructions = (longest * 1_000) >> INSTRUCTION;
+        let instructions = (longest * 1_000) >> instruction;
         let left = bound.micros as i64 - *longest as i64;
         let (took, allowed, left) = (millis(*longest as i64), millis(bound.micros as i64), millis(left));
         write!(

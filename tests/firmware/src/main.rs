@@ -1,4 +1,4 @@
-//! Firmware in QEMU against the Linux manager: real machine code of a Cortex-M3 behind a virtual cable, in a network
+//! Firmware in QEMU against the Linux manager: real machine code of a Cortex-M3 or M4 behind a virtual cable, in a network
 //! namespace that the program makes for itself.
 //!
 //! Everything is checked from what the manager sees and from what the board logs; waits are bounded generously, and
@@ -13,6 +13,7 @@ mod kept_away;
 mod keys;
 mod line;
 mod load;
+mod machine;
 mod manager;
 mod places;
 mod rp2040;
@@ -34,13 +35,17 @@ use clap::{Parser, Subcommand};
 use board::Bench;
 use checks::Check;
 use keys::Keys;
+use machine::Machine;
 
-/// Runs an image of the board lm3s6965evb in QEMU and checks what it does.
+/// Runs an image of an emulated board and checks what it does.
 #[derive(Parser)]
 struct Arguments {
     /// The AGV's image.
     #[arg(long)]
     image: PathBuf,
+    /// The board that it is for.
+    #[arg(long, value_enum, default_value = "lm3s6965evb")]
+    board: Machine,
     /// The same with random numbers that are the same in each life, and with a service that takes lists.
     #[arg(long)]
     constant: Option<PathBuf>,
@@ -112,7 +117,7 @@ enum Part {
     Serial(serial::Serial),
     /// Hands a board over between two managers; for an image that can be.
     HandOver,
-    /// Runs an RP2040 with a W5500 in rp2040js; for its image, in plain mode.
+    /// Runs an RP2040 with a W5500 in rp2040js; with `--board rp2040`, for its image.
     Rp2040,
     /// Starts a session: a board, its manager and a prompt for `cara`.
     Session(session::Session),
@@ -126,9 +131,7 @@ fn main() -> ExitCode {
         }
         Some(Part::Vehicle { shared: true }) => faults::stand_alone_shared().map(|()| ExitCode::SUCCESS),
         Some(Part::Vehicle { shared: false }) => faults::stand_alone().map(|()| ExitCode::SUCCESS),
-        Some(Part::Ends { times }) => {
-            session::ends(&arguments.image, arguments.cara.as_deref(), *times).map(|()| ExitCode::SUCCESS)
-        }
+        Some(Part::Ends { times }) => session::ends(&arguments, *times).map(|()| ExitCode::SUCCESS),
         _ => in_own_network(&arguments),
     };
     outcome.unwrap_or_else(|error| {
@@ -159,7 +162,7 @@ fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
 fn inside(arguments: &Arguments) -> Result<()> {
     signals::clean_up_at_signals()?;
     match &arguments.part {
-        Some(Part::Session(session)) => session::run(&arguments.image, session),
+        Some(Part::Session(session)) => session::run(arguments, session),
         Some(Part::Instructions { of, profile }) => count::run(&bench(arguments)?, &arguments.image, *of, *profile),
         Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
         Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
@@ -168,7 +171,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Serial(options)) => serial::run(&bench(arguments)?, options),
         Some(Part::HandOver) => {
             let keys = Keys::of_two_managers(arguments.cara.as_deref())?;
-            hand_over::run(&Bench::new(&arguments.image, arguments.logs, keys)?)
+            hand_over::run(&Bench::new(arguments.board, &arguments.image, arguments.logs, keys)?)
         }
         Some(Part::Rp2040) => rp2040::run(arguments),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
@@ -180,7 +183,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
 fn bench(arguments: &Arguments) -> Result<Bench> {
     let cara = arguments.cara.as_deref();
     let keys = if arguments.insecure { Keys::insecure(cara)? } else { Keys::of_boards(cara)? };
-    Bench::new(&arguments.image, arguments.logs, keys)
+    Bench::new(arguments.board, &arguments.image, arguments.logs, keys)
 }
 
 /// What is tested from outside, because it makes a network of its own.
@@ -189,7 +192,7 @@ fn after(arguments: &Arguments) -> Result<()> {
         return Ok(());
     }
     let start = Instant::now();
-    let reported = session::test(&arguments.image, arguments.cara.as_deref()).context(SESSION)?;
+    let reported = session::test(arguments).context(SESSION)?;
     println!("{SESSION:48} {:6.1} s  {reported}", start.elapsed().as_secs_f64());
     Ok(())
 }

@@ -38,7 +38,7 @@ const SECURED: [Check; 2] = [
 
 /// Runs all of it.
 pub(crate) fn run(arguments: &Arguments) -> Result<()> {
-    let bench = crate::bench(arguments)?.rp2040();
+    let bench = crate::bench(arguments)?;
     let others: [&[Check]; 2] =
         if arguments.insecure { [&checks::RP2040, &[]] } else { [&checks::RP2040_SECURED, &SECURED] };
     let mut passed = run_checks(&CHECKS, &bench, arguments)?;

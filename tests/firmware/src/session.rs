@@ -14,6 +14,7 @@ use clap::Args;
 use rustix::process::Signal;
 use tempfile::TempDir;
 
+use crate::Arguments;
 use crate::board::{Bench, LONG, Who};
 use crate::keys::Keys;
 
@@ -56,10 +57,10 @@ fn manager(text: &str) -> Result<String, String> {
 const PROMPT: &str = "cara> ";
 
 /// Starts everything, then runs what is typed until the input ends.
-pub(crate) fn run(image: &Path, session: &Session) -> Result<()> {
+pub(crate) fn run(of: &Arguments, session: &Session) -> Result<()> {
     let Session { name, id, manager, fleet, cara } = session.clone();
     let keys = Keys::draw(cara.as_deref(), fleet, &manager, &[&format!("{name}/{id}")])?;
-    let bench = Bench::new(image, true, Rc::clone(&keys))?;
+    let bench = Bench::new(of.board, &of.image, true, Rc::clone(&keys))?;
     let cable = bench.cable()?;
     let cara = Cara(keys);
     let _manager = cara.manager(&manager, fleet)?;
@@ -163,9 +164,9 @@ const TYPED: [(&str, &str); 7] = [
 ];
 
 /// The emulator session, with commands piped into it.
-pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
+pub(crate) fn test(of: &Arguments) -> Result<String> {
     let program = std::env::current_exe()?;
-    let mut session = Process::start("the session", &program, arguments(image, cara))?;
+    let mut session = Process::start("the session", &program, arguments(of))?;
     session.seen("INFO started because of", LONG)?;
     for (line, answer) in TYPED {
         session.send(line)?;
@@ -179,21 +180,22 @@ pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
         bail!("it ended with {ended}");
     }
     for wrapper in ["env", "nohup"] {
-        leaves_no_keys(wrapper, &program, image, cara).with_context(|| format!("started by {wrapper}"))?;
+        leaves_no_keys(wrapper, &program, of).with_context(|| format!("started by {wrapper}"))?;
     }
     Ok("what is typed is run, what the board logs is shown, and no keys stay behind".into())
 }
 
-fn arguments(image: &Path, cara: Option<&Path>) -> Vec<OsString> {
-    let mut arguments = vec!["--image".into(), image.as_os_str().to_owned(), "session".into()];
-    arguments.extend(cara.into_iter().flat_map(|cara| ["--cara".into(), cara.as_os_str().to_owned()]));
+fn arguments(of: &Arguments) -> Vec<OsString> {
+    let mut arguments = vec!["--board".into(), of.board.name().into()];
+    arguments.extend(["--image".into(), of.image.as_os_str().to_owned(), "session".into()]);
+    arguments.extend(of.cara.iter().flat_map(|cara| ["--cara".into(), cara.as_os_str().to_owned()]));
     arguments
 }
 
 /// A session that a signal ends takes its keys along, whatever signals it was started to ignore.
-fn leaves_no_keys(wrapper: &str, program: &Path, image: &Path, cara: Option<&Path>) -> Result<()> {
+fn leaves_no_keys(wrapper: &str, program: &Path, of: &Arguments) -> Result<()> {
     let folder = tempfile::tempdir()?;
-    let mut session = process_in(&folder, wrapper, program, image, cara)?;
+    let mut session = process_in(&folder, wrapper, program, of)?;
     session.seen("Ctrl-D", LONG)?;
     ensure!(std::fs::read_dir(folder.path())?.next().is_some(), "the session has its keys elsewhere");
     session.terminate(LONG)?;
@@ -206,14 +208,14 @@ const STARTS: Duration = Duration::from_millis(1_500);
 const ENDS: [Signal; 3] = [Signal::TERM, Signal::INT, Signal::HUP];
 
 /// Ends sessions by signals at random moments of their start, every second one below `nohup`; none leaves keys behind.
-pub(crate) fn ends(image: &Path, cara: Option<&Path>, times: u32) -> Result<()> {
+pub(crate) fn ends(of: &Arguments, times: u32) -> Result<()> {
     let program = std::env::current_exe()?;
     let mut dice = fastrand::Rng::new();
     let mut with_keys = 0;
     for number in 0..times {
         let folder = tempfile::tempdir()?;
         let (wrapper, signals) = if number.is_multiple_of(2) { ("env", 3) } else { ("nohup", 2) };
-        let mut session = process_in(&folder, wrapper, &program, image, cara)?;
+        let mut session = process_in(&folder, wrapper, &program, of)?;
         std::thread::sleep(STARTS.mul_f64(dice.f64()));
         with_keys += u32::from(std::fs::read_dir(folder.path())?.next().is_some());
         let signal = dice.choice(ENDS.iter().take(signals)).copied().unwrap_or(Signal::TERM);
@@ -226,10 +228,10 @@ pub(crate) fn ends(image: &Path, cara: Option<&Path>, times: u32) -> Result<()> 
 }
 
 /// A session whose keys are in a folder.
-fn process_in(folder: &TempDir, wrapper: &str, program: &Path, image: &Path, cara: Option<&Path>) -> Result<Process> {
+fn process_in(folder: &TempDir, wrapper: &str, program: &Path, of: &Arguments) -> Result<Process> {
     let mut place = OsString::from("TMPDIR=");
     place.push(folder.path());
-    let words = ["env".into(), place, program.as_os_str().to_owned()].into_iter().chain(arguments(image, cara));
+    let words = ["env".into(), place, program.as_os_str().to_owned()].into_iter().chain(arguments(of));
     Process::start("the session", Path::new(wrapper), words)
 }
 

@@ -30,36 +30,61 @@ pub(crate) use sizes::{check as check_sizes, sizes};
 /// Builds the images of one board, or of all of them, with the files that are flashed beside them.
 pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
     for board in chosen(name)? {
-        install::rust_target(board.target).map_err(anyhow::Error::msg)?;
-        for image in board.images {
-            let elf = board.build(image)?;
-            println!("{}", elf.display());
-            if let Some(place) = cara_settings::board::find(board.name) {
-                println!("{}", uf2::write_beside(&elf, place)?.display());
-            }
-        }
+        build_images(board)?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// Builds and links the images of all boards, with a Rust as old as promised as far as their dependencies say.
-pub(crate) fn link() -> Outcome {
-    for board in BOARDS.iter() {
-        if let Err(reason) = install::rust_target(board.target) {
-            return Outcome::Skipped(reason);
+fn build_images(board: &Board) -> Result<()> {
+    install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+    for image in board.images {
+        let elf = board.build(image)?;
+        println!("{}", elf.display());
+        if let Some(place) = cara_settings::board::find(board.name) {
+            println!("{}", uf2::write_beside(&elf, place)?.display());
         }
     }
-    build(None).and_then(|_| msrv::check_firmware()).into()
+    Ok(())
 }
 
-/// The emulated board, whose firmware is tested.
+/// Builds and links the images of boards, with a Rust as old as promised as far as their dependencies say.
+pub(crate) fn link() -> Outcome {
+    let boards = || BOARDS.iter().filter(|board| board.by_default);
+    if let Err(reason) = boards().try_for_each(|board| install::rust_target(board.target)) {
+        return Outcome::Skipped(reason);
+    }
+    boards().try_for_each(build_images).and_then(|()| msrv::check_firmware()).into()
+}
+
+/// The emulated board whose firmware is tested, measured and attacked each time.
 pub(crate) const TESTED: &str = "lm3s6965evb";
+/// The other emulated board.
+const SECOND: &str = "mps2-an386";
 /// Exit code of a test that the system does not allow.
 pub(crate) const NOT_ALLOWED: i32 = 77;
 
 /// Runs the emulated board's firmware against the Linux manager.
 pub(crate) fn test() -> Outcome {
-    emulated(tested)
+    emulated(|| {
+        let board = boards::find(TESTED)?;
+        let checked = checked(board)?;
+        if checked != Some(0) {
+            return Ok(checked);
+        }
+        tests(board, &board.build(&boards::SLIP)?)?.args(["serial"]).code()
+    })
+}
+
+/// The same on the other emulated board, which has no driver of a serial line; and makes it fail, and looks at its sizes.
+pub(crate) fn test_second() -> Outcome {
+    emulated(|| {
+        let checked = checked(boards::find(SECOND)?)?;
+        if checked != Some(0) {
+            return Ok(checked);
+        }
+        sizes::check_board(SECOND)?;
+        faults::injected(&Faults::checked(SECOND), &["--busy-host"])
+    })
 }
 
 /// What came of a test on the emulated board, which ends with an exit code.
@@ -89,28 +114,22 @@ pub(crate) fn test_rp2040() -> Outcome {
         uf2::write_beside(&image, cara_settings::board::find(board.name).context("it has no pages for settings")?)?;
         let scripts = workspace::root().join("tests/rp2040");
         Run::new("npm").args(["ci", "--silent", "--prefix"]).args([&scripts]).stream()?;
-        let plain = tests(&image)?.args(["--insecure", "--restarts", "12", "rp2040"]).code()?;
+        let plain = tests(board, &image)?.args(["--insecure", "--restarts", "12", "rp2040"]).code()?;
         if plain != Some(0) {
             return Ok(plain);
         }
-        tests(&image)?.args(["rp2040"]).code()
+        tests(board, &image)?.args(["rp2040"]).code()
     })
 }
 
-fn tested() -> Result<Option<i32>> {
-    let image = tested_image()?;
-    let constant = boards::find(TESTED)?.build(&boards::CONSTANT)?;
-    let checked = tests(&image)?.args(["--constant".as_ref(), constant.as_os_str()]).code()?;
+fn checked(board: &Board) -> Result<Option<i32>> {
+    install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+    let [image, constant] = [board.build(&boards::AGV)?, board.build(&boards::CONSTANT)?];
+    let checked = tests(board, &image)?.args(["--constant".as_ref(), constant.as_os_str()]).code()?;
     if checked != Some(0) {
         return Ok(checked);
     }
-    let streams = boards::find(TESTED)?.build(&boards::STREAMS)?;
-    let streamed = tests(&streams)?.args(["streams", "--rounds", "1"]).code()?;
-    if streamed != Some(0) {
-        return Ok(streamed);
-    }
-    let slip = boards::find(TESTED)?.build(&boards::SLIP)?;
-    tests(&slip)?.args(["serial"]).code()
+    tests(board, &board.build(&boards::STREAMS)?)?.args(["streams", "--rounds", "1"]).code()
 }
 
 /// Flash of the least unit on a line without IP, at most: 90 KiB.
@@ -126,7 +145,7 @@ pub(crate) fn line() -> Outcome {
         if flash > LEAST_ON_LINE {
             bail!("that is more than {LEAST_ON_LINE}");
         }
-        tests(&board.build(&boards::LINE)?)?.args(["serial", "--native"]).code()
+        tests(board, &board.build(&boards::LINE)?)?.args(["serial", "--native"]).code()
     })
 }
 
@@ -135,7 +154,7 @@ pub(crate) fn hand_over() -> Outcome {
     emulated(|| {
         let board = boards::find(TESTED)?;
         install::rust_target(board.target).map_err(anyhow::Error::msg)?;
-        tests(&board.build(&boards::HANDED)?)?.args(["hand-over"]).code()
+        tests(board, &board.build(&boards::HANDED)?)?.args(["hand-over"]).code()
     })
 }
 
@@ -150,21 +169,12 @@ pub(crate) fn kept_away(starts: &str) -> Result<Option<String>> {
 }
 
 fn attacked(arguments: &[&OsStr]) -> Result<Option<String>> {
-    let attacked = || {
-        let image = tested_image()?;
-        tests(&image)?.args(arguments).code()
-    };
+    let attacked = || tests(boards::find(TESTED)?, &emulated_image(&boards::AGV)?)?.args(arguments).code();
     match emulated(attacked) {
         Outcome::Passed => Ok(None),
         Outcome::Skipped(reason) => Ok(Some(reason)),
         Outcome::Failed(why) => bail!("attacks on a board: {why}"),
     }
-}
-
-/// The AGV's image of the emulated board.
-fn tested_image() -> Result<PathBuf> {
-    let Some(image) = boards::find(TESTED)?.images.first() else { bail!("{TESTED} has no image") };
-    emulated_image(image)
 }
 
 /// The image of a vehicle of the warehouse.
@@ -179,10 +189,11 @@ fn emulated_image(image: &Image) -> Result<PathBuf> {
     board.build(image)
 }
 
-/// The program that runs images, about to be run with one. It uses the `cara` command beside it.
-pub(crate) fn tests(image: &Path) -> Result<Run> {
+/// The program that runs images, about to be run with one of a board. It uses the `cara` command beside it.
+pub(crate) fn tests(board: &Board, image: &Path) -> Result<Run> {
     binaries::build(&["cara"])?;
-    Ok(binaries::debug("cara-firmware-tests")?.args(["--image".as_ref(), image.as_os_str()]))
+    let tests = binaries::debug("cara-firmware-tests")?.args(["--board", board.name]);
+    Ok(tests.args(["--image".as_ref(), image.as_os_str()]))
 }
 
 fn chosen(name: Option<&str>) -> Result<Vec<&'static Board>> {

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 36] = [
+pub(crate) const GROUPS: [Group; 37] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -357,6 +357,15 @@ pub(crate) const GROUPS: [Group; 36] = [
         by_default: false,
         waits: true,
         run: |_| firmware::test_rp2040(),
+    },
+    Group {
+        name: "mps2-an386",
+        what: "the second emulated board, a Cortex-M4 with another Ethernet controller: checks of the first one, faults, its sizes",
+        budget: 900,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| firmware::test_second(),
     },
     Group {
         name: "vda5050",

@@ -147,7 +147,7 @@ fn network() -> Result<Option<Vec<Row>>> {
     let images = [(SERVED, built(TARGET, SERVED)), (ECHO, board.build(echo.context("the board has no echo")?)?)];
     let mut rows = Vec::new();
     for (image, file) in images {
-        match firmware::tests(&file)?.args(["--insecure", "instructions", image]).output()? {
+        match firmware::tests(board, &file)?.args(["--insecure", "instructions", image]).output()? {
             (Some(0), reported) => rows.extend(reported.lines().map(of_board).collect::<Result<Vec<Row>>>()?),
             (Some(firmware::NOT_ALLOWED), _) => return Ok(None),
             (code, _) => bail!("the board's instructions could not be counted: exit code {code:?}"),

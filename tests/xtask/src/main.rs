@@ -145,7 +145,7 @@ enum Task {
         #[arg(value_name = "REVISION")]
         revisions: Vec<String>,
     },
-    /// Builds the firmware of a board, or of all boards; or runs the emulated one.
+    /// Builds the firmware of a board, or of all boards; or runs an emulated one.
     Firmware {
         /// Which board.
         #[arg(value_name = "BOARD")]

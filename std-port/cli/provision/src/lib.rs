@@ -80,7 +80,7 @@ pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
 
 fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
     let name = arguments.board.as_deref().unwrap_or_default();
-    let board = if name == text::EMULATED.name { &text::EMULATED } else { known(name)? };
+    let board = text::EMULATED.iter().find(|board| board.name == name).map_or_else(|| known(name), Ok)?;
     if arguments.uf2 && board.uf2.is_none() {
         let text = format!("{} has no boot loader that takes UF2: leave --uf2 away", board.name);
         return Err(Ended::usage(text));
@@ -91,7 +91,7 @@ fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
     let secrets = ring.as_ref().map(|ring| Secrets::draw(ring, &managers)).transpose()?;
     let content = Content { settings, secrets };
     match &arguments.output {
-        _ if *board == text::EMULATED => text::write(&content, arguments.output.as_deref(), global),
+        _ if text::EMULATED.contains(board) => text::write(name, &content, arguments.output.as_deref(), global),
         Some(file) => write_file(arguments, board, &content, file, global),
         None => report(board, &probe::provision(board, &content)?, None, &content, global),
     }
@@ -99,7 +99,7 @@ fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
 
 fn known(name: &str) -> anyhow::Result<&'static Board> {
     find(name).ok_or_else(|| {
-        let names = BOARDS.iter().chain([&text::EMULATED]).map(|board| board.name);
+        let names = BOARDS.iter().chain(&text::EMULATED).map(|board| board.name);
         let names = names.collect::<Vec<_>>().join(", ");
         Ended::usage(format!("there is no board {name}; there are: {names}"))
     })

@@ -24,10 +24,10 @@ pub(super) fn boards(global: &Global) -> anyhow::Result<()> {
     let heads =
         ["board", "chip", "first page", "second page", "count of starts", "erased at once", "file", "what it is"];
     let mut rows = Rows::new(heads);
-    for board in BOARDS.iter().chain([&EMULATED]) {
+    for board in BOARDS.iter().chain(&EMULATED) {
         if global.json {
-            // The emulated board has no flash.
-            let flash = (*board != EMULATED).then_some((board.pages, board.boots, board.erase_bytes));
+            // Emulated boards have no flash.
+            let flash = (!EMULATED.contains(board)).then_some((board.pages, board.boots, board.erase_bytes));
             output::object(&json!({
                 "board": board.name, "chip": board.chip, "pages": flash.map(|(pages, ..)| pages),
                 "starts": flash.map(|(_, starts, _)| starts), "erase_bytes": flash.map(|(.., bytes)| bytes),
@@ -44,7 +44,7 @@ pub(super) fn boards(global: &Global) -> anyhow::Result<()> {
 /// The form of the file that is written for a board.
 fn form(board: &Board) -> &'static str {
     match board.uf2 {
-        _ if *board == EMULATED => "text",
+        _ if EMULATED.contains(board) => "text",
         Some(_) => "uf2",
         None => "bin",
     }
@@ -52,7 +52,7 @@ fn form(board: &Board) -> &'static str {
 
 /// Where settings and the count of starts are, and how much is erased at once.
 fn flash(board: &Board) -> [String; 4] {
-    if *board == EMULATED {
+    if EMULATED.contains(board) {
         return ["-"; 4].map(str::to_owned);
     }
     let ([first, second], [one, other]) = (board.pages, board.boots);
@@ -97,7 +97,7 @@ fn pages(bytes: &[u8]) -> Vec<Zeroizing<Vec<u8>>> {
 /// What a board is told.
 struct Given {
     settings: Settings,
-    /// None of the emulated board, which has one text and no copies.
+    /// None of an emulated board, which has one text and no copies.
     generation: Option<u32>,
     keys: Option<Shown>,
 }
@@ -124,7 +124,7 @@ impl Given {
         }
         let wifi = wifi.map(|name| format!(", Wi-Fi {name}")).unwrap_or_default();
         let keys = keys.map(in_words).unwrap_or_default();
-        let head = generation.map_or_else(|| EMULATED.name.to_owned(), |number| format!("generation {number}"));
+        let head = generation.map_or_else(|| "emulated board".to_owned(), |number| format!("generation {number}"));
         output::line(format_args!("{head}: {settings}{wifi}{keys}"))
     }
 }

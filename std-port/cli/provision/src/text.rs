@@ -1,4 +1,4 @@
-//! The emulated board, which is told by a file of the host: the text of its settings, and its keys behind it.
+//! Emulated boards, which are told by a file of the host: the text of its settings, and its keys behind it.
 
 use std::path::Path;
 
@@ -13,31 +13,37 @@ use cara_tools::exit::Ended;
 use cara_tools::global::Global;
 use cara_tools::output;
 
-/// The emulated board. It has no pages.
-pub(super) const EMULATED: Board = Board {
-    name: "lm3s6965evb",
-    description: "emulated Cortex-M3",
-    chip: "LM3S6965",
-    folder: "lm3s6965evb",
-    feature: "",
-    target: "thumbv7m-none-eabi",
-    pages: [0; 2],
-    boots: [0; 2],
-    erase_bytes: 0,
-    uf2: None,
-    wireless: false,
-};
+/// Emulated boards. They have no pages.
+pub(super) const EMULATED: [Board; 2] = [
+    emulated("lm3s6965evb", "emulated Cortex-M3", "LM3S6965", "thumbv7m-none-eabi"),
+    emulated("mps2-an386", "emulated Cortex-M4", "AN386", "thumbv7em-none-eabihf"),
+];
+
+const fn emulated(name: &'static str, description: &'static str, chip: &'static str, target: &'static str) -> Board {
+    Board {
+        name,
+        description,
+        chip,
+        folder: name,
+        feature: "",
+        target,
+        pages: [0; 2],
+        boots: [0; 2],
+        erase_bytes: 0,
+        uf2: None,
+        wireless: false,
+    }
+}
 
 /// Begins the word with the keys.
 const WORD: &str = " keys=";
 
 /// Writes the file.
-pub(super) fn write(content: &Content, file: Option<&Path>, global: &Global) -> anyhow::Result<()> {
-    let name = EMULATED.name;
+pub(super) fn write(name: &str, content: &Content, file: Option<&Path>, global: &Global) -> anyhow::Result<()> {
     let file = file.ok_or_else(|| {
         Ended::usage(format!("{name} is emulated: it is told by a file of this computer, which --output FILE writes"))
     })?;
-    check_words(&content.settings, file)?;
+    check_words(name, &content.settings, file)?;
     let text = text(content);
     store(file, text.as_bytes(), content.secrets.is_some())?;
     match global.json {
@@ -56,10 +62,10 @@ pub(super) fn of_emulated(bytes: &[u8]) -> Option<&str> {
 }
 
 /// The image splits its arguments at blanks, and QEMU its options at commas.
-fn check_words(settings: &Settings, file: &Path) -> anyhow::Result<()> {
+fn check_words(board: &str, settings: &Settings, file: &Path) -> anyhow::Result<()> {
     let names = [Some(settings.identity.name()), settings.manager.as_ref().map(|manager| &*manager.name)];
     if let Some(name) = names.into_iter().flatten().find(|name| name.contains(char::is_whitespace)) {
-        let text = format!("{} is told by words, so no name may have a blank in it: rename {name:?}", EMULATED.name);
+        let text = format!("{board} is told by words, so no name may have a blank in it: rename {name:?}");
         return Err(Ended::usage(text));
     }
     let path = file.to_string_lossy();

@@ -13,12 +13,14 @@ pub(crate) struct Board {
     pub(crate) name: &'static str,
     /// Below `examples/firmware`; boards of one family share a folder.
     pub(crate) folder: &'static str,
-    /// Chooses the board within its family.
+    /// Chooses the board within its family; none of an emulated board.
     pub(crate) feature: Option<&'static str>,
     pub(crate) target: &'static str,
     pub(crate) images: &'static [Image],
     /// Whether it has a radio that is loaded with files which are no part of the project.
     pub(crate) has_radio: bool,
+    /// Whether it is built and measured each time that everything is checked.
+    pub(crate) by_default: bool,
 }
 
 /// What is built for a board.
@@ -91,14 +93,14 @@ const EMULATED: &[Image] = &[
 const UNIT: Image = Image { feature: Some("discover"), ..Image::plain("unit", "unit") };
 /// The same, whose settings say where its manager is.
 pub(crate) const FIXED: Image = Image::plain("unit-fixed", "unit");
-/// The AGV of the emulated board with its streams.
+/// The AGV of an emulated board with its streams.
 pub(crate) const STREAMS: Image = Image { name: "agv-streams", feature: Some("streams"), ..AGV };
 /// A vehicle of the warehouse.
 pub(crate) const WAREHOUSE: Image =
     Image { feature: Some("warehouse"), ..Image::plain("warehouse", "warehouse").secured() };
-/// The AGV of the emulated board with a service that makes it fail.
+/// The AGV of an emulated board with a service that makes it fail.
 pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
-/// The AGV of the emulated board with random numbers that are the same in each life, and with a service that takes lists.
+/// The AGV of an emulated board with random numbers that are the same in each life, and with a service that takes lists.
 pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random,lists"), ..AGV };
 /// The AGV of the emulated board that can be handed over to a second manager.
 pub(crate) const HANDED: Image = Image { name: "agv-hand-over", feature: Some("hand-over"), ..AGV };
@@ -111,7 +113,7 @@ pub(crate) const UNIT_LINE: Image = Image { name: "unit-line-quiet", feature: So
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
-/// All of them: the emulated one, and those of the table of boards with settings.
+/// All of them: the emulated ones, and those of the table of boards with settings.
 pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
     let emulated = Board {
         name: "lm3s6965evb",
@@ -120,6 +122,15 @@ pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
         target: "thumbv7m-none-eabi",
         images: EMULATED,
         has_radio: false,
+        by_default: true,
+    };
+    let second = Board {
+        name: "mps2-an386",
+        folder: "mps2-an386",
+        target: "thumbv7em-none-eabihf",
+        images: IMAGES,
+        by_default: false,
+        ..emulated
     };
     let real = cara_settings::board::BOARDS.into_iter().map(|board| Board {
         name: board.name,
@@ -128,8 +139,9 @@ pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
         target: board.target,
         images: IMAGES,
         has_radio: board.wireless,
+        by_default: true,
     });
-    std::iter::once(emulated).chain(real).collect()
+    [emulated, second].into_iter().chain(real).collect()
 });
 
 /// The board of a name; the error lists all.
@@ -141,7 +153,22 @@ pub(crate) fn find(name: &str) -> Result<&'static Board> {
     Ok(board)
 }
 
+/// The emulated board of a name.
+pub(crate) fn emulated(name: &str) -> Result<&'static Board> {
+    let board = find(name)?;
+    if !board.is_emulated() {
+        let names: Vec<&str> = BOARDS.iter().filter(|board| board.is_emulated()).map(|board| board.name).collect();
+        bail!("{name} is not emulated here, as these are: {}", names.join(", "));
+    }
+    Ok(board)
+}
+
 impl Board {
+    /// Whether it runs in QEMU.
+    pub(crate) fn is_emulated(&self) -> bool {
+        self.feature.is_none()
+    }
+
     /// Builds an image; where it is.
     pub(crate) fn build(&self, image: &Image) -> Result<PathBuf> {
         let folder = Path::new("examples/firmware").join(self.folder);

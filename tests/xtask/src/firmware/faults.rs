@@ -1,4 +1,4 @@
-//! `cargo xtask faults`: how long the motors of the emulated board go on behind a fault, beside the bound.
+//! `cargo xtask faults`: how long the motors of an emulated board go on behind a fault, beside the bound.
 
 use std::process::ExitCode;
 
@@ -22,6 +22,16 @@ pub(crate) struct Faults {
     /// From which the moments of the faults follow; drawn, and printed, if not given.
     #[arg(long)]
     seed: Option<u64>,
+    /// The emulated board.
+    #[arg(long, default_value = TESTED)]
+    board: String,
+}
+
+impl Faults {
+    /// Those of a check.
+    pub(super) fn checked(board: &str) -> Self {
+        Self { each: CHECKED, kind: String::new(), seed: None, board: board.to_owned() }
+    }
 }
 
 /// Faults of each kind in the checks.
@@ -43,16 +53,16 @@ pub(crate) fn check() -> Outcome {
     if let Err(reason) = install::program("nft", "nftables") {
         return Outcome::Skipped(reason);
     }
-    emulated(|| injected(&Faults { each: CHECKED, kind: String::new(), seed: None }, &["--busy-host"]))
+    emulated(|| injected(&Faults::checked(TESTED), &["--busy-host"]))
 }
 
-fn injected(faults: &Faults, more: &[&str]) -> Result<Option<i32>> {
-    let board = boards::find(TESTED)?;
+pub(super) fn injected(faults: &Faults, more: &[&str]) -> Result<Option<i32>> {
+    let board = boards::emulated(&faults.board)?;
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
     let image = board.build(&FAULTS)?;
     let seed = faults.seed.map(|seed| ["--seed".to_owned(), seed.to_string()]);
     let each = faults.each.to_string();
-    tests(&image)?
+    tests(board, &image)?
         .args(["faults", "--each", &each, "--kind", &faults.kind])
         .args(seed.iter().flatten())
         .args(more)

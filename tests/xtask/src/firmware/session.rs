@@ -5,13 +5,14 @@ use std::process::ExitCode;
 use anyhow::{Result, bail};
 use clap::Args;
 
-use super::{NOT_ALLOWED, TESTED, tested_image, tests};
+use super::boards::{self, AGV};
+use super::{NOT_ALLOWED, TESTED, tests};
 use crate::install;
 
 /// The boards and programs of the session.
 #[derive(Args)]
 pub(crate) struct SessionOptions {
-    /// Runs the emulated board, with a manager and a prompt that takes verbs of `cara`; Ctrl-D ends it.
+    /// Runs an emulated board, with a manager and a prompt that takes verbs of `cara`; Ctrl-D ends it.
     #[arg(long)]
     pub(crate) run: bool,
     /// The vehicle's name.
@@ -30,14 +31,14 @@ pub(crate) struct SessionOptions {
 
 /// Builds what is needed and runs it until the input ends.
 pub(crate) fn session(board: Option<&str>, options: &SessionOptions) -> Result<ExitCode> {
-    if board != Some(TESTED) {
-        bail!("only the emulated board runs here: cargo xtask firmware {TESTED} --run");
-    }
+    let Some(board) = board else { bail!("say which board: cargo xtask firmware {TESTED} --run") };
+    let board = boards::emulated(board)?;
     install::program("qemu-system-arm", "qemu-system-arm").map_err(anyhow::Error::msg)?;
-    let image = tested_image()?;
+    install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+    let image = board.build(&AGV)?;
     let (id, fleet) = (options.id.to_string(), options.fleet.to_string());
     let reported = ["session", "--name", &options.name, "--id", &id, "--manager", &options.manager, "--fleet", &fleet];
-    match tests(&image)?.args(reported).interactive().code()? {
+    match tests(board, &image)?.args(reported).interactive().code()? {
         Some(0) => Ok(ExitCode::SUCCESS),
         Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
         Some(_) => bail!("the session ended, for the reason above"),

@@ -23,9 +23,9 @@ const DOCUMENT: Document = Document { file: "docs/sizes.md", command: "cargo xta
 pub(crate) fn sizes(board: Option<&str>, json: Option<&Path>, write: bool) -> Result<ExitCode> {
     json.map_or(Ok(()), files::can_write)?;
     let board = board.map(boards::find).transpose()?;
-    let rows = board.map_or_else(measured, of_board)?;
+    let rows = board.map_or_else(|| measured(|_| true), of_board)?;
     println!("{}", table(&rows));
-    println!("The stack is measured on the emulated board only; the others were linked, and not run.");
+    println!("The stack is measured on emulated boards only; the others were linked, and not run.");
     if board.is_none() {
         print_resources()?;
     }
@@ -47,12 +47,17 @@ pub(crate) fn check() -> Outcome {
     if let Err(reason) = BOARDS.iter().try_for_each(|board| install::rust_target(board.target)) {
         return Outcome::Skipped(reason);
     }
-    measured().and_then(|rows| DOCUMENT.check(&rows)).into()
+    measured(|board| board.by_default).and_then(|rows| DOCUMENT.check(&rows)).into()
 }
 
-fn measured() -> Result<Vec<Row>> {
+/// The same for one board.
+pub(super) fn check_board(name: &str) -> Result<()> {
+    DOCUMENT.check(&of_board(boards::find(name)?)?)
+}
+
+fn measured(of: impl Fn(&Board) -> bool) -> Result<Vec<Row>> {
     let mut rows = Vec::new();
-    for board in BOARDS.iter() {
+    for board in BOARDS.iter().filter(|board| of(board)) {
         if board.has_radio && std::env::var_os(RADIO).is_none() {
             println!("{} is left out: {RADIO} does not say where its radio's files are", board.name);
             continue;
@@ -69,7 +74,7 @@ fn of_board(board: &'static Board) -> Result<Vec<Row>> {
         let path = board.build(image)?;
         // A board tells by its logs how deep its stack has been. There is no load for a vehicle of the warehouse.
         let has_load = image.has_logs && image.program != boards::WAREHOUSE.program;
-        let stack = if board.name == TESTED && has_load { stack(&path, image)? } else { None };
+        let stack = if board.is_emulated() && has_load { stack(board, &path, image)? } else { None };
         found.push((image, footprint(&path)?, stack));
     }
     let row = |(image, footprint, stack): &(&Image, Footprint, Option<u64>)| {
@@ -89,14 +94,14 @@ fn of_board(board: &'static Board) -> Result<Vec<Row>> {
 }
 
 /// The deepest stack under load; none, with the reason printed, where nothing can be run.
-fn stack(path: &Path, image: &Image) -> Result<Option<u64>> {
+fn stack(board: &Board, path: &Path, image: &Image) -> Result<Option<u64>> {
     if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
         println!("warning: no stack is measured: {reason}");
         return Ok(None);
     }
     let insecure = (!image.is_secured).then_some("--insecure");
     let load = if image.name == boards::FIXED.name { image.name } else { image.program };
-    let (code, output) = tests(path)?.args(insecure).args(["stack", load]).output()?;
+    let (code, output) = tests(board, path)?.args(insecure).args(["stack", load]).output()?;
     match code {
         Some(0) => {}
         Some(NOT_ALLOWED) => {
