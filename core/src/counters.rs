@@ -15,10 +15,16 @@ pub trait Counter: Copy + 'static {
     fn help(self) -> &'static str;
 }
 
+/// A counter in memory. On a microcontroller it has half the bytes, and stops at 4 billion.
+#[cfg(not(target_os = "none"))]
+type Value = u64;
+#[cfg(target_os = "none")]
+type Value = u32;
+
 /// A set of counters, all zero at first. `N` is the enum's `COUNT`.
 #[derive(Clone)]
 pub struct Counters<C, const N: usize> {
-    values: [u64; N],
+    values: [Value; N],
     kind: PhantomData<C>,
 }
 
@@ -29,10 +35,11 @@ impl<C: Counter, const N: usize> Counters<C, N> {
     }
 
     /// Adds `count`; saturates.
+    #[allow(clippy::unnecessary_fallible_conversions, reason = "on a microcontroller it can fail")]
     #[cfg_attr(target_os = "none", inline(never))]
     pub fn add(&mut self, counter: C, count: u64) {
         if let Some(value) = self.values.get_mut(counter.index()) {
-            *value = value.saturating_add(count);
+            *value = value.saturating_add(Value::try_from(count).unwrap_or(Value::MAX));
         }
     }
 
@@ -45,8 +52,9 @@ impl<C: Counter, const N: usize> Counters<C, N> {
     }
 
     /// The value of one counter.
+    #[allow(clippy::useless_conversion, reason = "it is one on a microcontroller")]
     pub fn value(&self, counter: C) -> u64 {
-        self.values.get(counter.index()).copied().unwrap_or(0)
+        self.values.get(counter.index()).map_or(0, |value| u64::from(*value))
     }
 
     /// All names and values, zeros included.
@@ -104,3 +112,18 @@ macro_rules! counters {
 }
 
 pub(crate) use counters;
+
+#[cfg(test)]
+mod tests {
+    use super::{Counters, Value};
+    use crate::host::connections::LinkCounter;
+
+    #[test]
+    fn a_counter_stops_at_its_end() {
+        let mut counters = Counters::<LinkCounter, { LinkCounter::COUNT }>::new();
+        counters.add(LinkCounter::BytesReceived, u64::MAX);
+        counters.count(LinkCounter::BytesReceived);
+        counters.merge(&counters.clone());
+        assert_eq!(counters.value(LinkCounter::BytesReceived), Value::MAX);
+    }
+}
