@@ -75,6 +75,11 @@ impl Entry {
         self.place != Place::Instant
     }
 
+    /// Whether it is an action at once that the vehicle does, and not the gateway.
+    pub fn is_of_vehicle_at_once(&self) -> bool {
+        self.place == Place::Instant && self.is_triggered
+    }
+
     /// Whether it runs on the vehicle, or may.
     pub const fn runs(&self) -> bool {
         self.number != 0 && !self.status.has_ended()

@@ -167,12 +167,23 @@ impl Config {
             ensure!(is_level(level, false), "{level:?} cannot be a level of a topic");
         }
         ensure!(!vehicle.is_empty(), "there is no vehicle");
-        let mut serial_numbers = BTreeSet::new();
+        let (mut serial_numbers, mut units) = (BTreeSet::new(), BTreeSet::new());
         for vehicle in vehicle {
+            ensure!(
+                units.insert((&vehicle.name, vehicle.id)),
+                "vehicle {}/{} is there twice",
+                vehicle.name,
+                vehicle.id
+            );
             let serial = &vehicle.serial_number;
             ensure!(is_level(serial, true), "serial number {serial:?} has other characters than A-Z a-z 0-9 _ . : -");
             ensure!(serial_numbers.insert(serial), "serial number {serial} is there twice");
         }
+        let names = self.capabilities.actions.keys().chain(&self.capabilities.maps);
+        ensure!(
+            names.into_iter().all(|name| name.len() <= ID_BYTES),
+            "names of actions and maps have 64 bytes at most"
+        );
         let seconds = [vda5050.state_every, vda5050.state_interval, vda5050.visualization_every, vda5050.oldest];
         ensure!(seconds.iter().all(|seconds| (0.0..1e6).contains(seconds)), "intervals are from 0 to 1,000,000 s");
         ensure!((1.0..=30.0).contains(&vda5050.state_every), "state_every is from 1 to 30 s (6.10)");
@@ -227,6 +238,7 @@ impl Config {
         (limits.max_string_lens.id_len, limits.max_string_lens.enum_len) =
             (Some(ID_BYTES as u32), Some(ID_BYTES as u32));
         let nodes = u32::try_from(can.max_nodes).unwrap_or(u32::MAX);
+        limits.max_string_lens.msg_len = Some(crate::mqtt::LARGEST as u32);
         let lens = &mut limits.max_array_lens;
         (lens.order_nodes, lens.order_edges) = (Some(nodes), Some(nodes.saturating_sub(1)));
         limits.timing.min_state_interval = self.vda5050.state_interval;

@@ -11,6 +11,8 @@ use crate::state::{Command, Failure, Status};
 const ASKED_BUSY: Duration = Duration::from_millis(100);
 /// And while it is idle.
 const ASKED_IDLE: Duration = Duration::from_millis(500);
+/// A vehicle that has not said for so long how it is counts as lost, though its link lives.
+const SILENT: Duration = Duration::from_secs(2);
 
 /// The side to the vehicle.
 pub trait Vehicle {
@@ -29,13 +31,16 @@ pub struct Driver<V, K> {
     record: K,
     is_kept: bool,
     asked: Option<Duration>,
+    answered: Duration,
+    is_silent: bool,
     failed: Option<String>,
 }
 
 impl<V: Vehicle, K: Keep> Driver<V, K> {
     /// Nothing is asked or told yet.
     pub const fn new(machine: Machine, vehicle: V, record: K) -> Self {
-        Self { machine, vehicle, record, is_kept: true, asked: None, failed: None }
+        let (asked, answered, is_silent, failed) = (None, Duration::ZERO, false, None);
+        Self { machine, vehicle, record, is_kept: true, asked, answered, is_silent, failed }
     }
 
     /// The side to the vehicle.
@@ -46,21 +51,36 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
     /// Asks the vehicle if that is due, and tells it what follows. After an error nothing was told that is not on disk, and no
     /// state may be published.
     pub fn turn(&mut self, now: Duration) -> io::Result<()> {
+        if self.machine.must_halt(now) {
+            self.tell(&Command::Halt, now);
+        }
         self.ask(now);
         self.keep()?;
         while let Some(command) = self.machine.next(now) {
-            self.keep()?;
-            let answer = self.vehicle.tell(&command);
-            let failed = answer.is_err();
-            self.failed = answer.as_ref().err().map(|failure| format!("{}: {failure}", command.word()));
-            self.machine.answered(&command, answer, now);
-            // What it does now is asked at once.
-            self.asked = None;
-            if failed {
+            if command != Command::Halt {
+                self.keep()?;
+            }
+            if !self.tell(&command, now) {
                 break;
             }
         }
         self.keep()
+    }
+
+    /// Whether the vehicle has done it.
+    fn tell(&mut self, command: &Command, now: Duration) -> bool {
+        let answer = self.vehicle.tell(command);
+        let is_done = answer.is_ok();
+        self.failed = answer.as_ref().err().map(|failure| format!("{}: {failure}", command.word()));
+        self.machine.answered(command, answer, now);
+        // What it does now is asked at once.
+        self.asked = None;
+        is_done
+    }
+
+    /// Whether the vehicle does not say how it is, though its link lives: nothing may be renewed that nobody watches.
+    pub const fn is_silent(&self) -> bool {
+        self.is_silent
     }
 
     /// Why the vehicle did not do what it was told last, if so.
@@ -85,10 +105,20 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
         }
         self.asked = Some(now);
         match self.vehicle.status() {
-            Ok(Some(status)) => self.machine.status(status),
-            Ok(None) => self.machine.vehicle_lost(),
-            // It is asked again; without a link it has stopped by itself.
-            Err(_) => {}
+            Ok(Some(status)) => {
+                (self.answered, self.is_silent) = (now, false);
+                self.machine.status(status);
+            }
+            Ok(None) => {
+                (self.answered, self.is_silent) = (now, false);
+                self.machine.vehicle_lost();
+            }
+            // It is asked again.
+            Err(_) if now.saturating_sub(self.answered) < SILENT => {}
+            Err(_) => {
+                self.is_silent = true;
+                self.machine.vehicle_lost();
+            }
         }
     }
 }

@@ -20,6 +20,8 @@ pub enum Kind {
     Action,
     /// The vehicle's drive is stopped and waits for a reset. The standard has no name for it.
     VehicleStopped,
+    /// The gateway cannot read the vehicle's record. The standard has no name for it.
+    OutOfService,
     /// The order's end was not reached while the broker was away, by the configured limit. The standard has no name for it.
     BrokerLost,
 }
@@ -34,13 +36,14 @@ impl Kind {
             Self::NoOrderToCancel => "noOrderToCancel",
             Self::Action => "actionError",
             Self::VehicleStopped => "vehicleStopped",
+            Self::OutOfService => "outOfService",
             Self::BrokerLost => "brokerLost",
         }
     }
 
     const fn level(self) -> ErrorLevel {
         match self {
-            Self::VehicleStopped => ErrorLevel::Fatal,
+            Self::VehicleStopped | Self::OutOfService => ErrorLevel::Fatal,
             _ => ErrorLevel::Warning,
         }
     }

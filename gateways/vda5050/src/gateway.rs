@@ -1,6 +1,6 @@
 //! One vehicle between its master and CARA: a thread with the vehicle's machine, its link and its client of the broker.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant, SystemTime};
@@ -17,7 +17,7 @@ use crate::machine::{Machine, Topic};
 use crate::message::{
     Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State, Visualization, read,
 };
-use crate::mqtt::{Heard, Link, Place};
+use crate::mqtt::{HEARD, Heard, Link, Place};
 use crate::record::Store;
 use crate::vehicle::Linked;
 
@@ -27,6 +27,8 @@ const TURN: Duration = Duration::from_millis(20);
 const HEART: Duration = Duration::from_millis(crate::vehicle::LEASE_MS / 2);
 /// What is sent last waits so long for its acknowledgement.
 const LAST_WORDS: Duration = Duration::from_secs(2);
+/// A record that could not be read is tried so often.
+const TRIED_AGAIN: Duration = Duration::from_secs(2);
 
 /// Whether the program ends, for all its threads.
 #[derive(Debug, Default)]
@@ -39,13 +41,15 @@ pub struct End {
 
 /// Runs one vehicle until `end`.
 pub fn run(config: &Config, vehicle: &config::Vehicle, system: &CommunicationSystem, end: &End) -> Result<()> {
-    let mut gateway = Gateway::start(config, vehicle, system)?;
     while !end.is_due.load(Ordering::SeqCst) {
-        let turn = Instant::now();
-        gateway.turn();
-        std::thread::sleep(TURN.saturating_sub(turn.elapsed()));
+        let mut gateway = Gateway::start(config, vehicle, system)?;
+        while !end.is_due.load(Ordering::SeqCst) && !gateway.is_mended() {
+            let turn = Instant::now();
+            gateway.turn();
+            std::thread::sleep(TURN.saturating_sub(turn.elapsed()));
+        }
+        gateway.stop(end.is_silent.load(Ordering::SeqCst));
     }
-    gateway.stop(end.is_silent.load(Ordering::SeqCst));
     Ok(())
 }
 
@@ -53,6 +57,7 @@ struct Gateway {
     config: Config,
     serial_number: String,
     prefix: String,
+    folder: PathBuf,
     factsheet: Factsheet,
     driver: Driver<Linked, Store>,
     link: Link,
@@ -66,8 +71,11 @@ struct Gateway {
     /// The header id of that, and whether it has come back.
     said: u32,
     is_echoed: bool,
-    /// Why the vehicle did not do something, as it was logged.
+    /// Why the vehicle did not do something, as it was logged, and why there is no broker.
     failed: Option<String>,
+    lost: Option<String>,
+    /// Of a vehicle whose record cannot be read: when it was tried last.
+    tried: Option<Instant>,
     reported: Option<(Report, Instant)>,
     visualized: Instant,
     /// Header id of the next last will.
@@ -79,8 +87,18 @@ impl Gateway {
         let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
         let peer = system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;
         let folder = config.manager.state_folder.join("vda5050");
-        let (store, record) = Store::open(&folder, &vehicle.serial_number)?;
-        let machine = Machine::new(record, config.policy(), Duration::ZERO);
+        let (store, machine) = match Store::open(&folder, &vehicle.serial_number) {
+            Ok((store, record)) => (store, Machine::new(record, config.policy(), Duration::ZERO)),
+            Err(error) => {
+                eprintln!(
+                    "{}: out of service until its record is mended or moved away: {error}",
+                    vehicle.serial_number
+                );
+                let machine = Machine::out_of_service(&error.to_string(), config.policy(), Duration::ZERO);
+                (Store::nowhere(), machine)
+            }
+        };
+        let tried = machine.is_out_of_service().then(Instant::now);
         let driver = Driver::new(machine, Linked::new(peer, system.heart(HEART)), store);
         let prefix = config.prefix(vehicle);
         let will = Arc::new(AtomicU32::new(0));
@@ -112,21 +130,37 @@ impl Gateway {
             said: 0,
             is_echoed: false,
             failed: None,
+            lost: None,
+            tried,
+            folder,
             reported: None,
             visualized: now,
             will,
         })
     }
 
+    /// Whether the record of a vehicle that was out of service can be read again.
+    fn is_mended(&mut self) -> bool {
+        let Some(tried) = &mut self.tried else { return false };
+        if tried.elapsed() < TRIED_AGAIN {
+            return false;
+        }
+        *tried = Instant::now();
+        Store::open(&self.folder, &self.serial_number).is_ok()
+    }
+
     fn turn(&mut self) {
         self.driver.vehicle_mut().beat();
-        while let Ok(heard) = self.link.heard.try_recv() {
+        // However many come, the vehicle has its turn.
+        for _ in 0..HEARD {
+            let Ok(heard) = self.link.heard.try_recv() else { break };
             self.hear(heard);
         }
         self.probe();
         let now = self.began.elapsed();
         let turned = self.driver.turn(now);
-        self.driver.vehicle_mut().give_up(turned.is_err());
+        let is_watched = turned.is_ok() && !self.driver.is_silent();
+        self.driver.vehicle_mut().give_up(!is_watched);
         if let Err(error) = turned {
             // Nothing is said that would not be known after a restart.
             eprintln!("{}: the record cannot be written: {error}", self.serial_number);
@@ -156,8 +190,10 @@ impl Gateway {
                 let _ = self.send_factsheet();
             }
             Heard::Lost(why) => {
-                if self.client.take().is_some() {
+                let was_there = self.client.take().is_some();
+                if was_there || self.lost.as_ref() != Some(&why) {
                     eprintln!("{}: the broker is away: {why}", self.serial_number);
+                    self.lost = Some(why);
                 }
                 self.broker(false);
             }
@@ -395,7 +431,6 @@ pub fn system(config: &Config) -> Result<CommunicationSystem> {
 
 /// Looks at all that a start needs, and changes nothing: the file, the factsheet, the keys, TLS, and the records.
 pub fn check(config: &Config) -> Result<()> {
-    config.factsheet()?;
     crate::mqtt::tls(&config.broker)?;
     let folder = config.manager.state_folder.join("vda5050");
     for vehicle in &config.vehicle {
@@ -403,7 +438,12 @@ pub fn check(config: &Config) -> Result<()> {
             Store::open(Path::new(&folder), &vehicle.serial_number)?;
         }
     }
-    let system = system(config)?;
+    check_vehicles(config, &system(config)?)
+}
+
+/// What no vehicle can do without.
+pub fn check_vehicles(config: &Config, system: &CommunicationSystem) -> Result<()> {
+    config.factsheet()?;
     for vehicle in &config.vehicle {
         let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
         system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;

@@ -7,8 +7,10 @@ use std::time::Duration;
 
 use crate::actions::{Entry, Place, block_driving, startable};
 use crate::errors::{Kind, Refusal};
-use crate::message::{Action, ActionScope, ActionStatus, EStop, InstantActions, OperatingMode, Order, Report};
-use crate::order::{Held, Verdict, judge, performable};
+use crate::message::{
+    Action, ActionScope, ActionStatus, BlockingType, EStop, InstantActions, OperatingMode, Order, Report,
+};
+use crate::order::{Held, ID_BYTES, PARAMETER_BYTES, Verdict, judge, parameters, performable};
 use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status, copy_of};
 
 /// Most errors that are reported at a time; the oldest go.
@@ -53,6 +55,8 @@ pub struct Machine {
     is_held: bool,
     is_report_due: bool,
     is_factsheet_due: bool,
+    /// Why nothing is done with this vehicle, if so.
+    out_of_service: Option<String>,
 }
 
 impl Machine {
@@ -73,7 +77,18 @@ impl Machine {
             is_held: false,
             is_report_due: true,
             is_factsheet_due: false,
+            out_of_service: None,
         }
+    }
+
+    /// One whose record cannot be read: the vehicle is shown in mode SERVICE with a FATAL error, as nobody knows what it has driven.
+    pub fn out_of_service(why: &str, policy: Policy, now: Duration) -> Self {
+        Self { out_of_service: Some(why.to_owned()), ..Self::new(Record::default(), policy, now) }
+    }
+
+    /// Whether it was made so.
+    pub const fn is_out_of_service(&self) -> bool {
+        self.out_of_service.is_some()
     }
 
     /// What is to be kept.
@@ -171,14 +186,19 @@ impl Machine {
             return refused("the order was replaced by a later one");
         }
         if verdict != Verdict::Duplicate {
-            self.is_new(order, verdict)?;
+            self.has_space(order, verdict)?;
         }
         Ok(verdict)
     }
 
-    /// Actions' ids are used once, and their number is bounded. An update sends its first node again.
-    fn is_new(&self, order: &Order, verdict: Verdict) -> Result<(), Refusal> {
+    /// Actions' ids are used once, and what is held is bounded over all updates. An update sends its first node again.
+    fn has_space(&self, order: &Order, verdict: Verdict) -> Result<(), Refusal> {
         let skipped = usize::from(verdict == Verdict::Update);
+        let base = self.record.nodes.iter().filter(|node| node.released && verdict == Verdict::Update).count();
+        let nodes = base + order.nodes.len() - skipped;
+        if nodes > self.policy.can.max_nodes {
+            return Err(Refusal::new(Kind::Order, "too many nodes with those that are left").about("nodes", nodes));
+        }
         let nodes = order.nodes.iter().skip(skipped).flat_map(|node| &node.actions);
         let sent: Vec<&Action> = nodes.chain(order.edges.iter().flat_map(|edge| &edge.actions)).collect();
         let stays = |entry: &&Entry| verdict == Verdict::Update && !self.is_in_horizon(entry.place);
@@ -295,6 +315,11 @@ impl Machine {
     pub fn instant_actions(&mut self, message: InstantActions) {
         let stamp = format!("{} {}", message.header.header_id, message.header.timestamp);
         for action in message.actions {
+            if action.action_id.len() > ID_BYTES || parameters(&action).len() > PARAMETER_BYTES {
+                let refusal = Refusal::new(Kind::Validation, "the action's id or its parameters are too long");
+                self.refuse(&refusal.about("topic", "instantActions").about("actionType", &action.action_type));
+                continue;
+            }
             if !self.is_due(&action, &stamp) {
                 continue;
             }
@@ -402,16 +427,23 @@ impl Machine {
 
     fn give_up_order(&mut self, why: &str) {
         self.record.is_cancelled = true;
-        for entry in self.record.actions.iter_mut().filter(|entry| entry.is_of_order()) {
+        self.give_up_actions(why, Entry::is_of_order);
+        self.has_changed = true;
+    }
+
+    /// What waits fails, what runs is ended where that can be.
+    fn give_up_actions(&mut self, why: &str, which: impl Fn(&Entry) -> bool) {
+        for entry in self.record.actions.iter_mut().filter(|entry| which(entry)) {
             let kind = self.policy.can.actions.get(&entry.action.action_type);
             if entry.status.has_ended() {
             } else if entry.number == 0 {
                 entry.end(ActionStatus::Failed, Some(why.into()));
-            } else if kind.is_none_or(|kind| kind.can_be_cancelled) {
+                self.has_changed = true;
+            } else if entry.ends_as.is_none() && kind.is_none_or(|kind| kind.can_be_cancelled) {
                 entry.ends_as = Some(ActionStatus::Failed);
+                self.has_changed = true;
             }
         }
-        self.has_changed = true;
     }
 
     /// Ends what waits for the vehicle to stand: `cancelOrder` and `startPause`.
@@ -420,8 +452,13 @@ impl Machine {
         let is_controlled = is_controlled(status.mode);
         // What is driven by hand moves, and has no order all the same.
         let stands = (!status.is_driving || !is_controlled) && !self.is_drive_sent && !self.is_halt_due;
-        if !is_controlled && !self.record.is_cancelled && self.record.is_order_open() {
-            self.give_up_order("the vehicle is not in an automatic mode");
+        if !is_controlled {
+            let why = "the vehicle is not in an automatic mode";
+            if !self.record.is_cancelled && self.record.is_order_open() {
+                self.give_up_order(why);
+            }
+            // Nothing begins beside somebody who works at the vehicle.
+            self.give_up_actions(why, Entry::is_of_vehicle_at_once);
         }
         let is_cancelling = self.record.is_cancelled;
         if !stands {
@@ -462,7 +499,13 @@ impl Machine {
     }
 
     /// The vehicle has said how it is. The first status of a link says what has become of what the link before had begun.
-    pub fn status(&mut self, status: Status) {
+    pub fn status(&mut self, mut status: Status) {
+        if self.out_of_service.is_some() {
+            status.mode = OperatingMode::Service;
+        }
+        if self.status.is_none() {
+            self.fail_what_is_late();
+        }
         let floor = status.drive.max(status.action);
         if floor > self.record.number {
             // The record is older than what the vehicle has been told.
@@ -479,6 +522,17 @@ impl Machine {
         }
         self.status = Some(status);
         self.settle();
+    }
+
+    /// Actions at once that had not begun when the link was lost, or the program ended: they were wanted then, not now.
+    fn fail_what_is_late(&mut self) {
+        for index in 0..self.record.actions.len() {
+            let entry = &self.record.actions[index];
+            let is_position = entry.action.action_type == "initPosition" && !entry.is_of_order();
+            if !entry.status.has_ended() && entry.number == 0 && (is_position || entry.is_of_vehicle_at_once()) {
+                self.end(index, ActionStatus::Failed, "the vehicle was lost before it began", false);
+            }
+        }
     }
 
     /// What a status says of an action.
@@ -571,39 +625,57 @@ impl Machine {
         }
     }
 
-    /// What the vehicle is to be told now, if anything. The record is to be written before.
-    pub fn next(&mut self, now: Duration) -> Option<Command> {
+    /// Whether the vehicle is to stop now. That needs no record: neither a disk nor a question to the vehicle may come before it.
+    pub fn must_halt(&mut self, now: Duration) -> bool {
         self.hold(now);
-        let status = self.status.as_ref()?;
-        let boot = status.boot;
-        let is_able = is_controlled(status.mode) && status.e_stop == EStop::None && status.stopped.is_none();
-        let may_drive = is_able && !self.record.is_paused && !self.is_held && !self.record.is_cancelled;
-        if self.is_drive_sent && !may_drive {
+        if self.status.is_none() {
+            return false;
+        }
+        if self.is_drive_sent && !self.may_drive() {
             self.is_drive_sent = false;
             self.is_halt_due = true;
         }
-        if self.is_halt_due {
+        self.is_halt_due
+    }
+
+    /// The master is in control, and nothing has stopped the vehicle.
+    fn is_able(&self) -> bool {
+        let able =
+            |status: &Status| is_controlled(status.mode) && status.e_stop == EStop::None && status.stopped.is_none();
+        self.status.as_ref().is_some_and(able)
+    }
+
+    fn may_drive(&self) -> bool {
+        let is_stopped = self.record.is_paused || self.is_held || self.record.is_cancelled;
+        self.is_able() && !is_stopped && !block_driving(&self.record.actions)
+    }
+
+    /// What the vehicle is to be told now, if anything. The record is to be written before.
+    pub fn next(&mut self, now: Duration) -> Option<Command> {
+        if self.must_halt(now) {
             return Some(Command::Halt);
         }
+        let boot = self.status.as_ref()?.boot;
         if now < self.retry_at {
             return None;
         }
         if let Some(command) = self.next_action(boot) {
             return Some(command);
         }
-        if !may_drive || self.is_drive_sent {
+        if !self.may_drive() || self.is_drive_sent {
             return None;
         }
         self.next_drive(boot)
     }
 
     fn next_action(&mut self, boot: u64) -> Option<Command> {
+        let is_able = self.is_able();
         for entry in &mut self.record.actions {
             if entry.ends_as.is_some() && entry.runs() && !entry.is_end_sent {
                 entry.is_end_sent = true;
                 return Some(Command::EndAction { number: entry.number });
             }
-            if entry.runs() && entry.ends_as.is_none() && !entry.is_sent {
+            if is_able && entry.runs() && entry.ends_as.is_none() && !entry.is_sent {
                 entry.is_sent = true;
                 return Some(Command::Act { number: entry.number, action: entry.action.clone() });
             }
@@ -613,10 +685,15 @@ impl Machine {
                 return Some(Command::InitPosition { action: entry.action.clone() });
             }
         }
-        if self.record.is_paused || self.is_held {
+        if !is_able || self.record.is_paused || self.is_held {
             return None;
         }
         let index = startable(&self.record.actions, self.policy.actions_at_once)?;
+        let moves = self.is_drive_sent || self.status.as_ref().is_none_or(|status| status.is_driving);
+        if moves && self.record.actions[index].action.blocking_type != BlockingType::None {
+            // The vehicle stops for it first.
+            return None;
+        }
         self.record.number += 1;
         self.has_changed = true;
         let entry = &mut self.record.actions[index];
@@ -627,7 +704,7 @@ impl Machine {
 
     fn next_drive(&mut self, boot: u64) -> Option<Command> {
         let (edge, node) = (self.record.edges.first()?, self.record.nodes.first()?);
-        if !edge.released || !node.released || block_driving(&self.record.actions) {
+        if !edge.released || !node.released {
             return None;
         }
         let (edge, node) = (Box::new(edge.clone()), Box::new(node.clone()));
@@ -708,7 +785,9 @@ impl Machine {
 
     /// The state without its header; `None` while the vehicle is not linked, as nothing is known then.
     pub fn report(&self) -> Option<Report> {
-        self.status.as_ref().map(|status| self.record.report(status, &self.policy.can.maps, self.is_held))
+        let mut report = self.record.report(self.status.as_ref()?, &self.policy.can.maps, self.is_held);
+        report.errors.extend(self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why).error()));
+        Some(report)
     }
 }
 

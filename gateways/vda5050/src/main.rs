@@ -1,8 +1,10 @@
 //! `cara-vda5050`: vehicles of CARA under VDA 5050.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use cara_std::{StartError, UnitEvent};
@@ -24,6 +26,9 @@ struct Options {
 /// Exit code for a configuration that cannot be used, as no restart mends it.
 const WRONG_FILE: u8 = 2;
 
+/// A vehicle's loop that has failed is begun anew after so long.
+const BEGUN_ANEW: Duration = Duration::from_secs(2);
+
 static END: End = End { is_due: AtomicBool::new(false), is_silent: AtomicBool::new(false) };
 
 fn main() -> Result<ExitCode> {
@@ -41,6 +46,7 @@ fn main() -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let system = gateway::system(&config)?;
+    gateway::check_vehicles(&config, &system)?;
     let events = system.events();
     system.start()?;
     ctrlc::set_handler(|| END.is_due.store(true, Ordering::SeqCst)).context("cannot take signals")?;
@@ -48,15 +54,20 @@ fn main() -> Result<ExitCode> {
         for vehicle in &config.vehicle {
             let (config, system) = (&config, &system);
             std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
-                if let Err(error) = gateway::run(config, vehicle, system, &END) {
-                    eprintln!("{}: {error:#}", vehicle.serial_number);
-                    END.is_due.store(true, Ordering::SeqCst);
+                // What ends one vehicle's loop is no reason to stop the others: it stops by its lease, and is begun anew.
+                while !END.is_due.load(Ordering::SeqCst) {
+                    match catch_unwind(AssertUnwindSafe(|| gateway::run(config, vehicle, system, &END))) {
+                        Ok(Ok(())) => return,
+                        Ok(Err(error)) => eprintln!("{}: {error:#}", vehicle.serial_number),
+                        Err(_) => eprintln!("{}: its loop has panicked", vehicle.serial_number),
+                    }
+                    std::thread::sleep(BEGUN_ANEW);
                 }
             })?;
         }
         println!("up with {} vehicles", config.vehicle.len());
         while !END.is_due.load(Ordering::SeqCst) {
-            let event = events.recv_timeout(std::time::Duration::from_millis(200));
+            let event = events.recv_timeout(Duration::from_millis(200));
             // Another gateway speaks for these vehicles now: this one says nothing more.
             if matches!(event, Ok(UnitEvent::Fenced { .. })) {
                 END.is_silent.store(true, Ordering::SeqCst);

@@ -133,9 +133,16 @@ impl ActionStatus {
     }
 }
 
-/// Reads a message, with the names that 2.0's schemas have instead of the document's.
+/// The most bytes of a text in a message, but for the values of an action's parameters.
+const TEXT_BYTES: usize = 1_024;
+
+/// Reads a message, with the names that 2.0's schemas have instead of the document's. Texts of it are kept and reported: their length
+/// is bounded.
 pub fn read<T: DeserializeOwned>(text: &[u8]) -> Result<T, serde_json::Error> {
     let mut value: Value = serde_json::from_slice(text)?;
+    if has_long_text(&value) {
+        return Err(serde::de::Error::custom("a text is longer than 1,024 bytes"));
+    }
     each_object(&mut value, &mut |object| {
         for (schema, document) in [("actionName", "actionType"), ("allowedDeviationXy", "allowedDeviationXY")] {
             if let Some(old) = object.remove(schema) {
@@ -144,6 +151,15 @@ pub fn read<T: DeserializeOwned>(text: &[u8]) -> Result<T, serde_json::Error> {
         }
     });
     serde_json::from_value(value)
+}
+
+fn has_long_text(value: &Value) -> bool {
+    match value {
+        Value::String(text) => text.len() > TEXT_BYTES,
+        Value::Array(values) => values.iter().any(has_long_text),
+        Value::Object(object) => object.iter().any(|(key, value)| *key != "value" && has_long_text(value)),
+        _ => false,
+    }
 }
 
 fn each_object(value: &mut Value, change: &mut impl FnMut(&mut Map<String, Value>)) {

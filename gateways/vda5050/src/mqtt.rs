@@ -17,9 +17,13 @@ use rustls::{ClientConfig, RootCertStore};
 use crate::config;
 
 /// The largest message that is read, in bytes.
-const LARGEST: usize = 512 * 1024;
-/// Messages that wait to be sent, and those that wait to be looked at.
+pub const LARGEST: usize = 512 * 1024;
+/// The largest that is sent: a state has all nodes and actions that are left, which came in many messages.
+const LARGEST_SENT: usize = 16 * 1024 * 1024;
+/// Messages that wait to be sent.
 const WAITING: usize = 256;
+/// Messages that wait to be looked at: as many are looked at in one turn of the loop.
+pub const HEARD: usize = 16;
 /// Between two attempts to connect.
 const BACK_OFF: Duration = Duration::from_secs(1);
 
@@ -57,7 +61,7 @@ pub struct Link {
 impl Link {
     /// Starts it.
     pub fn start(place: Place) -> Result<Self> {
-        let (sender, heard) = sync_channel(WAITING);
+        let (sender, heard) = sync_channel(HEARD);
         let ends = Arc::new(AtomicBool::new(false));
         let ended = ends.clone();
         std::thread::Builder::new().name(format!("mqtt {}", place.client_id)).spawn(move || {
@@ -87,9 +91,14 @@ impl Drop for Link {
 /// One connection, until it ends.
 fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
     let (client, mut connection) = Client::new(options(place)?, WAITING);
+    // Who listens holds the only one then: when that goes, the connection ends without a farewell, and the last will is sent.
+    let mut client = Some(client);
     for event in connection.iter() {
         let heard = match event? {
-            Event::Incoming(Packet::ConnAck(_)) => Heard::Connected(client.clone()),
+            Event::Incoming(Packet::ConnAck(_)) => match client.take() {
+                Some(client) => Heard::Connected(client),
+                None => continue,
+            },
             Event::Incoming(Packet::PubAck(_)) => Heard::Acknowledged,
             Event::Incoming(Packet::Publish(message)) => {
                 let topic = message.topic.strip_prefix(&place.prefix).and_then(|topic| topic.strip_prefix('/'));
@@ -109,7 +118,7 @@ fn options(place: &Place) -> Result<MqttOptions> {
     let Place { broker, client_id, prefix, will } = place;
     let mut options = MqttOptions::new(client_id, &broker.host, broker.port);
     options.set_keep_alive(Duration::from_secs(broker.keep_alive.into()));
-    options.set_clean_session(true).set_max_packet_size(LARGEST, LARGEST);
+    options.set_clean_session(true).set_max_packet_size(LARGEST, LARGEST_SENT);
     options.set_last_will(LastWill::new(format!("{prefix}/connection"), will(), QoS::AtLeastOnce, true));
     if let Some(user) = &broker.user {
         let password = match &broker.password_file {

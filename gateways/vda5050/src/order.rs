@@ -194,6 +194,9 @@ fn executable(order: &Order, can: &Capabilities) -> Result<(), Refusal> {
     if order.nodes.len() > can.max_nodes {
         return Err(wrong("too many nodes").about("nodes", order.nodes.len()));
     }
+    for id in [&order.order_id].into_iter().chain(&order.zone_set_id) {
+        fits(id)?;
+    }
     for node in &order.nodes {
         let id = &node.node_id;
         fits(id).and_then(|()| positioned(node, can)).map_err(|refusal| refusal.about("nodeId", id))?;
@@ -240,8 +243,10 @@ fn actions(order: &Order) -> impl Iterator<Item = (&Action, ActionScope)> {
 }
 
 fn fits(id: &str) -> Result<(), Refusal> {
-    let fits = id.len() <= ID_BYTES;
-    fits.then_some(()).ok_or_else(|| Refusal::new(Kind::Order, "an identifier has 64 bytes at most"))
+    // Those of a stretch go to the vehicle as lines.
+    let fits = id.len() <= ID_BYTES && !id.contains(char::is_control);
+    fits.then_some(())
+        .ok_or_else(|| Refusal::new(Kind::Order, "an identifier has 64 bytes at most, and no control characters"))
 }
 
 fn positioned(node: &Node, can: &Capabilities) -> Result<(), Refusal> {

@@ -15,7 +15,8 @@ pub trait Keep {
 /// A file, which is replaced as a whole.
 #[derive(Debug)]
 pub struct Store {
-    file: PathBuf,
+    /// Without one nothing is kept.
+    file: Option<PathBuf>,
 }
 
 impl Store {
@@ -30,19 +31,25 @@ impl Store {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Record::default(),
             Err(error) => return Err(error),
         };
-        Ok((Self { file }, record))
+        Ok((Self { file: Some(file) }, record))
+    }
+
+    /// For a vehicle that is out of service, and has no record.
+    pub const fn nowhere() -> Self {
+        Self { file: None }
     }
 }
 
 impl Keep for Store {
     fn keep(&mut self, record: &Record) -> io::Result<()> {
-        let next = self.file.with_extension("next");
+        let Some(kept) = &self.file else { return Ok(()) };
+        let next = kept.with_extension("next");
         let mut file = OpenOptions::new().write(true).create(true).truncate(true).open(&next)?;
         file.write_all(&serde_json::to_vec(record)?)?;
         file.sync_all()?;
-        std::fs::rename(&next, &self.file)?;
+        std::fs::rename(&next, kept)?;
         // The rename is in the folder.
-        let folder = self.file.parent().unwrap_or(Path::new("."));
+        let folder = kept.parent().unwrap_or(Path::new("."));
         File::open(folder)?.sync_all()
     }
 }

@@ -8,7 +8,7 @@ use cara_std::{AnyCall, CallError, Error, Heart, Peer, RequestOptions, ServiceEr
 
 use crate::driver::Vehicle;
 use crate::message::{Action, ActionStatus, AgvPosition, BatteryState, EStop, Edge, Node, OperatingMode, Velocity};
-use crate::order::parameters;
+use crate::order::{ID_BYTES, parameters};
 use crate::state::{Command, Failure, Status};
 
 /// How long the vehicle moves on after the gateway's last sign that it wants it, in milliseconds.
@@ -240,7 +240,8 @@ fn initial(action: &Action) -> Result<([f64; 3], &str), Failure> {
         of_key.map(|parameter| &parameter.value).ok_or_else(|| Failure::Refused(format!("{key} is missing")))
     };
     let number = |key: &str| value(key)?.as_f64().ok_or_else(|| Failure::Refused(format!("{key} is no number")));
-    let map = value("mapId")?.as_str().ok_or_else(|| Failure::Refused("mapId is no text".into()))?;
+    let map = value("mapId")?.as_str().filter(|map| map.len() <= ID_BYTES);
+    let map = map.ok_or_else(|| Failure::Refused("mapId is no text of 64 bytes at most".into()))?;
     Ok(([number("x")?, number("y")?, number("theta")?], map))
 }
 

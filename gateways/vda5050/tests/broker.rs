@@ -465,6 +465,43 @@ fn a_record_that_cannot_be_written_stops_the_vehicle() {
     plant.wait_for_end("o1", "k");
 }
 
+/// One record that cannot be read is that vehicle's trouble alone, and mended without a restart.
+#[test]
+fn a_damaged_record_puts_its_vehicle_out_of_service() {
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    plant.kill_gateway();
+    let record = plant.folder.path().join("state/vda5050/0001.json");
+    std::fs::write(&record, "{\"order_id\": \"o").unwrap();
+    plant.start_gateway();
+    plant.wait_for("it is out of service", |plant| {
+        plant.has_error("outOfService") && plant.state()["operatingMode"] == "SERVICE"
+    });
+    plant.order("o1", 0, 0, "a! b!");
+    plant.wait_for("the order is refused", |plant| plant.has_error("orderError"));
+    assert_eq!(std::fs::read_to_string(&record).unwrap(), "{\"order_id\": \"o");
+    std::fs::rename(&record, record.with_extension("damaged")).unwrap();
+    plant.wait_for("it is mended", |plant| plant.state()["operatingMode"] == "AUTOMATIC");
+    plant.order("o2", 0, 0, "a! b!");
+    plant.wait_for_end("o2", "b");
+}
+
+/// A message of half a megabyte, whatever is in it, is not kept and not reported.
+#[test]
+fn large_messages_do_no_harm() {
+    let plant = Plant::start("{ do = \"stop\" }");
+    for index in 0..4 {
+        let id = format!("{index}{}", "o".repeat(300_000));
+        plant.order(&id, 0, 0, "a! b!");
+        plant.publish("instantActions", false, &instant("stateRequest", &id));
+    }
+    plant.wait_for("they are refused", |plant| plant.has_error("validationError"));
+    plant.order("o1", 0, 0, "a! b!");
+    plant.wait_for_end("o1", "b");
+    let longest = |(state, _): &(Value, bool)| state.to_string().len();
+    let longest = plant.heard.lock().unwrap()["state"].iter().map(longest).max();
+    assert!(longest < Some(10_000), "{longest:?}");
+}
+
 /// The gateway is killed while the vehicle drives and handles something.
 #[test]
 fn a_gateway_that_is_killed_stops_the_vehicle_and_goes_on_afterwards() {
@@ -621,6 +658,11 @@ fn the_example_is_checked_and_mistakes_are_named() {
         ("version = \"2.1.0\"", "version = \"3.0.0\"", "is not 2.0.x or 2.1.x"),
         ("manufacturer = \"KIT\"", "manufacturer = \"KIT/1\"", "level of a topic"),
         ("serial_number = \"0001\"", "serial_number = \"../1\"", "serial number"),
+        (
+            "[[vehicle]]",
+            "[[vehicle]]\nname = \"agv-1\"\nid = 101\nserial_number = \"2\"\n[[vehicle]]",
+            "agv-1/101 is there twice",
+        ),
         ("state_every = 10.0", "state_every = 40.0", "from 1 to 30 s"),
         ("state_every = 10.0", "state_evry = 10.0", "unknown field"),
         ("# ca_file", "certificate_file = \"x\" #", "go together"),

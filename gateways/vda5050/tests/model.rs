@@ -6,7 +6,7 @@ mod fake;
 use std::collections::BTreeMap;
 
 use cara_vda5050::machine::Machine;
-use cara_vda5050::message::{Action, ActionStatus, InstantActions, OperatingMode, Order};
+use cara_vda5050::message::{Action, ActionStatus, BlockingType, InstantActions, OperatingMode, Order};
 use cara_vda5050::state::{OnBrokerLoss, Policy, Record};
 use fake::{Pair, instant, order, policy};
 
@@ -111,7 +111,10 @@ impl World {
             6 => {
                 self.names += 1;
                 let kind = self.rng.choice(["cancelOrder", "startPause", "stopPause", "beep", "stateRequest"]).unwrap();
-                self.send(Sent::Instant(instant(kind, &format!("i{}", self.names))));
+                let mut message = instant(kind, &format!("i{}", self.names));
+                message.actions[0].blocking_type =
+                    self.rng.choice([BlockingType::None, BlockingType::Soft, BlockingType::Hard]).unwrap();
+                self.send(Sent::Instant(message));
             }
             7 => {
                 self.names += 1;

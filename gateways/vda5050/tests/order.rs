@@ -605,3 +605,126 @@ fn scopes_of_actions_are_kept() {
         assert_eq!(pair.errors().len(), expected, "{way}");
     }
 }
+
+/// An action at once that blocks driving stops the vehicle first.
+#[test]
+fn a_blocking_action_at_once_waits_until_the_vehicle_stands() {
+    for (blocking, stops) in [(BlockingType::None, false), (BlockingType::Soft, true), (BlockingType::Hard, true)] {
+        let mut pair = Pair::new("a");
+        pair.vehicle.steps = 6;
+        pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+        pair.turn();
+        let mut message = instant("beep", "i1");
+        message.actions[0].blocking_type = blocking;
+        pair.machine.instant_actions(message);
+        if stops {
+            let halt = pair.machine.next(pair.now).unwrap();
+            assert_eq!(halt, Command::Halt);
+            pair.machine.answered(&halt, pair.vehicle.command(&halt), pair.now);
+            assert_eq!(pair.machine.next(pair.now), None, "it has not said that it stands");
+            pair.machine.status(pair.vehicle.status.clone());
+        }
+        pair.turn();
+        assert_eq!(pair.vehicle.status.is_driving, !stops, "{blocking:?}");
+        pair.turns(30);
+        assert_eq!((pair.left().as_str(), pair.vehicle.began.len()), ("", 1), "{blocking:?}");
+        assert_eq!(pair.vehicle.reached.len(), 2, "the same drive goes on");
+    }
+}
+
+#[test]
+fn no_action_begins_where_the_vehicle_may_not_move() {
+    let stops: [fn(&mut Fake); 4] = [
+        |vehicle| vehicle.status.mode = OperatingMode::Manual,
+        |vehicle| vehicle.status.mode = OperatingMode::Service,
+        |vehicle| vehicle.status.e_stop = EStop::Manual,
+        |vehicle| vehicle.status.stopped = Some("stopped by its operator".into()),
+    ];
+    for stop in stops {
+        let mut pair = Pair::new("a");
+        // The second one waits for the first.
+        for id in ["i1", "i2"] {
+            pair.machine.instant_actions(instant("beep", id));
+        }
+        pair.tell();
+        stop(&mut pair.vehicle);
+        pair.machine.status(pair.vehicle.status.clone());
+        pair.turns(10);
+        assert_eq!(pair.vehicle.began, ["i1"]);
+        if pair.vehicle.status.mode != OperatingMode::Automatic {
+            assert_eq!(pair.actions(), ["i1 FAILED", "i2 FAILED"]);
+        }
+    }
+}
+
+/// What was wanted at once is not wanted an hour later.
+#[test]
+fn an_action_at_once_that_had_not_begun_fails_with_the_link() {
+    let mut pair = Pair::new("a");
+    pair.machine.instant_actions(instant("initPosition", "i0"));
+    let init = pair.machine.next(pair.now).unwrap();
+    pair.machine.answered(&init, Err(Failure::Lost("time-out".into())), pair.now);
+    for id in ["i1", "i2"] {
+        pair.machine.instant_actions(instant("beep", id));
+    }
+    pair.vehicle.unlink();
+    pair.machine.vehicle_lost();
+    pair.machine.status(pair.vehicle.status.clone());
+    assert_eq!(pair.actions(), ["i0 FAILED", "i1 FAILED", "i2 FAILED"]);
+    pair.turns(10);
+    assert!(pair.vehicle.began.is_empty());
+}
+
+/// However many updates a master sends, what is held is bounded.
+#[test]
+fn updates_do_not_heap_up() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b! c! d!"));
+    for update in 1..100 {
+        let last = pair.machine.record().nodes.last().unwrap();
+        let (node, sequence) = (last.node_id.clone(), last.sequence_id);
+        pair.machine.order(order("o1", update, sequence, &format!("{node}! a! b! c! d!")));
+    }
+    assert!(pair.machine.record().nodes.len() <= 20, "{}", pair.machine.record().nodes.len());
+    assert_eq!(pair.errors().last(), Some(&"orderError"));
+    for id in 0..1_000 {
+        pair.machine.instant_actions(instant("beep", &format!("i{id}")));
+    }
+    assert!(pair.machine.record().actions.len() < 100);
+}
+
+#[test]
+fn long_texts_are_neither_kept_nor_reported() {
+    let long = "x".repeat(2_000);
+    for (id, parameter) in [(long.as_str(), ""), ("i1", long.as_str())] {
+        let mut pair = Pair::new("a");
+        let mut message = instant("stateRequest", id);
+        let value = serde_json::Value::from(parameter);
+        let parameter = cara_vda5050::message::ActionParameter { key: "k".into(), value };
+        message.actions[0].action_parameters = Some(vec![parameter]);
+        pair.machine.instant_actions(message.clone());
+        assert_eq!((pair.errors(), pair.actions().len()), (vec!["validationError"], 0));
+        let text = serde_json::to_vec(&message).unwrap();
+        let read = cara_vda5050::message::read::<cara_vda5050::message::InstantActions>(&text);
+        assert_eq!(read.is_err(), id == long, "a parameter's value is the application's");
+    }
+    let mut pair = Pair::new("a");
+    pair.machine.order(order(&"o".repeat(65), 0, 0, "a! b!"));
+    assert_eq!(pair.errors(), ["orderError"]);
+}
+
+#[test]
+fn a_vehicle_out_of_service_says_so_and_does_nothing() {
+    let mut pair = Pair::new("a");
+    pair.machine = Machine::out_of_service("damaged", policy(), pair.now);
+    pair.machine.broker(true, pair.now);
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.machine.order(order("o1", 0, 0, "a! b!"));
+    pair.machine.instant_actions(instant("beep", "i1"));
+    pair.turns(10);
+    assert_eq!((pair.vehicle.reached.len(), pair.vehicle.began.len()), (0, 0));
+    let report = pair.machine.report().unwrap();
+    assert_eq!(report.operating_mode, OperatingMode::Service);
+    let fatal = |error: &&cara_vda5050::message::Error| error.error_level == cara_vda5050::message::ErrorLevel::Fatal;
+    assert_eq!(report.errors.iter().find(fatal).unwrap().error_type, "outOfService");
+}

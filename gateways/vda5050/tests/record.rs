@@ -2,8 +2,10 @@
 
 mod fake;
 
+use std::cell::RefCell;
 use std::io;
 use std::path::Path;
+use std::rc::Rc;
 use std::time::Duration;
 
 use cara_vda5050::driver::{Driver, Vehicle};
@@ -147,4 +149,69 @@ fn a_damaged_record_is_not_overwritten() {
     std::fs::write(folder.path().join("0001.json"), "{\"order_id\": \"o").unwrap();
     let error = Store::open(folder.path(), "0001").unwrap_err();
     assert!(error.to_string().contains("is damaged"), "{error}");
+}
+
+/// What a driver does, as it does it; the vehicle answers or not.
+#[derive(Default)]
+struct Log {
+    done: Rc<RefCell<Vec<&'static str>>>,
+    status: Option<Status>,
+}
+
+impl Vehicle for Log {
+    fn status(&mut self) -> Result<Option<Status>, Failure> {
+        self.done.borrow_mut().push("ask");
+        self.status.clone().map(Some).ok_or_else(|| Failure::Lost("time-out".into()))
+    }
+
+    fn tell(&mut self, command: &Command) -> Result<(), Failure> {
+        self.done.borrow_mut().push(command.word());
+        Ok(())
+    }
+}
+
+impl Keep for Log {
+    fn keep(&mut self, _: &Record) -> io::Result<()> {
+        self.done.borrow_mut().push("keep");
+        Ok(())
+    }
+}
+
+fn logged() -> (Driver<Log, Log>, Rc<RefCell<Vec<&'static str>>>) {
+    let done = Rc::<RefCell<Vec<&'static str>>>::default();
+    let log = |status| Log { done: done.clone(), status };
+    let machine = Machine::new(Record::default(), policy(), Duration::ZERO);
+    let mut driver = Driver::new(machine, log(Some(Fake::at("a").status)), log(None));
+    driver.machine.broker(true, Duration::ZERO);
+    driver.turn(Duration::ZERO).unwrap();
+    driver.machine.order(order("o1", 0, 0, "a! b!"));
+    driver.turn(Duration::ZERO).unwrap();
+    assert_eq!(done.borrow().last(), Some(&"drive"));
+    done.borrow_mut().clear();
+    (driver, done)
+}
+
+/// Neither the disk nor a question to the vehicle comes before a stop.
+#[test]
+fn a_stop_is_told_first() {
+    for kind in ["startPause", "cancelOrder"] {
+        let (mut driver, done) = logged();
+        driver.machine.instant_actions(instant(kind, "i1"));
+        driver.turn(Duration::from_secs(1)).unwrap();
+        assert_eq!(done.borrow()[0], "halt", "{kind}: {:?}", done.borrow());
+    }
+}
+
+/// Its link lives, and it says nothing.
+#[test]
+fn a_vehicle_that_is_not_heard_of_counts_as_lost() {
+    let (mut driver, _) = logged();
+    driver.vehicle_mut().status = None;
+    driver.turn(Duration::from_secs(1)).unwrap();
+    assert!(!driver.is_silent() && driver.machine.is_linked(), "one question without an answer");
+    driver.turn(Duration::from_secs(3)).unwrap();
+    assert!(driver.is_silent() && !driver.machine.is_linked());
+    driver.vehicle_mut().status = Some(Fake::at("a").status);
+    driver.turn(Duration::from_secs(4)).unwrap();
+    assert!(!driver.is_silent() && driver.machine.is_linked());
 }

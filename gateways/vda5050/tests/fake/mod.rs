@@ -102,6 +102,8 @@ pub struct Fake {
     /// To which node, and how many steps are left.
     target: Option<(String, u32)>,
     action: Option<(String, u32)>,
+    /// It is one that the vehicle stands for.
+    is_blocked: bool,
     /// Actions as they began.
     pub began: Vec<String>,
     /// Nodes as they were reached.
@@ -116,7 +118,7 @@ impl Fake {
             AgvPosition { x: place(node), map_id: "hall".into(), position_initialized: true, ..AgvPosition::default() };
         let status =
             Status { position: Some(position), boot: 1, action_status: ActionStatus::Finished, ..Status::default() };
-        Self { status, target: None, action: None, began: Vec::new(), reached: Vec::new(), steps: 2 }
+        Self { status, target: None, action: None, is_blocked: false, began: Vec::new(), reached: Vec::new(), steps: 2 }
     }
 
     pub fn command(&mut self, command: &Command) -> Result<(), Failure> {
@@ -126,6 +128,7 @@ impl Fake {
                     return Err(Failure::Refused("an old number".into()));
                 }
                 assert!(edge.released && node.released, "{command:?}");
+                assert!(!self.is_blocked || self.action.is_none(), "driven while an action blocks that");
                 if *number > self.status.drive {
                     self.target = Some((node.node_id.clone(), self.steps));
                     self.reached.push((node.node_id.clone(), node.sequence_id));
@@ -141,6 +144,8 @@ impl Fake {
                     return Err(Failure::Refused("an old number".into()));
                 }
                 if *number > self.status.action {
+                    self.is_blocked = action.blocking_type != BlockingType::None;
+                    assert!(!self.is_blocked || !self.status.is_driving, "{action:?} begins while it drives");
                     self.began.push(action.action_id.clone());
                     self.action = Some((action.action_id.clone(), self.steps));
                     self.status.action_status = ActionStatus::Running;
