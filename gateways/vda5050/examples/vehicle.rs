@@ -1,14 +1,18 @@
 //! A vehicle that a gateway drives: a point that moves at a constant speed, and actions that take a while.
 //!
-//! Its output is what really happens: `drive 4 b`, `arrived b`, `stood 1.25`, `act 5 pick-1`, `ended pick-1 FINISHED`.
+//! Its output is what really happens: `drive 4 b`, `passed b`, `arrived c`, `stood 1.25`, `act 5 pick-1`, `ended pick-1 FINISHED`.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cara_std::{AnyCall, Interfaces, LeaseWatch, ServiceError, Unit};
-use cara_vda5050::message::ActionStatus;
-use cara_vda5050::vehicle::{ACTION_STATUSES, Condition, Guided, GuidedServer, refusal};
+use cara_vda5050::message::{ActionStatus, Load};
+use cara_vda5050::stretch::{Leg, Stretch};
+use cara_vda5050::vehicle::{
+    ACTION_STATUSES, Condition, Equipment, Equipped, EquippedServer, Guided, GuidedServer, refusal,
+};
 use clap::Parser;
+use serde_json::Value;
 
 /// How often the loop of the motors comes round.
 const TICK: Duration = Duration::from_millis(10);
@@ -42,12 +46,13 @@ struct Options {
 
 struct Body {
     condition: Condition,
-    node: String,
-    target: Option<[f64; 3]>,
+    /// What it was told to drive over.
+    legs: Vec<Leg>,
+    loads: Vec<Load>,
     speed: f64,
-    most: f64,
     drive: Option<LeaseWatch>,
-    action: Option<(String, Instant)>,
+    /// Its id, its type, its parameters, and since when.
+    action: Option<(String, String, Value, Instant)>,
     handling: Option<LeaseWatch>,
     takes: Duration,
 }
@@ -68,31 +73,28 @@ impl Guided for Vehicle {
         &mut self,
         call: &impl AnyCall<Order = LeaseWatch>,
         number: i64,
-        _edge: &str,
-        node: &str,
+        count: i64,
+        edges: &str,
+        nodes: &str,
         map: &str,
-        position: [f64; 3],
-        given: [bool; 2],
-        _deviation: [f64; 2],
-        max_speed: f64,
+        positions: [f64; 24],
+        given: [bool; 16],
+        deviations: [f64; 16],
+        max_speeds: [f64; 8],
     ) -> Result<(), ServiceError> {
         let mut body = self.lock();
-        if number < body.condition.drive {
+        let stretch = Stretch { number, count, edges, nodes, positions, given, deviations, max_speeds };
+        let legs = stretch.legs().filter(|legs| legs.iter().all(|leg| leg.position.is_some()));
+        let Some(legs) = legs else { return Err(ServiceError::Failed(refusal::NO_WAY)) };
+        if number + count <= body.condition.drive {
             return Err(ServiceError::Failed(refusal::OLD_NUMBER));
         }
-        if !given[0] {
-            return Err(ServiceError::Failed(refusal::NO_WAY));
-        }
         call.commit(|| {
-            if number > body.condition.drive {
-                println!("drive {number} {node}");
-                body.condition.has_arrived = false;
-            }
-            body.condition.drive = number;
             map.clone_into(&mut body.condition.map);
-            node.clone_into(&mut body.node);
-            body.target = Some(position);
-            body.most = if max_speed > 0.0 { max_speed.min(body.speed) } else { body.speed };
+            body.legs = legs;
+            if body.condition.drive < number || body.condition.has_arrived {
+                body.next_leg();
+            }
             body.drive = call.order();
         })?;
         Ok(())
@@ -103,8 +105,8 @@ impl Guided for Vehicle {
         call: &impl AnyCall<Order = LeaseWatch>,
         number: i64,
         id: &str,
-        _kind: &str,
-        _details: &str,
+        kind: &str,
+        details: &str,
     ) -> Result<(), ServiceError> {
         let mut body = self.lock();
         if number < body.condition.action {
@@ -114,7 +116,8 @@ impl Guided for Vehicle {
             if number > body.condition.action {
                 println!("act {number} {id}");
                 body.condition.action = number;
-                body.action = Some((id.to_owned(), Instant::now()));
+                let details: Value = serde_json::from_str(details).unwrap_or_default();
+                body.action = Some((id.to_owned(), kind.to_owned(), details, Instant::now()));
                 body.end_with(ActionStatus::Running, "");
             }
             body.handling = call.order();
@@ -135,46 +138,85 @@ impl Guided for Vehicle {
     }
 }
 
+impl Equipped for Vehicle {
+    fn vda_equipment(&mut self) -> Equipment {
+        Equipment { voltage: 48.0, ..Equipment::carrying(&self.lock().loads) }
+    }
+}
+
 impl Body {
     /// One turn of the motors' loop; the orders that are done.
     fn turn(&mut self, seconds: f64) -> Vec<LeaseWatch> {
         let mut done = Vec::new();
         let may_drive = self.drive.as_ref().is_some_and(LeaseWatch::is_live);
         let was_driving = self.condition.is_driving;
-        self.condition.is_driving = may_drive && self.target.is_some() && !self.condition.has_arrived;
+        self.condition.is_driving = may_drive && self.leg().is_some() && !self.condition.has_arrived;
+        let mut speed = 0.0;
         if self.condition.is_driving
-            && let Some([x, y, theta]) = self.target
+            && let Some(leg) = self.leg().cloned()
+            && let Some([x, y]) = leg.position
         {
-            let [at_x, at_y, _] = self.condition.position;
-            let (left, step) = ((x - at_x).hypot(y - at_y), self.most * seconds);
+            speed = leg.max_speed.unwrap_or(self.speed).min(self.speed);
+            let [at_x, at_y, at_theta] = self.condition.position;
+            let (left, step) = ((x - at_x).hypot(y - at_y), speed * seconds);
             let part = if left <= step { 1.0 } else { step / left };
+            let theta = leg.theta.unwrap_or(at_theta);
             self.condition.position = [at_x + (x - at_x) * part, at_y + (y - at_y) * part, theta];
             self.condition.driven += left.min(step);
             if part >= 1.0 {
-                println!("arrived {}", self.node);
-                (self.condition.has_arrived, self.condition.is_driving) = (true, false);
+                let is_last = self.legs.last().is_some_and(|last| last.number == leg.number);
+                println!("{} {}", if is_last { "arrived" } else { "passed" }, leg.node);
+                self.next_leg();
+                self.condition.is_driving = !self.condition.has_arrived;
             }
         }
-        self.condition.velocity = [if self.condition.is_driving { self.most } else { 0.0 }, 0.0, 0.0];
+        self.condition.velocity = [if self.condition.is_driving { speed } else { 0.0 }, 0.0, 0.0];
         if self.condition.has_arrived {
             done.extend(self.drive.take());
         } else if was_driving && !self.condition.is_driving {
             println!("stood {:.3}", self.condition.position[0]);
         }
-        if let Some((id, since)) = self.action.take() {
+        if let Some((id, kind, details, since)) = self.action.take() {
             let may_act = self.handling.as_ref().is_some_and(LeaseWatch::is_live);
             if !may_act {
                 println!("ended {id} FAILED");
                 self.end_with(ActionStatus::Failed, "nobody wanted it any more");
             } else if since.elapsed() >= self.takes {
                 println!("ended {id} FINISHED");
+                self.handled(&kind, &details);
                 self.end_with(ActionStatus::Finished, "done");
                 done.extend(self.handling.take());
             } else {
-                self.action = Some((id, since));
+                self.action = Some((id, kind, details, since));
             }
         }
         done
+    }
+
+    fn leg(&self) -> Option<&Leg> {
+        self.legs.iter().find(|leg| leg.number == self.condition.drive)
+    }
+
+    /// Begins the next edge, if there is one.
+    fn next_leg(&mut self) {
+        let next = self.legs.iter().find(|leg| leg.number > self.condition.drive);
+        self.condition.has_arrived = next.is_none();
+        if let Some(Leg { number, node, .. }) = next {
+            println!("drive {number} {node}");
+            self.condition.drive = *number;
+        }
+    }
+
+    /// What has become of its loads.
+    fn handled(&mut self, kind: &str, details: &Value) {
+        let text = |key: &str| details[key].as_str().map(str::to_owned);
+        match kind {
+            "pick" => {
+                self.loads.push(Load { load_id: text("loadId"), load_type: text("loadType"), ..Load::default() });
+            }
+            "drop" => drop(self.loads.pop()),
+            _ => {}
+        }
     }
 
     fn end_with(&mut self, status: ActionStatus, result: &str) {
@@ -190,10 +232,9 @@ fn main() -> anyhow::Result<()> {
     let condition = Condition { position, map: "hall".into(), charge: 80.0, ..Condition::default() };
     let vehicle = Vehicle(Arc::new(Mutex::new(Body {
         condition,
-        node: String::new(),
-        target: None,
+        legs: Vec::new(),
+        loads: Vec::new(),
         speed,
-        most: speed,
         drive: None,
         action: None,
         handling: None,
@@ -206,6 +247,7 @@ fn main() -> anyhow::Result<()> {
     let drive = unit.my_function_list().actuator(|| ())?;
     let handling = unit.my_function_list().actuator(|| ())?;
     unit.my_function_list().serve(GuidedServer { drive, handling })?;
+    unit.my_function_list().serve(EquippedServer)?;
     unit.publish_my_function_list()?;
     unit.start()?;
     let mut last = Instant::now();

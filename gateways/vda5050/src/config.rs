@@ -240,6 +240,7 @@ impl Config {
         let nodes = u32::try_from(can.max_nodes).unwrap_or(u32::MAX);
         limits.max_string_lens.msg_len = Some(crate::mqtt::LARGEST as u32);
         let lens = &mut limits.max_array_lens;
+        lens.state_loads = Some(crate::stretch::LEGS as u32);
         (lens.order_nodes, lens.order_edges) = (Some(nodes), Some(nodes.saturating_sub(1)));
         limits.timing.min_state_interval = self.vda5050.state_interval;
         limits.timing.default_state_interval = Some(self.vda5050.state_every);

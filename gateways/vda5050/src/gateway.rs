@@ -15,7 +15,8 @@ use crate::driver::Driver;
 use crate::errors::{Kind, Refusal};
 use crate::machine::{Machine, Topic};
 use crate::message::{
-    Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State, Visualization, read,
+    BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State, Visualization,
+    read,
 };
 use crate::mqtt::{HEARD, Heard, Link, Place};
 use crate::record::Store;
@@ -382,7 +383,9 @@ impl Gateway {
 fn lasting(report: &Report) -> Report {
     let mut report = report.clone();
     (report.agv_position, report.velocity) = (None, None);
-    report.battery_state.battery_charge = 0.0;
+    report.distance_since_last_node = None;
+    let charging = report.battery_state.charging;
+    report.battery_state = BatteryState { charging, ..BatteryState::default() };
     report
 }
 

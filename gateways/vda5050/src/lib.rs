@@ -1,7 +1,7 @@
 //! Vehicles of CARA under VDA 5050 2.0 and 2.1.
 //!
 //! [`machine`] decides, and has no I/O: orders ([`order`]), actions ([`actions`]), errors ([`errors`]) and the state that is reported
-//! ([`state`]). [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`]), [`mqtt`] is the broker, [`gateway`] joins
+//! ([`state`]). [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`], [`stretch`]), [`mqtt`] is the broker, [`gateway`] joins
 //! them, [`config`] is its file. `docs/vda5050.md` says what of the standard is there.
 
 pub mod actions;
@@ -15,4 +15,5 @@ pub mod mqtt;
 pub mod order;
 pub mod record;
 pub mod state;
+pub mod stretch;
 pub mod vehicle;

@@ -3,15 +3,16 @@
 //! Messages and statuses change the [`Machine`]; [`Machine::next`] says what the vehicle is to be told. Whoever drives it writes
 //! [`Machine::record`] to disk when [`Machine::take_changed`] says so, before it tells the vehicle or the master anything.
 
+mod at_once;
+
 use std::time::Duration;
 
 use crate::actions::{Entry, Place, block_driving, startable};
 use crate::errors::{Kind, Refusal};
-use crate::message::{
-    Action, ActionScope, ActionStatus, BlockingType, EStop, InstantActions, OperatingMode, Order, Report,
-};
-use crate::order::{Held, ID_BYTES, PARAMETER_BYTES, Verdict, judge, parameters, performable};
-use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status, copy_of};
+use crate::message::{Action, ActionStatus, BlockingType, EStop, Edge, Node, OperatingMode, Order, Report};
+use crate::order::{Held, Verdict, judge};
+use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status};
+use crate::stretch::LEGS;
 
 /// Most errors that are reported at a time; the oldest go.
 pub const ERRORS: usize = 16;
@@ -22,6 +23,9 @@ pub const OWN_ACTIONS: [&str; 6] =
     ["startPause", "stopPause", "cancelOrder", "stateRequest", "factsheetRequest", "initPosition"];
 /// How long the vehicle is left alone after it has refused something.
 const BACK_OFF: Duration = Duration::from_millis(500);
+
+/// With so many edges left, or fewer, the vehicle is told of those that follow.
+const TOLD_AGAIN: usize = LEGS / 2;
 
 /// A topic of the gateway's own messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,6 +59,8 @@ pub struct Machine {
     is_held: bool,
     is_report_due: bool,
     is_factsheet_due: bool,
+    /// What the vehicle had driven when it passed its last node.
+    driven_at_node: Option<f64>,
     /// Why nothing is done with this vehicle, if so.
     out_of_service: Option<String>,
 }
@@ -77,6 +83,7 @@ impl Machine {
             is_held: false,
             is_report_due: true,
             is_factsheet_due: false,
+            driven_at_node: None,
             out_of_service: None,
         }
     }
@@ -275,7 +282,7 @@ impl Machine {
         self.has_changed = true;
         if self.record.nodes.len() > self.record.edges.len() {
             // The vehicle is at an order's first node, or it would have been refused.
-            self.traverse();
+            self.traverse(self.status.as_ref().map(|status| status.driven));
         }
     }
 
@@ -284,8 +291,9 @@ impl Machine {
         !self.record.nodes.is_empty() || self.record.actions.iter().any(|entry| !entry.status.has_ended())
     }
 
-    /// The first node that is left counts as traversed (6.10.2).
-    fn traverse(&mut self) {
+    /// The first node that is left counts as traversed (6.10.2), where the vehicle had driven so far.
+    fn traverse(&mut self, driven: Option<f64>) {
+        self.driven_at_node = driven;
         let record = &mut self.record;
         if record.nodes.is_empty() {
             return;
@@ -306,144 +314,10 @@ impl Machine {
                 }
             }
         }
-        record.drive = None;
-        self.is_drive_sent = false;
+        record.told = record.told.saturating_sub(1);
+        record.drive = record.drive.filter(|_| record.told > 0).map(|number| number + 1);
+        self.is_drive_sent &= record.told > 0;
         self.has_changed = true;
-    }
-
-    /// A message on topic `instantActions`. A copy of one changes nothing.
-    pub fn instant_actions(&mut self, message: InstantActions) {
-        let stamp = format!("{} {}", message.header.header_id, message.header.timestamp);
-        for action in message.actions {
-            if action.action_id.len() > ID_BYTES || parameters(&action).len() > PARAMETER_BYTES {
-                let refusal = Refusal::new(Kind::Validation, "the action's id or its parameters are too long");
-                self.refuse(&refusal.about("topic", "instantActions").about("actionType", &action.action_type));
-                continue;
-            }
-            if !self.is_due(&action, &stamp) {
-                continue;
-            }
-            if self.record.actions.len() >= self.policy.can.max_actions + INSTANT_ACTIONS {
-                self.refuse(&Refusal::new(Kind::Order, "too many actions").about("actionId", &action.action_id));
-                continue;
-            }
-            self.has_changed = true;
-            self.is_report_due = true;
-            let mut entry = Entry { message: stamp.clone(), ..Entry::new(action, Place::Instant) };
-            self.begin(&mut entry);
-            self.record.actions.push(entry);
-        }
-        self.forget_instant_actions();
-        self.settle();
-    }
-
-    /// Whether an action at once is new. What the gateway itself does has the same effect each time, and some masters send it under
-    /// the same id again, so that it counts by its message; what the vehicle does counts by its id.
-    fn is_due(&mut self, action: &Action, stamp: &str) -> bool {
-        let id = &action.action_id;
-        if self.record.spent.contains(&copy_of(id, stamp)) {
-            return false;
-        }
-        let is_own = OWN_ACTIONS.contains(&action.action_type.as_str());
-        let known = self.record.actions.iter().position(|entry| entry.action.action_id == *id);
-        if let Some(known) = known {
-            let entry = &self.record.actions[known];
-            let is_same = !entry.is_of_order() && entry.action.action_type == action.action_type;
-            if is_same && (entry.message == stamp || is_own && !entry.status.has_ended()) {
-                return false;
-            }
-            if is_same && is_own {
-                let before = self.record.actions.remove(known);
-                self.record.spend(copy_of(id, &before.message));
-                return true;
-            }
-        }
-        let is_new = known.is_none() && (is_own || !self.record.spent.contains(id));
-        if !is_new {
-            let refusal = Refusal::new(Kind::Validation, "an action of this id was sent before");
-            self.refuse(&refusal.about("topic", "instantActions").about("actionId", id));
-        }
-        is_new
-    }
-
-    fn begin(&mut self, entry: &mut Entry) {
-        let finished = (ActionStatus::Finished, None);
-        let running = (ActionStatus::Running, None);
-        let (status, result) = match entry.action.action_type.as_str() {
-            "startPause" => {
-                self.record.is_paused = true;
-                running
-            }
-            "stopPause" => {
-                self.record.is_paused = false;
-                self.record.errors.retain(|error| error.error_type != Kind::BrokerLost.name());
-                finished
-            }
-            "cancelOrder" => return self.cancel(entry),
-            "stateRequest" => finished,
-            "factsheetRequest" => {
-                self.is_factsheet_due = true;
-                finished
-            }
-            "initPosition" if self.is_executing() => {
-                (ActionStatus::Failed, Some("an order is being executed".to_owned()))
-            }
-            "initPosition" if self.is_linked() => running,
-            "initPosition" => (ActionStatus::Failed, Some("the vehicle is not connected".to_owned())),
-            _ => match self.performs(&entry.action) {
-                Ok(()) => {
-                    entry.is_triggered = true;
-                    (ActionStatus::Waiting, None)
-                }
-                Err(refusal) => {
-                    self.refuse(&refusal.about("topic", "instantActions"));
-                    (ActionStatus::Failed, None)
-                }
-            },
-        };
-        (entry.status, entry.result) = (status, result);
-    }
-
-    /// Whether the vehicle does this at once: it does nothing late.
-    fn performs(&self, action: &Action) -> Result<(), Refusal> {
-        let refused = |text: &str| Err(Refusal::new(Kind::Order, text).about("actionId", &action.action_id));
-        match &self.status {
-            None => refused("the vehicle is not connected"),
-            Some(status) if !is_controlled(status.mode) => refused("the vehicle is not in an automatic mode"),
-            Some(_) => performable(action, ActionScope::Instant, &self.policy.can).map(drop),
-        }
-    }
-
-    /// `cancelOrder` (6.6.3): what waits fails, what runs is ended where that can be; then the vehicle stands, and the order is over.
-    fn cancel(&mut self, entry: &mut Entry) {
-        if !self.record.is_order_open() {
-            entry.status = ActionStatus::Failed;
-            let refusal = Refusal::new(Kind::NoOrderToCancel, "there is no order");
-            return self.refuse(&refusal.about("actionId", &entry.action.action_id).about("topic", "instantActions"));
-        }
-        entry.status = ActionStatus::Running;
-        self.give_up_order("the order was cancelled");
-    }
-
-    fn give_up_order(&mut self, why: &str) {
-        self.record.is_cancelled = true;
-        self.give_up_actions(why, Entry::is_of_order);
-        self.has_changed = true;
-    }
-
-    /// What waits fails, what runs is ended where that can be.
-    fn give_up_actions(&mut self, why: &str, which: impl Fn(&Entry) -> bool) {
-        for entry in self.record.actions.iter_mut().filter(|entry| which(entry)) {
-            let kind = self.policy.can.actions.get(&entry.action.action_type);
-            if entry.status.has_ended() {
-            } else if entry.number == 0 {
-                entry.end(ActionStatus::Failed, Some(why.into()));
-                self.has_changed = true;
-            } else if entry.ends_as.is_none() && kind.is_none_or(|kind| kind.can_be_cancelled) {
-                entry.ends_as = Some(ActionStatus::Failed);
-                self.has_changed = true;
-            }
-        }
     }
 
     /// Ends what waits for the vehicle to stand: `cancelOrder` and `startPause`.
@@ -468,7 +342,7 @@ impl Machine {
         if is_cancelling && !runs && !self.record.nodes.is_empty() {
             self.record.nodes.clear();
             self.record.edges.clear();
-            self.record.drive = None;
+            (self.record.drive, self.record.told) = (None, 0);
             self.has_changed = true;
         }
         for entry in &mut self.record.actions {
@@ -482,20 +356,6 @@ impl Machine {
                 self.has_changed = true;
             }
         }
-    }
-
-    fn forget_instant_actions(&mut self) {
-        let is_old = |entry: &Entry| !entry.is_of_order() && entry.status.has_ended();
-        let mut too_many =
-            self.record.actions.iter().filter(|entry| is_old(entry)).count().saturating_sub(INSTANT_ACTIONS);
-        let (gone, kept) = std::mem::take(&mut self.record.actions).into_iter().partition(|entry| {
-            let goes = too_many > 0 && is_old(entry);
-            too_many -= usize::from(goes);
-            goes
-        });
-        self.record.actions = kept;
-        let gone: Vec<Entry> = gone;
-        gone.into_iter().for_each(|entry| self.record.spend_action(entry));
     }
 
     /// The vehicle has said how it is. The first status of a link says what has become of what the link before had begun.
@@ -512,11 +372,8 @@ impl Machine {
             self.record.number = floor;
             self.has_changed = true;
         }
-        if self.record.drive == Some(status.drive) && status.has_arrived {
-            self.traverse();
-        } else if self.is_drive_sent && self.record.drive == Some(status.drive) && !status.is_ordered {
-            self.is_drive_sent = false;
-        }
+        (0..self.passed(&status)).for_each(|_| self.traverse(Some(status.driven)));
+        self.is_drive_sent &= status.is_ordered;
         for index in 0..self.record.actions.len() {
             self.learn(index, &status);
         }
@@ -524,15 +381,14 @@ impl Machine {
         self.settle();
     }
 
-    /// Actions at once that had not begun when the link was lost, or the program ended: they were wanted then, not now.
-    fn fail_what_is_late(&mut self) {
-        for index in 0..self.record.actions.len() {
-            let entry = &self.record.actions[index];
-            let is_position = entry.action.action_type == "initPosition" && !entry.is_of_order();
-            if !entry.status.has_ended() && entry.number == 0 && (is_position || entry.is_of_vehicle_at_once()) {
-                self.end(index, ActionStatus::Failed, "the vehicle was lost before it began", false);
-            }
-        }
+    /// How many of the nodes that it was told of the vehicle has passed, the one at which it stands included.
+    fn passed(&self, status: &Status) -> usize {
+        let Some(first) = self.record.drive else { return 0 };
+        let Some(ahead) = status.drive.checked_sub(first) else { return 0 };
+        let told = self.record.told.max(1);
+        let ahead = usize::try_from(ahead).unwrap_or(usize::MAX);
+        // What nobody told it, it has not driven.
+        if ahead >= told { 0 } else { ahead + usize::from(status.has_arrived) }
     }
 
     /// What a status says of an action.
@@ -662,7 +518,7 @@ impl Machine {
         if let Some(command) = self.next_action(boot) {
             return Some(command);
         }
-        if !self.may_drive() || self.is_drive_sent {
+        if !self.may_drive() || self.is_drive_sent && self.record.told > TOLD_AGAIN {
             return None;
         }
         self.next_drive(boot)
@@ -702,12 +558,34 @@ impl Machine {
         Some(Command::Act { number: entry.number, action: entry.action.clone() })
     }
 
+    /// The released edges that the vehicle drives without standing. It stands where an action forbids driving, and at both ends of an
+    /// edge with actions, which begin and end there; nor does a stretch leave its map.
+    fn stretch(&self) -> Vec<(Edge, Node)> {
+        let mut legs: Vec<(Edge, Node)> = Vec::new();
+        for (edge, node) in self.record.edges.iter().zip(&self.record.nodes).take(LEGS) {
+            if !edge.released || !node.released {
+                break;
+            }
+            let map = |node: &Node| node.node_position.as_ref().map(|at| at.map_id.clone());
+            let stands = |(before, at): &(Edge, Node)| {
+                let blocks = at.actions.iter().any(|action| action.blocking_type != BlockingType::None);
+                blocks || !before.actions.is_empty() || !edge.actions.is_empty() || map(at) != map(node)
+            };
+            if legs.last().is_some_and(stands) {
+                break;
+            }
+            legs.push((edge.clone(), node.clone()));
+        }
+        legs
+    }
+
+    /// Tells the vehicle of a stretch, or of a longer one while it drives.
     fn next_drive(&mut self, boot: u64) -> Option<Command> {
-        let (edge, node) = (self.record.edges.first()?, self.record.nodes.first()?);
-        if !edge.released || !node.released {
+        let legs = self.stretch();
+        let (edge, _) = legs.first()?;
+        if self.is_drive_sent && legs.len() <= self.record.told {
             return None;
         }
-        let (edge, node) = (Box::new(edge.clone()), Box::new(node.clone()));
         if self.record.drive.is_none() {
             let entered = Place::Edge(edge.sequence_id);
             for entry in self.record.actions.iter_mut().filter(|entry| entry.place == entered && !entry.is_triggered) {
@@ -721,12 +599,16 @@ impl Machine {
             if block_driving(&self.record.actions) {
                 return None;
             }
-            self.record.number += 1;
-            self.record.drive = Some(self.record.number);
+            self.record.drive = Some(self.record.number + 1);
+        }
+        let number = self.record.drive?;
+        if legs.len() > self.record.told {
+            self.record.told = legs.len();
+            self.record.number = self.record.number.max(number + legs.len() as u64 - 1);
             self.has_changed = true;
         }
         self.is_drive_sent = true;
-        self.record.drive.map(|number| Command::Drive { number, edge, node })
+        Some(Command::Drive { number, legs })
     }
 
     /// What the vehicle has answered to a command: nothing, or a refusal for people. One that was refused comes again, but for an
@@ -736,8 +618,8 @@ impl Machine {
         match command {
             Command::Drive { .. } => {
                 self.is_drive_sent &= !failed;
-                // It may drive all the same.
-                self.is_halt_due |= matches!(answer, Err(Failure::Lost(_)));
+                // It may drive all the same, or on by what it was told before.
+                self.is_halt_due |= failed;
             }
             Command::Halt => self.is_halt_due = failed,
             Command::Act { number, .. } => self.acted(*number, answer),
@@ -764,28 +646,12 @@ impl Machine {
         }
     }
 
-    fn positioned(&mut self, action: &Action, answer: Result<(), Failure>) {
-        self.is_position_sent = false;
-        let Some(index) = self.record.actions.iter().position(|entry| entry.action.action_id == action.action_id)
-        else {
-            return;
-        };
-        match answer {
-            Ok(()) => {
-                let named = action.action_parameters.iter().flatten().find(|parameter| parameter.key == "lastNodeId");
-                if let Some(node) = named.and_then(|parameter| parameter.value.as_str()) {
-                    (self.record.last_node_id, self.record.last_node_sequence_id) = (node.to_owned(), 0);
-                }
-                self.end(index, ActionStatus::Finished, "", true);
-            }
-            Err(Failure::Refused(why)) => self.end(index, ActionStatus::Failed, &why, false),
-            Err(_) => {}
-        }
-    }
-
     /// The state without its header; `None` while the vehicle is not linked, as nothing is known then.
     pub fn report(&self) -> Option<Report> {
-        let mut report = self.record.report(self.status.as_ref()?, &self.policy.can.maps, self.is_held);
+        let status = self.status.as_ref()?;
+        let mut report = self.record.report(status, &self.policy.can.maps, self.is_held);
+        let since = self.driven_at_node.map(|driven| status.driven - driven);
+        report.distance_since_last_node = since.filter(|metres| metres.is_finite() && *metres >= 0.0);
         report.errors.extend(self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why).error()));
         Some(report)
     }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::actions::Entry;
 use crate::errors::{Kind, Refusal};
 use crate::message::{
-    Action, ActionStatus, AgvPosition, BatteryState, EStop, Edge, EdgeState, Error, MapState, Node, NodeState,
+    Action, ActionStatus, AgvPosition, BatteryState, EStop, Edge, EdgeState, Error, Load, MapState, Node, NodeState,
     OperatingMode, Report, SafetyState, Velocity,
 };
 use crate::order::Capabilities;
@@ -40,6 +40,8 @@ pub struct Record {
     pub number: u64,
     /// The number under which the vehicle drives to the first of `nodes`.
     pub drive: Option<u64>,
+    /// How many of `nodes` the vehicle has been told of, with that number and those that follow.
+    pub told: usize,
     /// By topic: the header ids below this one may have been used.
     pub header_ids: [u32; 4],
     /// Ids of instant actions and orders that are over: a late copy of one does nothing. The oldest go.
@@ -49,11 +51,11 @@ pub struct Record {
 /// What the vehicle says of itself.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Status {
-    /// The command to drive that it took last, and whether it has reached its node.
+    /// The number of the edge that it drives over, or has driven over last.
     pub drive: u64,
-    /// It has reached that command's node.
+    /// It stands at that one's node, and has no further one.
     pub has_arrived: bool,
-    /// That command's order lives.
+    /// Its order to drive lives.
     pub is_ordered: bool,
     /// It moves.
     pub is_driving: bool,
@@ -75,6 +77,8 @@ pub struct Status {
     pub mode: OperatingMode,
     /// Its battery.
     pub battery: BatteryState,
+    /// What it carries, if it knows.
+    pub loads: Option<Vec<Load>>,
     /// By its safety controller only.
     pub e_stop: EStop,
     /// By its safety controller only.
@@ -86,14 +90,12 @@ pub struct Status {
 /// What the vehicle is to be told. Commands with a number may be repeated: the vehicle does each number once.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Command {
-    /// Drive over an edge to its end, and stand there.
+    /// Drive over edges, each to its node, and stand at the last one.
     Drive {
-        /// Of this command.
+        /// Of the first edge; those behind it have the numbers that follow.
         number: u64,
-        /// Over which.
-        edge: Box<Edge>,
-        /// To which.
-        node: Box<Node>,
+        /// Over which, to which.
+        legs: Vec<(Edge, Node)>,
     },
     /// The order to drive is given up: it stops.
     Halt,
@@ -241,7 +243,7 @@ impl Record {
             distance_since_last_node: None,
             agv_position: status.position.clone(),
             velocity: status.velocity.clone(),
-            loads: None,
+            loads: status.loads.clone(),
             information: None,
         }
     }

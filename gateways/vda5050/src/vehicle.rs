@@ -1,20 +1,25 @@
 //! What a vehicle offers to be driven under VDA 5050, as services of CARA, and how the gateway calls them.
 //!
-//! A vehicle drives from node to node. Each call that moves is an order with a lease: the vehicle moves while the gateway wants it,
+//! A vehicle drives over a stretch of the released base. Each call that moves is an order with a lease: the vehicle moves while the gateway wants it,
 //! and stops by itself when the gateway, its host or the link fails. The gateway renews orders as its loop beats, and that loop asks
 //! for nothing beyond the released base.
+
+use std::time::Instant;
 
 use cara_std::{AnyCall, CallError, Error, Heart, Peer, RequestOptions, ServiceError, Variables, interface};
 
 use crate::driver::Vehicle;
-use crate::message::{Action, ActionStatus, AgvPosition, BatteryState, EStop, Edge, Node, OperatingMode, Velocity};
+use crate::message::{Action, ActionStatus, AgvPosition, BatteryState, EStop, Load, OperatingMode, Velocity};
 use crate::order::{ID_BYTES, parameters};
 use crate::state::{Command, Failure, Status};
+use crate::stretch::{LEGS, Stretch, of_order};
 
 /// How long the vehicle moves on after the gateway's last sign that it wants it, in milliseconds.
 pub const LEASE_MS: u64 = 600;
 /// How long the vehicle may take to say how it is; the loop's heart waits meanwhile.
 const PATIENCE: std::time::Duration = std::time::Duration::from_millis(250);
+/// What it carries is asked so often, if no action ends.
+const EQUIPMENT_ASKED: std::time::Duration = std::time::Duration::from_millis(500);
 /// How long it may take to begin something.
 const PATIENCE_TO_BEGIN: std::time::Duration = std::time::Duration::from_millis(500);
 
@@ -45,11 +50,11 @@ pub const ACTION_STATUSES: [ActionStatus; 4] =
 /// All that the gateway asks of a vehicle.
 #[derive(Variables, Clone, Debug, Default, PartialEq)]
 pub struct Condition {
-    /// The number of the last `vda_drive` that it took; 0 since it was switched on.
+    /// The number of the edge that it drives over, or has driven over last; 0 since it was switched on.
     pub drive: i64,
-    /// It has reached that one's node.
+    /// It stands at that one's node, and has no further one.
     pub has_arrived: bool,
-    /// That one's order lives.
+    /// Its order to drive lives.
     pub is_ordered: bool,
     /// It moves.
     pub is_driving: bool,
@@ -92,9 +97,9 @@ pub trait Guided {
     /// What its port knows an order by.
     type Order;
 
-    /// Drives over an edge to its end node and stands there, while its caller wants it. With the number of the last call it goes on
-    /// to the same node, or has arrived already. `given` says whether x and y, and the angle, are given; `deviation` is the node's,
-    /// 0 where it has none; a speed of 0 is no limit.
+    /// Drives over edges, past their end nodes, and stands at the last one, while its caller wants it. The first edge has this number,
+    /// the next ones those that follow. What it is told replaces what it was told before: an edge that it drives over it goes on with,
+    /// and those that it has driven over it skips. `Stretch` reads the variables.
     #[actuator(drive)]
     #[lease(ms = 600)]
     #[allow(clippy::too_many_arguments, reason = "each is a variable of the service")]
@@ -102,13 +107,14 @@ pub trait Guided {
         &mut self,
         call: &impl AnyCall<Order = Self::Order>,
         number: i64,
-        #[size(64)] edge: &str,
-        #[size(64)] node: &str,
+        count: i64,
+        #[size(519)] edges: &str,
+        #[size(519)] nodes: &str,
         #[size(64)] map: &str,
-        #[unit = "m, m, rad"] position: [f64; 3],
-        given: [bool; 2],
-        #[unit = "m, rad"] deviation: [f64; 2],
-        #[unit = "m/s"] max_speed: f64,
+        #[unit = "m, m, rad"] positions: [f64; 24],
+        given: [bool; 16],
+        #[unit = "m, rad"] deviations: [f64; 16],
+        #[unit = "m/s"] max_speeds: [f64; 8],
     ) -> Result<(), ServiceError>;
 
     /// Begins an action, which goes on while its caller wants it. With the number of the last call it changes nothing. `details` are its
@@ -134,19 +140,118 @@ pub trait Guided {
     fn vda_condition(&mut self) -> Condition;
 }
 
+/// What it carries, and more of its battery. What it does not know is NaN, or a count of -1.
+#[derive(Variables, Clone, Debug, PartialEq)]
+pub struct Equipment {
+    /// How many loads it carries, 8 at most.
+    pub loads: i64,
+    /// Their identifiers, one a line; an empty line where it is not known.
+    #[size(519)]
+    pub load_ids: String,
+    /// Their types.
+    #[size(519)]
+    pub load_types: String,
+    /// Where on the vehicle each one is.
+    #[size(519)]
+    pub load_positions: String,
+    /// Their weights.
+    #[unit = "kg"]
+    pub load_weights: [f64; 8],
+    /// Of the battery.
+    #[unit = "V"]
+    pub voltage: f64,
+    /// Of a new battery.
+    #[unit = "%"]
+    pub health: f64,
+    /// How far it gets.
+    #[unit = "m"]
+    pub reach: f64,
+}
+
+impl Default for Equipment {
+    fn default() -> Self {
+        let [load_ids, load_types, load_positions] = Default::default();
+        let (loads, unknown) = (-1, f64::NAN);
+        let (load_weights, voltage, health, reach) = ([unknown; 8], unknown, unknown, unknown);
+        Self { loads, load_ids, load_types, load_positions, load_weights, voltage, health, reach }
+    }
+}
+
+impl Equipment {
+    /// With these loads.
+    pub fn carrying(loads: &[Load]) -> Self {
+        let loads = &loads[..loads.len().min(LEGS)];
+        let lines = |of: fn(&Load) -> &Option<String>| {
+            loads.iter().map(|load| of(load).as_deref().unwrap_or_default()).collect::<Vec<_>>().join("\n")
+        };
+        let mut load_weights = [f64::NAN; 8];
+        load_weights.iter_mut().zip(loads).for_each(|(to, load)| *to = load.weight.unwrap_or(f64::NAN));
+        let (load_ids, load_types) = (lines(|load| &load.load_id), lines(|load| &load.load_type));
+        let load_positions = lines(|load| &load.load_position);
+        Self { loads: loads.len() as i64, load_ids, load_types, load_positions, load_weights, ..Self::default() }
+    }
+
+    fn report(&self, status: &mut Status) {
+        let known = |value: f64| Some(value).filter(|value| value.is_finite());
+        let line =
+            |text: &str, index: usize| text.split('\n').nth(index).filter(|line| !line.is_empty()).map(str::to_owned);
+        let load = |index: usize| Load {
+            load_id: line(&self.load_ids, index),
+            load_type: line(&self.load_types, index),
+            load_position: line(&self.load_positions, index),
+            weight: known(self.load_weights[index]),
+            ..Load::default()
+        };
+        status.loads = usize::try_from(self.loads).ok().map(|count| (0..count.min(LEGS)).map(load).collect());
+        let battery = &mut status.battery;
+        (battery.battery_voltage, battery.battery_health) = (known(self.voltage), known(self.health));
+        battery.reach = known(self.reach);
+    }
+}
+
+/// A vehicle that carries something, or knows more of its battery. Not every one offers this.
+#[interface]
+pub trait Equipped {
+    /// Tells what it carries and how its battery is.
+    #[idempotent]
+    fn vda_equipment(&mut self) -> Equipment;
+}
+
 /// A vehicle behind a link of CARA.
 #[derive(Debug)]
 pub struct Linked {
     peer: Peer,
     heart: Heart,
+    equipment: Equipment,
+    /// When that was asked, and what the vehicle had done then.
+    asked: Option<(Instant, u64, ActionStatus)>,
     /// Nothing is renewed any more.
     is_given_up: bool,
 }
 
 impl Linked {
     /// What moves is renewed as the heart beats.
-    pub const fn new(peer: Peer, heart: Heart) -> Self {
-        Self { peer, heart, is_given_up: false }
+    pub fn new(peer: Peer, heart: Heart) -> Self {
+        Self { peer, heart, equipment: Equipment::default(), asked: None, is_given_up: false }
+    }
+
+    /// Asks what it carries: now and then, and when an action has changed that, so that a state never shows the one without the other.
+    fn ask_equipment(&mut self, status: &mut Status) -> Result<(), Failure> {
+        if self.peer.function("vda_equipment").is_none() {
+            return Ok(());
+        }
+        let is_news = self.asked.is_none_or(|(at, action, how)| {
+            at.elapsed() >= EQUIPMENT_ASKED || (action, how) != (status.action, status.action_status)
+        });
+        if is_news {
+            let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() };
+            let answer = EquippedClient::at(&self.peer).with(options).vda_equipment().wait();
+            self.beat();
+            self.equipment = answer.map_err(|error| failure(&error))?;
+            self.asked = Some((Instant::now(), status.action, status.action_status));
+        }
+        self.equipment.report(status);
+        Ok(())
     }
 
     /// The gateway's loop has come round.
@@ -174,19 +279,20 @@ impl Vehicle for Linked {
         let latch = self.peer.actuator_state("vda_drive").and_then(|state| state.latch);
         let boot = self.peer.epoch().map_or(0, |epoch| epoch.0);
         let stopped = latch.map(|latch| format!("stopped by {}, reason {}", latch.by, latch.reason));
-        Ok(Some(Status { stopped, boot, ..status(condition) }))
+        let mut status = Status { stopped, boot, ..status(condition) };
+        self.ask_equipment(&mut status)?;
+        Ok(Some(status))
     }
 
     fn tell(&mut self, command: &Command) -> Result<(), Failure> {
         let options = RequestOptions { timeout: Some(PATIENCE_TO_BEGIN.into()), ..RequestOptions::new() };
         let asked = GuidedClient::at(&self.peer).with(options);
         let answer = match command {
-            Command::Drive { number, edge, node } => {
-                let (position, given, deviation, map) = target(node);
+            Command::Drive { number, legs } => {
+                let (stretch, [edges, nodes], map) = of_order(signed(*number), legs);
+                let Stretch { number, count, positions, given, deviations, max_speeds, .. } = stretch;
                 let client = asked.renewing(self.heart.renew());
-                let Edge { edge_id, max_speed, .. } = &**edge;
-                let (number, speed) = (signed(*number), max_speed.unwrap_or(0.0));
-                client.vda_drive(number, edge_id, &node.node_id, map, position, given, deviation, speed).wait()
+                client.vda_drive(number, count, &edges, &nodes, map, positions, given, deviations, max_speeds).wait()
             }
             Command::Act { number, action } => {
                 let client = asked.renewing(self.heart.renew());
@@ -223,14 +329,6 @@ fn failure(error: &CallError) -> Failure {
         _ if error.code().is_some() => Failure::Refused(error.to_string()),
         _ => Failure::Lost(error.to_string()),
     }
-}
-
-type Target<'n> = ([f64; 3], [bool; 2], [f64; 2], &'n str);
-
-fn target(node: &Node) -> Target<'_> {
-    let Some(at) = &node.node_position else { return ([0.0; 3], [false; 2], [0.0; 2], "") };
-    let deviation = [at.allowed_deviation_xy, at.allowed_deviation_theta].map(Option::unwrap_or_default);
-    ([at.x, at.y, at.theta.unwrap_or(0.0)], [true, at.theta.is_some()], deviation, &at.map_id)
 }
 
 /// Parameters of `initPosition` (6.8.1).
@@ -274,6 +372,7 @@ fn status(condition: Condition) -> Status {
             charging: condition.is_charging,
             ..BatteryState::default()
         },
+        loads: None,
         e_stop: word(&E_STOPS, condition.e_stop, EStop::Manual),
         field_violation: condition.field_violation,
         boot: 0,

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use cara_std::keys::{FleetKeys, Store};
 use cara_std::{Fleet, Identity};
 use cara_vda5050::config::Config;
-use cara_vda5050::message::{Connection, ConnectionState, InstantActions, Order};
+use cara_vda5050::message::{ActionParameter, Connection, ConnectionState, InstantActions, Order};
 use cara_vda5050::vehicle::LEASE_MS;
 use fake::{instant, order};
 use rumqttc::{Client, Event, MqttOptions, Packet, QoS};
@@ -349,6 +349,30 @@ fn a_master_drives_a_vehicle() {
         assert_eq!([plant.count("act "), plant.count("drive ")], [2, 4], "{:?}", plant.vehicle.lines());
         check_messages(&plant);
     }
+}
+
+/// Nodes are passed without standing at them, and what the vehicle carries is in its state.
+#[test]
+fn a_vehicle_drives_through_and_carries_something() {
+    let plant = Plant::start("{ do = \"stop\" }");
+    plant.wait_for("it carries nothing", |plant| plant.state()["loads"] == serde_json::json!([]));
+    assert_eq!(plant.state()["batteryState"]["batteryVoltage"], 48.0);
+    let mut way = order("o1", 0, 0, "a! b! c! d! e! f! g! h! i! j! k! l!:pick=HARD");
+    let parameter = ActionParameter { key: "loadId".into(), value: "pallet-7".into() };
+    way.nodes[11].actions[0].action_parameters = Some(vec![parameter]);
+    plant.publish("order", false, &way);
+    plant.vehicle.wait_for("passed b");
+    plant.wait_for("b is reported while it drives", |plant| {
+        plant.state()["lastNodeId"] == "b" && plant.state()["driving"] == true
+    });
+    plant.instant("startPause", "p1");
+    plant.vehicle.wait_for("stood");
+    plant.instant("stopPause", "p2");
+    plant.wait_for_end("o1", "l");
+    plant.wait_for("it has picked", |plant| plant.action("o1-l22n-pick") == "FINISHED");
+    assert_eq!(plant.state()["loads"][0]["loadId"], "pallet-7");
+    assert_eq!([plant.count("passed"), plant.count("arrived"), plant.count("stood")], [10, 1, 1]);
+    check_messages(&plant);
 }
 
 /// Runs a master control by others, which says by its exit code whether all went as it was to.

@@ -101,6 +101,8 @@ pub struct Fake {
     pub status: Status,
     /// To which node, and how many steps are left.
     target: Option<(String, u32)>,
+    /// What it was told: numbers, nodes and their sequence ids.
+    legs: Vec<(u64, String, u32)>,
     action: Option<(String, u32)>,
     /// It is one that the vehicle stands for.
     is_blocked: bool,
@@ -118,23 +120,38 @@ impl Fake {
             AgvPosition { x: place(node), map_id: "hall".into(), position_initialized: true, ..AgvPosition::default() };
         let status =
             Status { position: Some(position), boot: 1, action_status: ActionStatus::Finished, ..Status::default() };
-        Self { status, target: None, action: None, is_blocked: false, began: Vec::new(), reached: Vec::new(), steps: 2 }
+        Self {
+            status,
+            target: None,
+            legs: Vec::new(),
+            action: None,
+            is_blocked: false,
+            began: Vec::new(),
+            reached: Vec::new(),
+            steps: 2,
+        }
     }
 
     pub fn command(&mut self, command: &Command) -> Result<(), Failure> {
         match command {
-            Command::Drive { number, edge, node } => {
-                if *number < self.status.drive {
+            Command::Drive { number, legs } => {
+                if number + legs.len() as u64 <= self.status.drive {
                     return Err(Failure::Refused("an old number".into()));
                 }
-                assert!(edge.released && node.released, "{command:?}");
+                assert!(!legs.is_empty() && legs.len() <= 8);
+                assert!(legs.iter().all(|(edge, node)| edge.released && node.released), "{command:?}");
+                let blocks = |actions: &[Action]| actions.iter().any(|of| of.blocking_type != BlockingType::None);
+                let (_, passed) = legs.split_last().unwrap();
+                assert!(!passed.iter().any(|(_, node)| blocks(&node.actions)), "past a node with {command:?}");
+                assert!(legs.len() == 1 || legs.iter().all(|(edge, _)| edge.actions.is_empty()), "{command:?}");
                 assert!(!self.is_blocked || self.action.is_none(), "driven while an action blocks that");
-                if *number > self.status.drive {
-                    self.target = Some((node.node_id.clone(), self.steps));
-                    self.reached.push((node.node_id.clone(), node.sequence_id));
-                    self.status.has_arrived = false;
+                let leg = |(index, (_, node)): (usize, &(Edge, Node))| {
+                    (number + index as u64, node.node_id.clone(), node.sequence_id)
+                };
+                self.legs = legs.iter().enumerate().map(leg).collect();
+                if self.status.drive < *number || self.status.has_arrived {
+                    self.next_leg();
                 }
-                self.status.drive = *number;
                 self.status.is_ordered = !self.status.has_arrived;
                 self.status.is_driving = !self.status.has_arrived;
             }
@@ -160,6 +177,17 @@ impl Fake {
             Command::InitPosition { .. } => {}
         }
         Ok(())
+    }
+
+    /// Begins the next edge of the stretch.
+    fn next_leg(&mut self) {
+        let next = self.legs.iter().find(|(number, ..)| *number > self.status.drive).cloned();
+        self.status.has_arrived = next.is_none();
+        if let Some((number, node, sequence)) = next {
+            self.status.drive = number;
+            self.target = Some((node.clone(), self.steps));
+            self.reached.push((node, sequence));
+        }
     }
 
     fn stop_driving(&mut self) {
@@ -196,8 +224,9 @@ impl Fake {
                 if let Some(position) = &mut self.status.position {
                     position.x = place(node);
                 }
-                self.status.has_arrived = true;
-                (self.status.is_ordered, self.status.is_driving) = (false, false);
+                self.next_leg();
+                let drives = !self.status.has_arrived;
+                (self.status.is_ordered, self.status.is_driving) = (drives, drives);
             }
         }
         if let Some((_, left)) = &mut self.action {
