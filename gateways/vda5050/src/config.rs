@@ -1,6 +1,7 @@
 //! The gateway's file: `example.toml` shows all of it.
 
 use std::collections::BTreeSet;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -42,6 +43,8 @@ pub struct Manager {
     pub key_file: Option<PathBuf>,
     /// Where its claim and the records of the vehicles are kept.
     pub state_folder: PathBuf,
+    /// Where metrics are served, on this host.
+    pub metrics: Option<SocketAddr>,
     /// Only vehicles of this host.
     #[serde(default)]
     pub only_this_host: bool,
@@ -144,6 +147,23 @@ pub struct Vehicle {
     pub serial_number: String,
 }
 
+impl Broker {
+    /// For one vehicle: `{serial}` in its user and its files is the serial number.
+    pub fn of(&self, vehicle: &Vehicle) -> Self {
+        let named = |text: &str| text.replace("{serial}", &vehicle.serial_number);
+        let mut broker = self.clone();
+        broker.user = broker.user.map(|user| named(&user));
+        let files = [&mut broker.password_file, &mut broker.certificate_file, &mut broker.key_file];
+        // A path that is no text has nothing to be replaced.
+        files.into_iter().flatten().for_each(|file| {
+            if let Some(text) = file.to_str() {
+                *file = named(text).into();
+            }
+        });
+        broker
+    }
+}
+
 impl Config {
     /// Reads and checks a file. Paths in it are relative to its folder.
     pub fn read(file: &Path) -> Result<Self> {
@@ -193,6 +213,8 @@ impl Config {
                 "limits of finish-base are not negative"
             );
         }
+        let metrics = self.manager.metrics;
+        ensure!(metrics.is_none_or(|at| at.ip().is_loopback()), "metrics are served at a loopback address only");
         ensure!(broker.keep_alive >= 5, "keep_alive is 5 s at least");
         ensure!(broker.probe == 0 || broker.probe_timeout > broker.probe, "probe_timeout is longer than probe");
         ensure!(

@@ -20,6 +20,8 @@ pub enum Kind {
     Action,
     /// The vehicle's drive is stopped and waits for a reset. The standard has no name for it.
     VehicleStopped,
+    /// The client's or the broker's certificate expires soon. The standard has no name for it.
+    CertificateExpires,
     /// The gateway cannot read the vehicle's record. The standard has no name for it.
     OutOfService,
     /// The order's end was not reached while the broker was away, by the configured limit. The standard has no name for it.
@@ -36,6 +38,7 @@ impl Kind {
             Self::NoOrderToCancel => "noOrderToCancel",
             Self::Action => "actionError",
             Self::VehicleStopped => "vehicleStopped",
+            Self::CertificateExpires => "certificateExpires",
             Self::OutOfService => "outOfService",
             Self::BrokerLost => "brokerLost",
         }

@@ -18,8 +18,10 @@ use crate::message::{
     BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State, Visualization,
     read,
 };
+use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, Link, Place};
 use crate::record::Store;
+use crate::tls::Whose;
 use crate::vehicle::Linked;
 
 /// The loop comes round so often.
@@ -30,6 +32,10 @@ const HEART: Duration = Duration::from_millis(crate::vehicle::LEASE_MS / 2);
 const LAST_WORDS: Duration = Duration::from_secs(2);
 /// A record that could not be read is tried so often.
 const TRIED_AGAIN: Duration = Duration::from_secs(2);
+/// Certificates are looked at so often, and at each connection.
+const LOOKED_AGAIN: Duration = Duration::from_secs(60);
+/// Days before the end of a certificate at which there is a warning, the fewest first.
+const EXPIRES_WITHIN: [u64; 2] = [7, 30];
 
 /// Whether the program ends, for all its threads.
 #[derive(Debug, Default)]
@@ -41,9 +47,15 @@ pub struct End {
 }
 
 /// Runs one vehicle until `end`.
-pub fn run(config: &Config, vehicle: &config::Vehicle, system: &CommunicationSystem, end: &End) -> Result<()> {
+pub fn run(
+    config: &Config,
+    vehicle: &config::Vehicle,
+    system: &CommunicationSystem,
+    seen: &Arc<Seen>,
+    end: &End,
+) -> Result<()> {
     while !end.is_due.load(Ordering::SeqCst) {
-        let mut gateway = Gateway::start(config, vehicle, system)?;
+        let mut gateway = Gateway::start(config, vehicle, system, seen.clone())?;
         while !end.is_due.load(Ordering::SeqCst) && !gateway.is_mended() {
             let turn = Instant::now();
             gateway.turn();
@@ -79,12 +91,23 @@ struct Gateway {
     tried: Option<Instant>,
     reported: Option<(Report, Instant)>,
     visualized: Instant,
+    /// For metrics.
+    seen: Arc<Seen>,
+    /// Within how many days certificates expire, as it was logged, and when that was looked at.
+    expires: [Option<u64>; 2],
+    looked: Instant,
     /// Header id of the next last will.
     will: Arc<AtomicU32>,
 }
 
 impl Gateway {
-    fn start(config: &Config, vehicle: &config::Vehicle, system: &CommunicationSystem) -> Result<Self> {
+    fn start(
+        config: &Config,
+        vehicle: &config::Vehicle,
+        system: &CommunicationSystem,
+        seen: Arc<Seen>,
+    ) -> Result<Self> {
+        let config = &Config { broker: config.broker.of(vehicle), ..config.clone() };
         let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
         let peer = system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;
         let folder = config.manager.state_folder.join("vda5050");
@@ -114,6 +137,7 @@ impl Gateway {
             client_id,
             prefix: prefix.clone(),
             will: Box::new(last_words),
+            expiry: seen.expiry.clone(),
         })?;
         let now = Instant::now();
         Ok(Self {
@@ -134,6 +158,9 @@ impl Gateway {
             lost: None,
             tried,
             folder,
+            seen,
+            expires: [None; 2],
+            looked: now,
             reported: None,
             visualized: now,
             will,
@@ -158,6 +185,9 @@ impl Gateway {
             self.hear(heard);
         }
         self.probe();
+        if self.looked.elapsed() >= LOOKED_AGAIN {
+            self.look_at_certificates();
+        }
         let now = self.began.elapsed();
         let turned = self.driver.turn(now);
         let is_watched = turned.is_ok() && !self.driver.is_silent();
@@ -175,6 +205,30 @@ impl Gateway {
             }
         }
         self.publish();
+        self.seen.linked.store(self.driver.machine.is_linked(), Ordering::Relaxed);
+        self.seen.out_of_service.store(self.tried.is_some(), Ordering::Relaxed);
+    }
+
+    /// Warns of certificates that expire soon.
+    fn look_at_certificates(&mut self) {
+        self.looked = Instant::now();
+        self.seen.expiry.read_client(&self.config.broker);
+        let mut alarms = Vec::new();
+        for whose in Whose::ALL {
+            let Some(end) = self.seen.expiry.of(whose) else { continue };
+            let left = end.duration_since(SystemTime::now()).unwrap_or_default();
+            let within = EXPIRES_WITHIN.into_iter().find(|days| left < Duration::from_secs(days * 24 * 3_600));
+            let before = std::mem::replace(&mut self.expires[whose as usize], within);
+            let Some(days) = within else { continue };
+            let (word, end) = (whose.word(), humantime::format_rfc3339_seconds(end));
+            if within != before {
+                eprintln!("{}: the {word}'s certificate expires within {days} days: {end}", self.serial_number);
+            }
+            let text = format!("the {word}'s certificate expires within {days} days");
+            let refusal = Refusal::new(Kind::CertificateExpires, text);
+            alarms.push(refusal.about("certificate", word).about("expires", end));
+        }
+        self.driver.machine.alarm(alarms);
     }
 
     fn hear(&mut self, heard: Heard) {
@@ -188,6 +242,7 @@ impl Gateway {
                 self.probed = [Instant::now(); 2];
                 self.shown = None;
                 self.broker(true);
+                self.look_at_certificates();
                 let _ = self.send_factsheet();
             }
             Heard::Lost(why) => {
@@ -201,17 +256,22 @@ impl Gateway {
             Heard::Message(topic, is_retained, bytes) => match topic.as_str() {
                 "order" => match self.checked::<Order>("order", is_retained, &bytes) {
                     Ok(order) => self.driver.machine.order(order),
-                    Err(refusal) => self.driver.machine.refuse(&refusal),
+                    Err(refusal) => self.refuse(&refusal),
                 },
                 "instantActions" => match self.checked::<InstantActions>("instantActions", is_retained, &bytes) {
                     Ok(message) => self.driver.machine.instant_actions(message),
-                    Err(refusal) => self.driver.machine.refuse(&refusal),
+                    Err(refusal) => self.refuse(&refusal),
                 },
                 "connection" => self.hear_connection(&bytes),
                 _ => self.probed[1] = Instant::now(),
             },
             Heard::Acknowledged => {}
         }
+    }
+
+    fn refuse(&mut self, refusal: &Refusal) {
+        self.seen.refused.fetch_add(1, Ordering::Relaxed);
+        self.driver.machine.refuse(refusal);
     }
 
     /// What the gateway has said last comes back. Behind that, the last will of an earlier client may come, and is contradicted.
@@ -231,6 +291,7 @@ impl Gateway {
         is_retained: bool,
         bytes: &[u8],
     ) -> Result<T, Refusal> {
+        self.seen.received.fetch_add(1, Ordering::Relaxed);
         let refused = |text: String| Refusal::new(Kind::Validation, text).about("topic", topic);
         if is_retained {
             return Err(refused("a retained message is not of now".into()));
@@ -267,12 +328,18 @@ impl Gateway {
             self.probed[0] = Instant::now();
             let _ = client.try_publish(format!("{}/cara-probe", self.prefix), QoS::AtMostOnce, false, "");
         }
-        self.broker(self.probed[1].elapsed() < Duration::from_millis(self.config.broker.probe_timeout));
+        let answers = self.probed[1].elapsed() < Duration::from_millis(self.config.broker.probe_timeout);
+        if !answers && self.is_broker_there {
+            eprintln!("{}: the broker returns no probe", self.serial_number);
+        }
+        self.broker(answers);
     }
 
     fn broker(&mut self, is_there: bool) {
         if self.is_broker_there != is_there {
             self.is_broker_there = is_there;
+            self.seen.broker.store(is_there, Ordering::Relaxed);
+            self.seen.broker_losses.fetch_add(u64::from(!is_there), Ordering::Relaxed);
             self.driver.machine.broker(is_there, self.began.elapsed());
         }
     }
@@ -320,12 +387,13 @@ impl Gateway {
 
     /// Topic `state`: with news, when it was asked for, and every so often.
     fn send_state(&mut self) -> Option<()> {
-        let Some(report) = self.driver.machine.report() else { return Some(()) };
         let config::Vda5050 { state_every, state_interval, .. } = self.config.vda5050;
         let age = self.reported.as_ref().map(|(_, at)| at.elapsed().as_secs_f64());
         if age.is_some_and(|age| age < state_interval) {
             return Some(());
         }
+        let Some(report) = self.driver.machine.report() else { return Some(()) };
+        self.seen.errors.store(report.errors.len() as u64, Ordering::Relaxed);
         let has_news = self.reported.as_ref().is_none_or(|(last, _)| lasting(last) != lasting(&report));
         let is_due = self.driver.machine.take_report_due();
         if !(has_news || is_due || age.is_none_or(|age| age >= state_every)) {
@@ -358,6 +426,7 @@ impl Gateway {
 
     fn send(&self, topic: &str, quality: QoS, is_retained: bool, message: &impl Serialize) -> Option<()> {
         let client = self.client.as_ref()?;
+        self.seen.sent.fetch_add(1, Ordering::Relaxed);
         client.try_publish(format!("{}/{topic}", self.prefix), quality, is_retained, json(message)).ok()
     }
 
@@ -421,7 +490,7 @@ impl HasHeader for InstantActions {
 
 /// The m_unit whose vehicles these are, not started yet.
 pub fn system(config: &Config) -> Result<CommunicationSystem> {
-    let config::Manager { name, id, fleet, key_file, state_folder, only_this_host } = &config.manager;
+    let config::Manager { name, id, fleet, key_file, state_folder, only_this_host, .. } = &config.manager;
     let mut builder = CommunicationSystem::builder(name, *id)?.fleet(*fleet).state_folder(state_folder);
     if let Some(file) = key_file {
         builder = builder.key_file(file);
@@ -434,7 +503,9 @@ pub fn system(config: &Config) -> Result<CommunicationSystem> {
 
 /// Looks at all that a start needs, and changes nothing: the file, the factsheet, the keys, TLS, and the records.
 pub fn check(config: &Config) -> Result<()> {
-    crate::mqtt::tls(&config.broker)?;
+    for vehicle in &config.vehicle {
+        crate::tls::client(&config.broker.of(vehicle), &Arc::default())?;
+    }
     let folder = config.manager.state_folder.join("vda5050");
     for vehicle in &config.vehicle {
         if folder.join(format!("{}.json", vehicle.serial_number)).exists() {

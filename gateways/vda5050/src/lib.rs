@@ -1,8 +1,8 @@
 //! Vehicles of CARA under VDA 5050 2.0 and 2.1.
 //!
 //! [`machine`] decides, and has no I/O: orders ([`order`]), actions ([`actions`]), errors ([`errors`]) and the state that is reported
-//! ([`state`]). [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`], [`stretch`]), [`mqtt`] is the broker, [`gateway`] joins
-//! them, [`config`] is its file. `docs/vda5050.md` says what of the standard is there.
+//! ([`state`]). [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`], [`stretch`]), [`mqtt`] and [`tls`] are the broker, [`gateway`] joins
+//! them, [`config`] is its file, [`metrics`] is for Prometheus. `docs/vda5050.md` says what of the standard is there.
 
 pub mod actions;
 pub mod config;
@@ -11,9 +11,11 @@ pub mod errors;
 pub mod gateway;
 pub mod machine;
 pub mod message;
+pub mod metrics;
 pub mod mqtt;
 pub mod order;
 pub mod record;
 pub mod state;
 pub mod stretch;
+pub mod tls;
 pub mod vehicle;

@@ -61,6 +61,8 @@ pub struct Machine {
     is_factsheet_due: bool,
     /// What the vehicle had driven when it passed its last node.
     driven_at_node: Option<f64>,
+    /// What is reported while it lasts, and concerns no order.
+    alarms: Vec<Refusal>,
     /// Why nothing is done with this vehicle, if so.
     out_of_service: Option<String>,
 }
@@ -84,6 +86,7 @@ impl Machine {
             is_report_due: true,
             is_factsheet_due: false,
             driven_at_node: None,
+            alarms: Vec::new(),
             out_of_service: None,
         }
     }
@@ -91,6 +94,11 @@ impl Machine {
     /// One whose record cannot be read: the vehicle is shown in mode SERVICE with a FATAL error, as nobody knows what it has driven.
     pub fn out_of_service(why: &str, policy: Policy, now: Duration) -> Self {
         Self { out_of_service: Some(why.to_owned()), ..Self::new(Record::default(), policy, now) }
+    }
+
+    /// What is reported from now on, beside errors of orders.
+    pub fn alarm(&mut self, alarms: Vec<Refusal>) {
+        self.alarms = alarms;
     }
 
     /// Whether it was made so.
@@ -653,6 +661,7 @@ impl Machine {
         let since = self.driven_at_node.map(|driven| status.driven - driven);
         report.distance_since_last_node = since.filter(|metres| metres.is_finite() && *metres >= 0.0);
         report.errors.extend(self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why).error()));
+        report.errors.extend(self.alarms.iter().map(Refusal::error));
         Some(report)
     }
 }

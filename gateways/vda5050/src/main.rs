@@ -1,15 +1,18 @@
 //! `cara-vda5050`: vehicles of CARA under VDA 5050.
 
+use std::net::TcpListener;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, Result};
 use cara_std::{StartError, UnitEvent};
-use cara_vda5050::config::Config;
+use cara_vda5050::config::{Config, Vehicle};
 use cara_vda5050::gateway::{self, End};
+use cara_vda5050::metrics::{self, Seen};
 use clap::Parser;
 
 /// Vehicles of CARA under VDA 5050 2.0 and 2.1, over an MQTT broker.
@@ -50,13 +53,21 @@ fn main() -> Result<ExitCode> {
     let events = system.events();
     system.start()?;
     ctrlc::set_handler(|| END.is_due.store(true, Ordering::SeqCst)).context("cannot take signals")?;
+    let seen = |vehicle: &Vehicle| Arc::new(Seen { serial_number: vehicle.serial_number.clone(), ..Seen::default() });
+    let seen: Vec<Arc<Seen>> = config.vehicle.iter().map(seen).collect();
+    if let Some(address) = config.manager.metrics {
+        let listener = TcpListener::bind(address).with_context(|| format!("cannot serve metrics at {address}"))?;
+        let (unit, seen) = (system.downgrade(), seen.clone());
+        let text = move || metrics::text(&unit.upgrade().map(|unit| unit.metrics()).unwrap_or_default(), &seen);
+        std::thread::Builder::new().name("metrics".into()).spawn(move || metrics::serve(&listener, text))?;
+    }
     let is_fenced = std::thread::scope(|scope| -> Result<bool> {
-        for vehicle in &config.vehicle {
+        for (vehicle, seen) in config.vehicle.iter().zip(&seen) {
             let (config, system) = (&config, &system);
             std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
                 // What ends one vehicle's loop is no reason to stop the others: it stops by its lease, and is begun anew.
                 while !END.is_due.load(Ordering::SeqCst) {
-                    match catch_unwind(AssertUnwindSafe(|| gateway::run(config, vehicle, system, &END))) {
+                    match catch_unwind(AssertUnwindSafe(|| gateway::run(config, vehicle, system, seen, &END))) {
                         Ok(Ok(())) => return,
                         Ok(Err(error)) => eprintln!("{}: {error:#}", vehicle.serial_number),
                         Err(_) => eprintln!("{}: its loop has panicked", vehicle.serial_number),

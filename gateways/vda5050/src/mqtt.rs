@@ -10,11 +10,9 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use rumqttc::{Client, Event, LastWill, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
-use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, PrivateKeyDer};
-use rustls::{ClientConfig, RootCertStore};
 
 use crate::config;
+use crate::tls::{self, Expiry};
 
 /// The largest message that is read, in bytes.
 pub const LARGEST: usize = 512 * 1024;
@@ -49,6 +47,8 @@ pub struct Place {
     pub prefix: String,
     /// The message on topic `connection` if it goes away.
     pub will: Box<dyn Fn() -> Vec<u8> + Send>,
+    /// What is seen of certificates.
+    pub expiry: Arc<Expiry>,
 }
 
 /// A thread that stays connected.
@@ -115,7 +115,7 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
 }
 
 fn options(place: &Place) -> Result<MqttOptions> {
-    let Place { broker, client_id, prefix, will } = place;
+    let Place { broker, client_id, prefix, will, expiry } = place;
     let mut options = MqttOptions::new(client_id, &broker.host, broker.port);
     options.set_keep_alive(Duration::from_secs(broker.keep_alive.into()));
     options.set_clean_session(true).set_max_packet_size(LARGEST, LARGEST_SENT);
@@ -127,34 +127,8 @@ fn options(place: &Place) -> Result<MqttOptions> {
         };
         options.set_credentials(user, password.trim_end());
     }
-    if let Some(tls) = tls(broker)? {
+    if let Some(tls) = tls::client(broker, expiry)? {
         options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(Arc::new(tls))));
     }
     Ok(options)
-}
-
-/// The TLS that a broker's settings ask for; its files are read now.
-pub fn tls(broker: &config::Broker) -> Result<Option<ClientConfig>> {
-    let Some(ca) = &broker.ca_file else { return Ok(None) };
-    let certificates = |file: &std::path::Path| -> Result<Vec<CertificateDer<'static>>> {
-        let read = CertificateDer::pem_file_iter(file).and_then(Iterator::collect);
-        let certificates: Vec<_> = read.with_context(|| format!("cannot read certificates of {}", file.display()))?;
-        anyhow::ensure!(!certificates.is_empty(), "{} has no certificate", file.display());
-        Ok(certificates)
-    };
-    let mut roots = RootCertStore::empty();
-    for certificate in certificates(ca)? {
-        roots.add(certificate).with_context(|| ca.display().to_string())?;
-    }
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
-    let builder = builder.with_root_certificates(roots);
-    let config = match (&broker.certificate_file, &broker.key_file) {
-        (Some(certificate), Some(key)) => {
-            let own = PrivateKeyDer::from_pem_file(key).with_context(|| format!("cannot read {}", key.display()))?;
-            builder.with_client_auth_cert(certificates(certificate)?, own)?
-        }
-        _ => builder.with_no_client_auth(),
-    };
-    Ok(Some(config))
 }

@@ -1,0 +1,359 @@
+//! A plant of processes: mosquitto, a master, the gateway and a vehicle.
+#![allow(dead_code, unreachable_pub)]
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU16, AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use cara_std::keys::{FleetKeys, Store};
+use cara_std::{Fleet, Identity};
+use cara_vda5050::message::{InstantActions, Order};
+use rumqttc::{Client, Event, MqttOptions, Packet, QoS};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::fake::{instant, order};
+
+/// Longest wait for anything that is to happen.
+pub const PATIENCE: Duration = Duration::from_secs(30);
+
+pub fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !is_so() {
+        assert!(Instant::now() < end, "not within {PATIENCE:?}: {what}");
+        sleep(Duration::from_millis(10));
+    }
+}
+
+/// A port below those that the system gives to connections, and not the same twice.
+pub fn free_port() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    loop {
+        let port = 20_000 + (std::process::id() as u16 % 1_000) * 10 + NEXT.fetch_add(1, Ordering::SeqCst) % 2_000;
+        if TcpListener::bind(("127.0.0.1", port)).is_ok() {
+            return port;
+        }
+    }
+}
+
+/// A child process that ends with its owner, and the lines of its output with the moments when they came.
+pub struct Process {
+    pub child: Child,
+    pub lines: Arc<Mutex<Vec<(Instant, String)>>>,
+}
+
+impl Process {
+    pub fn start(command: &mut Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+        let lines: Arc<Mutex<Vec<_>>> = Arc::default();
+        let (output, heard) = (child.stdout.take().unwrap(), lines.clone());
+        std::thread::spawn(move || {
+            for line in BufReader::new(output).lines().map_while(Result::ok) {
+                heard.lock().unwrap().push((Instant::now(), line));
+            }
+        });
+        Self { child, lines }
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    pub fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
+    pub fn lines(&self) -> Vec<String> {
+        self.lines.lock().unwrap().iter().map(|(_, line)| line.clone()).collect()
+    }
+
+    pub fn wait_for(&self, start: &str) {
+        until(start, || self.lines().iter().any(|line| line.starts_with(start)));
+    }
+
+    /// When a line came.
+    pub fn at(&self, start: &str) -> Option<Instant> {
+        self.lines.lock().unwrap().iter().find(|(_, line)| line.starts_with(start)).map(|(at, _)| *at)
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// What a master has heard, by topic.
+pub type Messages = Arc<Mutex<BTreeMap<String, Vec<(Value, bool)>>>>;
+
+/// A plant: a broker, a master, a gateway and a vehicle.
+pub struct Plant {
+    pub folder: TempDir,
+    pub fleet: u32,
+    pub port: u16,
+    pub broker: Option<Process>,
+    pub gateway: Option<Process>,
+    pub vehicle: Process,
+    pub client: Client,
+    pub heard: Messages,
+    pub more_of_broker: String,
+    pub protocol: &'static str,
+    /// Where metrics are.
+    pub metrics: u16,
+}
+
+impl Plant {
+    pub fn start(on_broker_loss: &str) -> Self {
+        Self::with(on_broker_loss, "2.1.0", |_| (String::new(), String::new()))
+    }
+
+    /// `secured` makes files in a folder, and says what broker and gateway are told of them.
+    pub fn with(on_broker_loss: &str, version: &'static str, secured: impl Fn(&Path) -> (String, String)) -> Self {
+        static FLEETS: AtomicU32 = AtomicU32::new(0);
+        let fleet = 5_050_000 + std::process::id() % 10_000 * 20 + FLEETS.fetch_add(1, Ordering::SeqCst);
+        let (folder, port, heard) = (tempfile::tempdir().unwrap(), free_port(), Messages::default());
+        keys(folder.path(), fleet);
+        let (more_of_broker, more_of_gateway) = secured(folder.path());
+        let example = Path::new(env!("CARGO_MANIFEST_DIR"));
+        std::fs::copy(example.join("example-factsheet.json"), folder.path().join("example-factsheet.json")).unwrap();
+        let text = std::fs::read_to_string(example.join("example.toml")).unwrap();
+        let finish = "{ do = \"finish-base\", seconds = 60.0, metres = 50.0 }";
+        assert!(text.contains(finish));
+        let text =
+            text.replace("port = 1883", &format!("port = {}\n{more_of_gateway}", tls_port(port, &more_of_broker)));
+        let text = text.replace("fleet = 42", &format!("fleet = {fleet}")).replace(finish, on_broker_loss);
+        let (metrics, off) = (free_port(), "# metrics = \"127.0.0.1:9465\"");
+        assert!(text.contains(off));
+        let text = text.replace(off, &format!("metrics = \"127.0.0.1:{metrics}\""));
+        std::fs::write(folder.path().join("vda5050.toml"), text.replace("\"2.1.0\"", &format!("\"{version}\"")))
+            .unwrap();
+        let vehicle = vehicle(folder.path(), fleet);
+        let broker = Some(broker(folder.path(), port, &more_of_broker));
+        let client = master(port, heard.clone());
+        let gateway = None;
+        let mut plant = Self {
+            folder,
+            fleet,
+            port,
+            broker,
+            gateway,
+            vehicle,
+            client,
+            heard,
+            more_of_broker,
+            protocol: version,
+            metrics,
+        };
+        plant.start_gateway();
+        plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE");
+        plant.wait_for("a state", |plant| plant.state() != Value::Null);
+        plant
+    }
+
+    pub fn file(&self) -> PathBuf {
+        self.folder.path().join("vda5050.toml")
+    }
+
+    /// What Prometheus gets.
+    pub fn scrape(&self) -> String {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.metrics)).unwrap();
+        stream.write_all(b"GET /metrics HTTP/1.1\r\nhost: x\r\n\r\n").unwrap();
+        let mut text = String::new();
+        stream.read_to_string(&mut text).unwrap();
+        text
+    }
+
+    pub fn start_gateway(&mut self) {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara-vda5050"));
+        command.arg(self.file()).env("CARA_KEYS", self.folder.path().join("keys"));
+        command.env("XDG_RUNTIME_DIR", self.folder.path());
+        let gateway = Process::start(&mut command);
+        gateway.wait_for("up with");
+        self.gateway = Some(gateway);
+    }
+
+    pub fn kill_gateway(&mut self) -> Instant {
+        self.gateway.take().unwrap().kill();
+        Instant::now()
+    }
+
+    pub fn restart_broker(&mut self) {
+        self.broker = Some(broker(self.folder.path(), self.port, &self.more_of_broker));
+    }
+
+    pub fn wait_for(&self, what: &str, is_so: impl Fn(&Self) -> bool) {
+        let end = Instant::now() + PATIENCE;
+        while !is_so(self) {
+            let late = Instant::now() >= end;
+            assert!(!late, "not within {PATIENCE:?}: {what}\n{}\n{:?}", self.state(), self.vehicle.lines());
+            sleep(Duration::from_millis(10));
+        }
+    }
+
+    pub fn last(&self, topic: &str) -> (Value, bool) {
+        let heard = self.heard.lock().unwrap();
+        heard.get(topic).and_then(|messages| messages.last()).cloned().unwrap_or_default()
+    }
+
+    pub fn state(&self) -> Value {
+        self.last("state").0
+    }
+
+    pub fn connection(&self) -> String {
+        self.last("connection").0["connectionState"].as_str().unwrap_or_default().to_owned()
+    }
+
+    pub fn publish(&self, topic: &str, retain: bool, message: &impl serde::Serialize) {
+        let message = serde_json::to_vec(message).unwrap();
+        self.client.publish(format!("uagv/v2/KIT/0001/{topic}"), QoS::AtMostOnce, retain, message).unwrap();
+    }
+
+    pub fn order(&self, id: &str, update: u32, first: u32, way: &str) -> Order {
+        let mut order = order(id, update, first, way);
+        order.header.version = self.protocol.into();
+        self.publish("order", false, &order);
+        order
+    }
+
+    pub fn instant(&self, kind: &str, id: &str) -> InstantActions {
+        let message = instant(kind, id);
+        self.publish("instantActions", false, &message);
+        message
+    }
+
+    /// The order's end has come, at a node.
+    pub fn wait_for_end(&self, id: &str, node: &str) {
+        self.wait_for(&format!("order {id} has ended at {node}"), |plant| {
+            let state = plant.state();
+            let left = state["nodeStates"].as_array().map_or(1, Vec::len);
+            state["orderId"] == id && state["lastNodeId"] == node && left == 0 && state["driving"] == false
+        });
+    }
+
+    pub fn action(&self, id: &str) -> String {
+        let state = self.state();
+        let states = state["actionStates"].as_array().cloned().unwrap_or_default();
+        let found = states.iter().find(|action| action["actionId"] == id);
+        found.map_or_else(String::new, |action| action["actionStatus"].as_str().unwrap_or_default().to_owned())
+    }
+
+    pub fn has_error(&self, kind: &str) -> bool {
+        self.state()["errors"].as_array().is_some_and(|errors| errors.iter().any(|error| error["errorType"] == kind))
+    }
+
+    /// Lines of the vehicle: how often one began so.
+    pub fn count(&self, start: &str) -> usize {
+        self.vehicle.lines().iter().filter(|line| line.starts_with(start)).count()
+    }
+}
+
+/// The master speaks without TLS, to the port of its own.
+pub fn tls_port(port: u16, more_of_broker: &str) -> u16 {
+    more_of_broker
+        .lines()
+        .find_map(|line| line.strip_prefix("listener "))
+        .map_or(port, |rest| rest.split_whitespace().next().unwrap().parse().unwrap())
+}
+
+pub fn keys(folder: &Path, fleet: u32) {
+    let manager = Identity::m_unit("vda5050", 1).unwrap();
+    let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
+    keys.add(&manager, &[]).unwrap();
+    keys.add_all(&[Identity::s_unit("agv-1", 101).unwrap()], &[manager]).unwrap();
+    std::fs::create_dir(folder.join("keys")).unwrap();
+    Store::create(&folder.join("keys"), keys).unwrap();
+}
+
+pub fn vehicle(folder: &Path, fleet: u32) -> Process {
+    // Examples are beside the programs.
+    let file = Path::new(env!("CARGO_BIN_EXE_cara-vda5050")).with_file_name("examples").join("vehicle");
+    let mut command = Command::new(file);
+    command.args(["agv-1", "101", "--speed", "2", "--fleet", &fleet.to_string()]);
+    Process::start(command.env("CARA_KEYS", folder.join("keys")).env("XDG_STATE_HOME", folder.join("vehicle")))
+}
+
+pub fn broker(folder: &Path, port: u16, more: &str) -> Process {
+    let file = folder.join("mosquitto.conf");
+    let text =
+        format!("per_listener_settings true\nuser root\nlistener {port} 127.0.0.1\nallow_anonymous true\n{more}");
+    std::fs::write(&file, text).unwrap();
+    let mut command = Command::new("mosquitto");
+    command.arg("-c").arg(&file).stderr(Stdio::null()).env("OPENSSL_CONF", folder.join("openssl.cnf"));
+    let broker = Process::start(&mut command);
+    until("mosquitto listens", || TcpStream::connect(("127.0.0.1", port)).is_ok());
+    broker
+}
+
+/// A client that hears all topics, and connects again.
+pub fn master(port: u16, heard: Messages) -> Client {
+    let mut options = MqttOptions::new("master", "127.0.0.1", port);
+    options.set_keep_alive(Duration::from_secs(5)).set_max_packet_size(1 << 20, 1 << 20);
+    let (client, mut connection) = Client::new(options, 100);
+    let subscriber = client.clone();
+    std::thread::spawn(move || {
+        for event in connection.iter() {
+            match event {
+                Ok(Event::Incoming(Packet::ConnAck(_))) => {
+                    let _ = subscriber.try_subscribe("uagv/#", QoS::AtLeastOnce);
+                }
+                Ok(Event::Incoming(Packet::Publish(message))) => {
+                    let topic = message.topic.rsplit('/').next().unwrap_or_default().to_owned();
+                    let value = serde_json::from_slice(&message.payload).unwrap_or_default();
+                    heard.lock().unwrap().entry(topic).or_default().push((value, message.retain));
+                }
+                Ok(_) => {}
+                Err(_) => sleep(Duration::from_millis(100)),
+            }
+        }
+    });
+    client
+}
+
+/// Each message that was sent is valid, and its header ids rise by topic.
+pub fn check_messages(plant: &Plant) {
+    for (topic, messages) in plant.heard.lock().unwrap().iter() {
+        if matches!(topic.as_str(), "order" | "instantActions" | "cara-probe") {
+            continue;
+        }
+        let file = format!("schemas/2.1.0/{topic}.schema");
+        let schema = std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).unwrap();
+        let validator = jsonschema::validator_for(&serde_json::from_slice(&schema).unwrap()).unwrap();
+        let mut last = -1;
+        for (message, is_retained) in messages {
+            let errors: Vec<String> = validator.iter_errors(message).map(|error| error.to_string()).collect();
+            assert!(errors.is_empty(), "{topic}: {errors:?}\n{message}");
+            let header_id = message["headerId"].as_i64().unwrap();
+            // A retained one comes again with each connection, and a last will has the id of its making.
+            let is_will = message["connectionState"] == "CONNECTIONBROKEN";
+            assert!(header_id > last || *is_retained || is_will, "{topic}: {header_id} behind {last}");
+            last = last.max(header_id);
+        }
+    }
+}
+
+/// A new authority, and certificates of it.
+pub fn certificates(folder: &Path, names: &[&str], days: u32) {
+    let openssl = |arguments: &str| {
+        let arguments = arguments.split_whitespace();
+        let mut command = Command::new("openssl");
+        let ran = command.args(arguments).current_dir(folder).stderr(Stdio::null()).stdout(Stdio::null()).status();
+        assert!(ran.unwrap().success(), "{command:?}");
+    };
+    let curve = "-newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes";
+    openssl(&format!("req -x509 {curve} -keyout ca.key -out ca.pem -subj /CN=ca -days 500"));
+    std::fs::write(folder.join("names"), "subjectAltName = IP:127.0.0.1\n").unwrap();
+    for name in names {
+        openssl(&format!("req -new {curve} -keyout {name}.key -out {name}.csr -subj /CN={name}"));
+        let signed = format!("-CA ca.pem -CAkey ca.key -CAcreateserial -days {days} -extfile names");
+        openssl(&format!("x509 -req -in {name}.csr -out {name}.pem {signed}"));
+    }
+}

@@ -1,0 +1,156 @@
+//! TLS to mosquitto: both versions, a client certificate for each vehicle with an access list, expiry, and files that change.
+
+mod fake;
+mod plant;
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::{Arc, Mutex};
+
+use cara_vda5050::config::Broker;
+use plant::{Plant, certificates, free_port, until};
+use rumqttc::{Client, Event, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
+
+/// What mosquitto and the gateway are told of a listener with certificates.
+fn secured(folder: &Path, port: u16, days: u32) -> (String, String) {
+    certificates(folder, &["broker", "0001", "0002", "master"], days);
+    let file = |name: &str| folder.join(name).display().to_string();
+    let acl = Path::new(env!("CARGO_MANIFEST_DIR")).join("example-acl");
+    let broker = format!(
+        "listener {port} 127.0.0.1\ncafile {}\ncertfile {}\nkeyfile {}\nrequire_certificate true\n\
+         use_identity_as_username true\nacl_file {}\n",
+        file("ca.pem"),
+        file("broker.pem"),
+        file("broker.key"),
+        acl.display()
+    );
+    let gateway = "ca_file = \"ca.pem\"\ncertificate_file = \"{serial}.pem\"\nkey_file = \"{serial}.key\"".to_owned();
+    (broker, gateway)
+}
+
+#[test]
+fn both_versions_of_tls_are_spoken() {
+    for (version, other) in [("TLSv1.2", "-tls1_3"), ("TLSv1.3", "-tls1_2")] {
+        let tls = free_port();
+        let plant = Plant::with("{ do = \"stop\" }", "2.1.0", |folder| {
+            let text = "openssl_conf = a\n[a]\nssl_conf = b\n[b]\nsystem_default = c\n[c]\n";
+            let only = format!("{text}MinProtocol = {version}\nMaxProtocol = {version}\n");
+            std::fs::write(folder.join("openssl.cnf"), only).unwrap();
+            secured(folder, tls, 400)
+        });
+        plant.order("o1", 0, 0, "a! b!");
+        plant.wait_for_end("o1", "b");
+        let mut with_other = Command::new("openssl");
+        with_other.args(["s_client", other, "-connect", &format!("127.0.0.1:{tls}")]).stdin(Stdio::null());
+        with_other.stdout(Stdio::null()).stderr(Stdio::null());
+        assert!(!with_other.status().unwrap().success(), "mosquitto speaks no other version than {version}");
+    }
+}
+
+/// A client by its certificate, and what it hears of all that it asks for.
+fn client(folder: &Path, name: &str, port: u16) -> (Client, Arc<Mutex<Vec<String>>>) {
+    let file = |end: &str| folder.join(format!("{name}.{end}")).display().to_string();
+    let text = format!(
+        "host = \"127.0.0.1\"\nca_file = \"{}\"\ncertificate_file = \"{}\"\nkey_file = \"{}\"",
+        folder.join("ca.pem").display(),
+        file("pem"),
+        file("key")
+    );
+    let broker: Broker = toml::from_str(&text).unwrap();
+    let tls = cara_vda5050::tls::client(&broker, &Arc::default()).unwrap().unwrap();
+    let mut options = MqttOptions::new(format!("test-{name}"), "127.0.0.1", port);
+    options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(Arc::new(tls))));
+    let (client, mut connection) = Client::new(options, 100);
+    let heard = Arc::<Mutex<Vec<String>>>::default();
+    let (subscriber, topics) = (client.clone(), heard.clone());
+    std::thread::spawn(move || {
+        for event in connection.iter() {
+            match event {
+                Ok(Event::Incoming(Packet::ConnAck(_))) => subscriber.subscribe("uagv/#", QoS::AtMostOnce).unwrap(),
+                Ok(Event::Incoming(Packet::SubAck(_))) => topics.lock().unwrap().push("subscribed".into()),
+                Ok(Event::Incoming(Packet::Publish(message))) => topics.lock().unwrap().push(message.topic),
+                Ok(_) => {}
+                Err(_) => return,
+            }
+        }
+    });
+    until("subscribed", || !heard.lock().unwrap().is_empty());
+    (client, heard)
+}
+
+#[test]
+fn a_vehicles_client_has_its_own_topics_only() {
+    let tls = free_port();
+    let plant = Plant::with("{ do = \"stop\" }", "2.1.0", |folder| secured(folder, tls, 400));
+    let (other, of_other) = client(plant.folder.path(), "0002", tls);
+    let (master, of_master) = client(plant.folder.path(), "master", tls);
+    // Each message says where it was sent; what is allowed comes last, so that the rest would have come before.
+    let publish = |client: &Client, topic: &str| {
+        client.publish(topic, QoS::AtLeastOnce, false, format!("{{\"to\": \"{topic}\"}}")).unwrap();
+    };
+    for topic in ["order", "instantActions", "connection", "state", "visualization", "factsheet", "cara-probe"] {
+        publish(&other, &format!("uagv/v2/KIT/0001/{topic}"));
+    }
+    for topic in ["order", "instantActions"] {
+        publish(&other, &format!("uagv/v2/KIT/0002/{topic}"));
+    }
+    publish(&other, "uagv/v2/KIT/0002/state");
+    for topic in ["connection", "state", "visualization", "factsheet"] {
+        publish(&master, &format!("uagv/v2/KIT/0001/{topic}"));
+    }
+    publish(&master, "uagv/v2/KIT/0002/order");
+    let came = |plant: &Plant| {
+        let heard = plant.heard.lock().unwrap();
+        let said = heard.values().flatten().filter_map(|(message, _)| message["to"].as_str().map(str::to_owned));
+        let mut said: Vec<String> = said.collect();
+        said.sort();
+        said
+    };
+    let allowed = ["uagv/v2/KIT/0002/order", "uagv/v2/KIT/0002/state"];
+    plant.wait_for("what is allowed has come", |plant| came(plant).len() >= allowed.len());
+    assert_eq!(came(&plant), allowed);
+    // The master's orders and the vehicle's states get through, and no other vehicle reads them.
+    let order = serde_json::to_vec(&fake::order("o1", 0, 0, "a! b!")).unwrap();
+    master.publish("uagv/v2/KIT/0001/order", QoS::AtMostOnce, false, order).unwrap();
+    plant.wait_for_end("o1", "b");
+    until("the master hears a state", || of_master.lock().unwrap().iter().any(|topic| topic.ends_with("0001/state")));
+    let foreign: Vec<String> =
+        of_other.lock().unwrap().iter().filter(|topic| topic.contains("0001")).cloned().collect();
+    assert!(foreign.is_empty(), "{foreign:?}");
+}
+
+#[test]
+fn certificates_that_expire_are_an_alarm_until_they_are_replaced() {
+    let tls = free_port();
+    let mut plant = Plant::with("{ do = \"stop\" }", "2.1.0", |folder| secured(folder, tls, 6));
+    let alarms = |plant: &Plant| {
+        let errors = plant.state()["errors"].as_array().cloned().unwrap_or_default();
+        let whose = errors.iter().filter(|error| {
+            let is_near = error["errorDescription"].as_str().is_some_and(|text| text.ends_with("within 7 days"));
+            error["errorType"] == "certificateExpires" && error["errorLevel"] == "WARNING" && is_near
+        });
+        whose.map(|error| error["errorReferences"][0]["referenceValue"].clone()).collect::<Vec<_>>()
+    };
+    plant.wait_for("both expire", |plant| alarms(plant) == ["client", "broker"]);
+    let scraped = plant.scrape();
+    for line in [
+        "cara_vda5050_broker{vehicle=\"0001\"} 1",
+        "cara_vda5050_linked{vehicle=\"0001\"} 1",
+        "cara_vda5050_out_of_service{vehicle=\"0001\"} 0",
+        "cara_vda5050_errors{vehicle=\"0001\"} 2",
+        "cara_vda5050_certificate_expires{vehicle=\"0001\",certificate=\"client\"}",
+        "cara_vda5050_certificate_expires{vehicle=\"0001\",certificate=\"broker\"}",
+        "cara_unit_",
+    ] {
+        assert!(scraped.contains(line), "{line}: {scraped}");
+    }
+    assert!(scraped.ends_with("# EOF\n") && scraped.matches("# EOF").count() == 1);
+    // An authority that nobody knew before.
+    plant.broker.take().unwrap().kill();
+    secured(plant.folder.path(), tls, 400);
+    plant.restart_broker();
+    plant.wait_for("the alarm is over", |plant| plant.connection() == "ONLINE" && alarms(plant).is_empty());
+    assert!(plant.scrape().contains("cara_vda5050_broker_losses_total{vehicle=\"0001\"} 1"));
+    plant.order("o1", 0, 0, "a! b!");
+    plant.wait_for_end("o1", "b");
+}
