@@ -350,8 +350,10 @@ impl Unit {
             let held = link.held.len() + link.unanswered.len();
             assert!(usize::from(link.session.calls_held()) >= held, "a call runs and is not counted");
         }
-        let lent = self.links.iter().flatten().count() * 4;
-        assert!(self.pool.free() + self.starved.len() + lent >= BUFFERS, "buffers are missing");
+        // A link may have them all: what is received takes the last one.
+        if self.links.iter().all(Option::is_none) {
+            assert_eq!(self.pool.free() + self.starved.len(), BUFFERS, "buffers are missing");
+        }
         assert!(self.hub.node.next_deadline() > self.now, "a deadline of the node passes and stays");
         assert!(self.hub.node.nodes().count() <= 5);
     }
