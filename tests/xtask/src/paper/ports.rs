@@ -6,10 +6,11 @@ use crate::bad_input::references;
 use super::RULES;
 
 /// Where tests below a folder run; of several, the first one that fits.
-const FOLDERS: [(&str, &str); 13] = [
+const FOLDERS: [(&str, &str); 14] = [
     ("core/", "core"),
     ("std-port/", "Linux"),
     ("examples/linux/", "Linux"),
+    ("examples/warehouse/", "Linux"),
     ("examples/smoltcp/", "smoltcp"),
     ("tests/experiments/bench/src/deadlines.rs", "simulator"),
     ("tests/experiments/bench/src/experiments/simulated.rs", "simulator"),
@@ -22,12 +23,11 @@ const FOLDERS: [(&str, &str); 13] = [
     ("tests/xtask/", "sources"),
 ];
 
-/// Columns of the table of scenarios, and what they are called here.
-const COLUMNS: [(&str, &str); 4] =
-    [("simulator", "simulator"), ("with keys", "with keys"), ("Linux", "Linux"), ("embassy", "embassy")];
+/// Columns of the table of scenarios.
+const COLUMNS: [&str; 5] = ["simulator", "with keys", "Linux", "embassy", "line"];
 
 /// All of them, in the order in which they are told.
-const ORDER: [&str; 8] = ["core", "simulator", "with keys", "Linux", "embassy", "smoltcp", "QEMU", "sources"];
+const ORDER: [&str; 9] = ["core", "simulator", "with keys", "Linux", "embassy", "line", "smoltcp", "QEMU", "sources"];
 
 /// The ports on which the tests run that a row names.
 pub(super) fn of(place: &str, scenarios: &str) -> String {
@@ -49,7 +49,7 @@ pub(super) fn ticked<'s>(scenarios: &'s str, name: &'s str) -> impl Iterator<Ite
     let wanted = format!("`{name}`");
     let line = scenarios.lines().map(cells).find(|cells| cells.get(1) == Some(&wanted.as_str())).unwrap_or_default();
     let is_ticked = move |head: &str| heads.iter().zip(&line).any(|(found, cell)| *found == head && *cell == "✓");
-    COLUMNS.into_iter().filter(move |(head, _)| is_ticked(head)).map(|(_, port)| port)
+    COLUMNS.into_iter().filter(move |head| is_ticked(head))
 }
 
 #[cfg(test)]
