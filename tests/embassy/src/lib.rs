@@ -23,8 +23,10 @@ mod driver;
 mod gate;
 mod security;
 mod tasks;
+mod wire;
 
 pub use bench::{Bench, Board};
 pub use cara_ethernet::{Fault, FaultCounts, Faults};
 pub use clock::now;
 pub use security::{keys, security};
+pub use wire::{Wire, WireCounts};

@@ -1,7 +1,6 @@
 //! Two units on a serial line without IP.
 
-use std::cell::{Cell, RefCell};
-use std::convert::Infallible;
+use std::cell::RefCell;
 use std::rc::Rc;
 
 use cara_core::distribution::parameters::Parameters;
@@ -11,92 +10,36 @@ use cara_core::services::lease::Lease;
 use cara_core::time::Duration;
 use cara_embassy::line::{self, Line, Memory};
 use cara_embassy::{Config, Handle, Handler, Limits, Security, ServiceOptions, resources};
-use cara_embassy_host::{Bench, Board};
-use embassy_sync::blocking_mutex::raw::NoopRawMutex;
-use embassy_sync::pipe::Pipe;
-use embedded_io_async::{ErrorType, Read};
+use cara_embassy_host::{Bench, Board, Wire};
 
 const BAUD: u32 = 115_200;
 const LONG: Duration = Duration::from_secs(60);
 const LEASE: Duration = Duration::from_millis(400);
 const LIMITS: Limits = Limits { message_size: 512, ..Limits::S_UNIT };
 
-type Way = Pipe<NoopRawMutex, 512>;
-
-/// What happens to the bytes of a wire.
-#[derive(Default)]
-struct Faults {
-    is_pulled: Cell<bool>,
-    /// One byte in so many is changed; 0 for none.
-    changed: Cell<u32>,
-    bytes: Cell<u32>,
+/// A unit at an end, with its line.
+fn start(wire: &Wire, end: usize, board: &Board, seed: u64, config: Config) -> (Handle, Line) {
+    let line = wire.line(end, board, seed);
+    let memory = Box::leak(Box::new(<resources!((), LIMITS)>::new()));
+    let (unit, mut runner) = cara_embassy::new(line, memory, config, ()).unwrap();
+    board.spawn(async move { runner.run().await });
+    (unit, line)
 }
 
-/// The receiving half of a UART.
-struct Receiver {
-    way: &'static Way,
-    faults: Rc<Faults>,
+fn start_manager(wire: &Wire, board: &Board, seed: u64) -> Handle {
+    let (unit, _) = start(wire, 0, board, seed, Config::m_unit("manager", 1, Security::insecure(seed)).unwrap());
+    unit
 }
 
-impl ErrorType for Receiver {
-    type Error = Infallible;
-}
-
-impl Read for Receiver {
-    async fn read(&mut self, into: &mut [u8]) -> Result<usize, Infallible> {
-        loop {
-            let count = self.way.read(into).await;
-            for byte in &mut into[..count] {
-                self.faults.bytes.set(self.faults.bytes.get() + 1);
-                if self.faults.bytes.get().checked_rem(self.faults.changed.get()) == Some(0) {
-                    *byte ^= 0x10;
-                }
-            }
-            if !self.faults.is_pulled.get() {
-                return Ok(count);
-            }
-        }
-    }
-}
-
-struct Wire {
-    ways: [&'static Way; 2],
-    faults: Rc<Faults>,
-}
-
-impl Wire {
-    fn new() -> Self {
-        Self { ways: [(); 2].map(|()| &*Box::leak(Box::new(Way::new()))), faults: Rc::default() }
-    }
-
-    /// A unit at an end, with its line.
-    fn start(&self, end: usize, board: &Board, seed: u64, config: Config) -> (Handle, Line) {
-        let (line, incoming, outgoing) = line::new(Box::leak(Box::new(Memory::new())), BAUD, seed);
-        let receiver = Receiver { way: self.ways[end], faults: Rc::clone(&self.faults) };
-        let sender = self.ways[1 - end];
-        board.spawn(async move { incoming.run(receiver).await });
-        board.spawn(async move { outgoing.run(sender).await });
-        let memory = Box::leak(Box::new(<resources!((), LIMITS)>::new()));
-        let (unit, mut runner) = cara_embassy::new(line, memory, config, ()).unwrap();
-        board.spawn(async move { runner.run().await });
-        (unit, line)
-    }
-
-    fn manager(&self, board: &Board, seed: u64) -> Handle {
-        let (unit, _) = self.start(0, board, seed, Config::m_unit("manager", 1, Security::insecure(seed)).unwrap());
-        unit
-    }
-
-    fn agv(&self, board: &Board, seed: u64, lease: &'static Lease) -> (Handle, Line) {
-        let config = Config::s_unit("agv", 7, "manager", 1, Security::insecure(seed)).unwrap();
-        let (unit, line) = self.start(1, board, seed, config);
-        let list = unit.my_function_list();
-        let done = || Handler::method(&|(), _, _| Ok(()));
-        list.add_service("go(n: int) -> (n: int)", ServiceOptions::new().lease(LEASE, lease, &|| {}), done()).unwrap();
-        list.add_service("echo(n: int) -> (n: int)", ServiceOptions::new(), done()).unwrap();
-        unit.publish_my_function_list().unwrap();
-        (unit, line)
-    }
+fn start_agv(wire: &Wire, board: &Board, seed: u64, lease: &'static Lease) -> (Handle, Line) {
+    let config = Config::s_unit("agv", 7, "manager", 1, Security::insecure(seed)).unwrap();
+    let (unit, line) = start(wire, 1, board, seed, config);
+    let list = unit.my_function_list();
+    let done = || Handler::method(&|(), _, _| Ok(()));
+    list.add_service("go(n: int) -> (n: int)", ServiceOptions::new().lease(LEASE, lease, &|| {}), done()).unwrap();
+    list.add_service("echo(n: int) -> (n: int)", ServiceOptions::new(), done()).unwrap();
+    unit.publish_my_function_list().unwrap();
+    (unit, line)
 }
 
 fn knows(unit: Handle) -> bool {
@@ -126,9 +69,9 @@ fn ask(bench: &Bench, board: &Board, manager: Handle, function: &'static str) ->
 #[test]
 fn units_on_a_line_join_and_call_and_a_pulled_line_ends_the_lease() {
     static GO: Lease = Lease::new();
-    let (bench, wire) = (Bench::new(31), Wire::new());
+    let (bench, wire) = (Bench::new(31), Wire::new(BAUD, 31));
     let (depot, board) = (bench.board(), bench.board());
-    let (manager, (agv, _)) = (wire.manager(&depot, 1), wire.agv(&board, 2, &GO));
+    let (manager, (agv, _)) = (start_manager(&wire, &depot, 1), start_agv(&wire, &board, 2, &GO));
     assert!(bench.run_until(|| knows(manager) && agv.is_connected(), LONG));
     assert_eq!(manager.peer("agv").unwrap().address().map(|address| *address.ip()), Some(line::PEER));
     let asked = bench.now();
@@ -139,12 +82,12 @@ fn units_on_a_line_join_and_call_and_a_pulled_line_ends_the_lease() {
     bench.run_for(Duration::from_secs(2));
     let is_live = || GO.is_live(cara_embassy::now());
     assert!(is_live(), "the manager renews it");
-    wire.faults.is_pulled.set(true);
+    (0..2).for_each(|end| wire.pull(end, true));
     let pulled = bench.now();
     assert!(bench.run_until(|| !is_live(), LONG));
     assert!(bench.now().since(pulled) <= LEASE, "the bound is the lease");
     assert!(bench.run_until(|| !manager.is_connected() && !agv.is_connected(), LONG));
-    wire.faults.is_pulled.set(false);
+    (0..2).for_each(|end| wire.pull(end, false));
     assert!(bench.run_until(|| knows(manager), LONG));
     assert_eq!(ask(&bench, &depot, manager, "echo"), Ok(5));
     assert!(!is_live());
@@ -153,14 +96,14 @@ fn units_on_a_line_join_and_call_and_a_pulled_line_ends_the_lease() {
 #[test]
 fn either_end_of_a_line_may_restart() {
     static GO: Lease = Lease::new();
-    let (bench, wire) = (Bench::new(32), Wire::new());
+    let (bench, wire) = (Bench::new(32), Wire::new(BAUD, 32));
     let (depot, board) = (bench.board(), bench.board());
-    let (manager, _) = (wire.manager(&depot, 1), wire.agv(&board, 2, &GO));
+    let (manager, _) = (start_manager(&wire, &depot, 1), start_agv(&wire, &board, 2, &GO));
     assert!(bench.run_until(|| knows(manager), LONG));
     // The vehicle's old link is not missed yet when it dials again.
     board.cut_power();
     let board = board.reboot();
-    let (agv, _) = wire.agv(&board, 3, &GO);
+    let (agv, _) = start_agv(&wire, &board, 3, &GO);
     assert!(
         bench.run_until(|| !manager.is_connected(), Duration::from_millis(500)),
         "its end comes with the next dial"
@@ -168,7 +111,7 @@ fn either_end_of_a_line_may_restart() {
     assert!(bench.run_until(|| agv.is_connected() && knows(manager), LONG));
     depot.cut_power();
     let depot = depot.reboot();
-    let manager = wire.manager(&depot, 4);
+    let manager = start_manager(&wire, &depot, 4);
     assert!(bench.run_until(|| knows(manager), LONG));
     assert_eq!(ask(&bench, &depot, manager, "echo"), Ok(5));
 }
@@ -176,10 +119,10 @@ fn either_end_of_a_line_may_restart() {
 #[test]
 fn noise_on_a_line_changes_no_call() {
     static GO: Lease = Lease::new();
-    let (bench, wire) = (Bench::new(33), Wire::new());
-    wire.faults.changed.set(701);
+    let (bench, wire) = (Bench::new(33), Wire::new(BAUD, 33));
+    wire.set_damage(701);
     let (depot, board) = (bench.board(), bench.board());
-    let (manager, (_, line)) = (wire.manager(&depot, 1), wire.agv(&board, 2, &GO));
+    let (manager, (_, line)) = (start_manager(&wire, &depot, 1), start_agv(&wire, &board, 2, &GO));
     assert!(bench.run_until(|| knows(manager), LONG));
     while line.counters().bad < 10 {
         assert_eq!(ask(&bench, &depot, manager, "echo"), Ok(5));
@@ -190,19 +133,19 @@ fn noise_on_a_line_changes_no_call() {
 #[test]
 fn datagrams_wait_until_the_unit_takes_them() {
     static GO: Lease = Lease::new();
-    let (bench, wire) = (Bench::new(34), Wire::new());
+    let (bench, wire) = (Bench::new(34), Wire::new(BAUD, 34));
     let (depot, board) = (bench.board(), bench.board());
-    let (manager, (_, line)) = (wire.manager(&depot, 1), wire.agv(&board, 2, &GO));
+    let (manager, (_, line)) = (start_manager(&wire, &depot, 1), start_agv(&wire, &board, 2, &GO));
     assert!(bench.run_until(|| knows(manager), LONG));
     bench.run_for(Duration::from_secs(5));
-    let before = wire.faults.bytes.get();
+    let before = wire.counts().bytes;
     board.suspend(Duration::from_millis(60));
     for _ in 0..4 {
         manager.broadcast();
         bench.run_for(Duration::from_millis(14));
     }
     bench.run_for(Duration::from_millis(100));
-    assert!(wire.faults.bytes.get() - before > 100, "searches have come");
+    assert!(wire.counts().bytes - before > 100, "searches have come");
     assert_eq!(line.counters().dropped, 0);
 }
 

@@ -59,6 +59,7 @@ pub fn once(scenario: &Scenario, port: Port, seed: u64, profile: FaultProfile) -
             Port::Secured => ports::simulator(seed, profile, Mode::Secured),
             Port::Linux => ports::linux(scenario.needs),
             Port::Embassy => ports::embassy(seed, profile, scenario.needs),
+            Port::Line => ports::line(seed, profile),
         };
         (scenario.run)(&mut *world);
         world.report()
@@ -104,6 +105,8 @@ impl dyn World + '_ {
         match self.port() {
             Port::Simulator | Port::Secured => Some(Duration::ZERO),
             Port::Embassy => Some(Duration::from_millis(1)),
+            // A few frames.
+            Port::Line => Some(Duration::from_millis(10)),
             Port::Linux => None,
         }
     }

@@ -31,6 +31,8 @@ pub enum Need {
     Backlog,
     /// An interface that goes and comes.
     Interface,
+    /// More than two units.
+    ThirdUnit,
     /// More units than a test on one machine should start.
     ManyUnits,
     /// Minutes of time.
@@ -55,7 +57,7 @@ pub enum Need {
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 24] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -69,6 +71,7 @@ impl Need {
         Self::UnprovenClients,
         Self::Backlog,
         Self::Interface,
+        Self::ThirdUnit,
         Self::ManyUnits,
         Self::LongTime,
         Self::ExactTime,
@@ -88,6 +91,7 @@ impl Need {
             Port::Secured => self.missing_on_secured(),
             Port::Linux => self.missing_on_linux(),
             Port::Embassy => self.missing_on_embassy(),
+            Port::Line => self.missing_on_line(),
         }
     }
 
@@ -132,6 +136,7 @@ impl Need {
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader
+            | Self::ThirdUnit
             | Self::UnknownClients
             | Self::UnprovenClients
             | Self::Backlog => {
@@ -153,6 +158,20 @@ impl Need {
             Self::DroppedHearts => "a board's heart is a static, which is never dropped",
             Self::Choice => "a board that is an m_unit has few links, and meets every m_unit",
             _ => return None,
+        })
+    }
+
+    /// Of two boards on a serial line.
+    const fn missing_on_line(self) -> Option<&'static str> {
+        Some(match self {
+            Self::ThirdUnit | Self::ManyUnits => "a line has two ends",
+            Self::Freeze | Self::FreezeLink => "a wire holds nothing back: what is not read at once is lost",
+            Self::Reset => "nothing between its ends can reset the stream of a wire",
+            Self::Path => "a wire has one rate, and keeps the order",
+            Self::AddressChange => "a line has no addresses",
+            Self::UnknownClients | Self::UnprovenClients => "whoever else is on a line is its other end",
+            Self::Interface => "nothing tells a unit whether its wire is plugged in",
+            _ => return self.missing_on_embassy(),
         })
     }
 }

@@ -17,21 +17,23 @@ Each rule is a function in `tests/scenarios/src/rules`, run on every port that c
 cara-scenarios` runs each once; `cargo run --release --package cara-scenarios --bin seeds` runs each for 1,000 seeds on
 the simulator. A rule's numbers are those of [paper.md](paper.md). The column *faults* names the fault profile of the
 simulated network: rough is loss, delay, jitter, reordering, duplication, short partitions and split reads; light is the
-same without loss and partitions; own is only what the scenario injects. On Linux units have keys, as is the default,
-except in scenarios with unknown clients, which speak plain. On the simulator and on boards units are plain, and
+same without loss and partitions; own is only what the scenario injects. On the line, of 1,000,000 baud, rough changes one
+byte in 2,000 and loses one; light is nothing. On Linux, on boards and on the line units have keys, as is the default,
+except in scenarios with unknown clients, which speak plain. On the simulator units are plain, and
 `--test secured` runs the rules once more on the simulator with keys. A letter instead of a port's ✓ leads to the reason
 below.
 
-| scenario | rule | faults | simulator | with keys | Linux | embassy |
-|---|---|---|---|---|---|---|
+| scenario | rule | faults | simulator | with keys | Linux | embassy | line |
+|---|---|---|---|---|---|---|---|
 ";
 
 /// The ports that lack something, with what they are.
-const PORTS: [(Port, &str); 4] = [
+const PORTS: [(Port, &str); 5] = [
     (Port::Simulator, "the simulator"),
     (Port::Secured, "the simulator with keys"),
     (Port::Linux, "Linux over loopback"),
     (Port::Embassy, "boards with embassy on a switch in memory"),
+    (Port::Line, "two boards on a serial line without IP"),
 ];
 
 /// The whole file.

@@ -39,6 +39,8 @@ pub enum Port {
     Linux,
     /// Boards with embassy-net, on a switch in memory and in virtual time.
     Embassy,
+    /// Two boards on a serial line without IP, in virtual time.
+    Line,
 }
 
 /// A fault that a port cannot inject.

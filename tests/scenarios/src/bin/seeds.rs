@@ -1,7 +1,7 @@
-//! Runs every scenario for many seeds on the simulator, with faults on; or on boards, where each run keeps its memory
+//! Runs every scenario for many seeds on the simulator, with faults on; or on boards or a line, where each run keeps its memory
 //! until the end, so that a scenario at a time suits.
 //!
-//! `seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--secured | --embassy] [--traces FILE | --write-traces FILE]`
+//! `seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--secured | --embassy | --line] [--traces FILE | --write-traces FILE]`
 //!
 //! A trace stands for all that could be seen of a scenario's runs: what is on the wire, what units see, and when. `--traces`
 //! fails where one differs from the file, which `--write-traces` has made: so a change that is to keep behaviour shows that
@@ -23,7 +23,7 @@ const FEW: u64 = 500;
 /// Failures that are shown of one scenario.
 const SHOWN: usize = 3;
 
-const USAGE: &str = "seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--secured | --embassy] \
+const USAGE: &str = "seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--secured | --embassy | --line] \
                      [--traces FILE | --write-traces FILE]";
 
 /// What the command line says.
@@ -94,6 +94,7 @@ fn arguments() -> Result<Wanted, String> {
             "--scenario" => wanted.scenario = Some(value()?),
             "--secured" => wanted.port = Port::Secured,
             "--embassy" => wanted.port = Port::Embassy,
+            "--line" => wanted.port = Port::Line,
             "--quick" => wanted.seeds = QUICK,
             "--traces" => {
                 let file = value()?;
@@ -129,6 +130,7 @@ fn run(scenario: &Scenario, wanted: &Wanted) -> Ended {
         println!("  FAILED with seed {seed}: {}", failure.replace('\n', "\n    "));
         let port = match wanted.port {
             Port::Embassy => " --embassy",
+            Port::Line => " --line",
             Port::Secured => " --secured",
             Port::Simulator | Port::Linux => "",
         };

@@ -32,6 +32,11 @@ pub fn embassy(seed: u64, profile: FaultProfile, needs: &[Need]) -> Box<dyn Worl
     Box::new(embassy::EmbassyWorld::new(seed, profile, mode))
 }
 
+/// Two boards with keys on a serial line; the seed decides everything.
+pub fn line(seed: u64, profile: FaultProfile) -> Box<dyn World> {
+    Box::new(embassy::EmbassyWorld::on_line(seed, profile))
+}
+
 /// A table as a board has it: there for good.
 fn lent(table: Option<&'static [Rule]>) -> Option<&'static dyn Access> {
     table.map(|rules| &*Box::leak(Box::new(rules)) as &'static dyn Access)

@@ -8,9 +8,9 @@ use crate::scenario::scenarios;
 use crate::{Service, Spec, World, number, secs};
 
 scenarios![
-    a_peer_without_permission_is_refused_and_sees_nothing: "access control", Rough, [], ["RequestsForbidden"];
+    a_peer_without_permission_is_refused_and_sees_nothing: "access control", Rough, [ThirdUnit], ["RequestsForbidden"];
     a_change_of_the_access_table_takes_effect: "access control", Rough, [], ["RequestsRun"];
-    what_a_peer_may_not_publish_is_not_seen: "access control", Rough, [], ["FunctionsForbidden"];
+    what_a_peer_may_not_publish_is_not_seen: "access control", Rough, [ThirdUnit], ["FunctionsForbidden"];
     no_rate_refuses_a_stop: "access control, stop and reset", Light, [], ["RequestsTooSoon"];
 ];
 

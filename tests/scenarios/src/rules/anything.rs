@@ -10,7 +10,7 @@ use crate::{Fault, Service, Spec, Unit, World, boxed, millis, number, secs};
 
 scenarios![
     whatever_happens_the_fleet_comes_back: "4, 13, 68", Rough,
-        [Crash, Partition, Freeze, FreezeLink, Reset, Path, AddressChange, Suspend],
+        [Crash, Partition, Freeze, FreezeLink, Reset, Path, AddressChange, Suspend, ThirdUnit],
         ["power-cut", "process-killed", "restart", "partition", "freeze", "reset", "address-change", "suspend",
          "bandwidth", "LeasesExpired", "RequestsExpired", "ran"];
 ];

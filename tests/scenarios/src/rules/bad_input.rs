@@ -14,19 +14,19 @@ use crate::{
 };
 
 scenarios![
-    bad_arguments_harm_nobody_else: "40–42, 47", Rough, [], ["RequestsWithheld"];
-    what_is_too_long_is_an_error_in_either_direction: "52", Rough, [], ["RequestsWithheld"];
-    a_full_list_of_functions_names_its_limit: "full tables", Rough, [], ["RequestsRun"];
-    full_tables_of_calls_name_their_limit: "full tables", Rough, [], ["RequestsBusy", "CallsTimedOut"];
+    bad_arguments_harm_nobody_else: "40–42, 47", Rough, [ThirdUnit], ["RequestsWithheld"];
+    what_is_too_long_is_an_error_in_either_direction: "52", Rough, [ThirdUnit], ["RequestsWithheld"];
+    a_full_list_of_functions_names_its_limit: "full tables", Rough, [ThirdUnit], ["RequestsRun"];
+    full_tables_of_calls_name_their_limit: "full tables", Rough, [ThirdUnit], ["RequestsBusy", "CallsTimedOut"];
     two_units_with_few_buffers_do_not_stop_each_other: "full tables", Light, [], ["answered"];
-    a_second_manager_of_a_name_is_told_on_its_own_side: "known identity, new epoch", Rough, [], ["OwnIdentity"];
-    another_fleet_that_dials_is_refused_by_name: "fleet", Rough, [UnknownClients, UnprovenClients],
+    a_second_manager_of_a_name_is_told_on_its_own_side: "known identity, new epoch", Rough, [ThirdUnit], ["OwnIdentity"];
+    another_fleet_that_dials_is_refused_by_name: "fleet", Rough, [UnknownClients, UnprovenClients, ThirdUnit],
         ["DatagramFleet", "RefusedFleet", "client was told"];
-    garbage_on_every_port_harms_nobody: "garbage", Rough, [UnknownClients], ["DatagramMagic", "DatagramFleet"];
-    a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [UnknownClients, UnprovenClients], ["left"];
-    a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [UnknownClients, Backlog], ["GaveWay"];
-    a_reader_of_one_byte_a_second_harms_nobody_else: "slow reader", Own, [SlowReader], ["SendRefused"];
-    a_unit_without_an_interface_finds_its_manager_when_it_has_one: "no interface", Light, [Interface],
+    garbage_on_every_port_harms_nobody: "garbage", Rough, [UnknownClients, ThirdUnit], ["DatagramMagic", "DatagramFleet"];
+    a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [UnknownClients, UnprovenClients, ThirdUnit], ["left"];
+    a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [UnknownClients, Backlog, ThirdUnit], ["GaveWay"];
+    a_reader_of_one_byte_a_second_harms_nobody_else: "slow reader", Own, [SlowReader, ThirdUnit], ["SendRefused"];
+    a_unit_without_an_interface_finds_its_manager_when_it_has_one: "no interface", Light, [Interface, ThirdUnit],
         ["SendFailed", "unplugged"];
 ];
 

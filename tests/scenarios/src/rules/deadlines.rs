@@ -9,7 +9,7 @@ use crate::scenario::scenarios;
 use crate::{Service, World, millis, number, secs};
 
 scenarios![
-    a_time_out_frees_its_slot_and_the_late_reply_is_dropped: "48", Rough, [], ["CallsTimedOut", "RepliesLate"];
+    a_time_out_frees_its_slot_and_the_late_reply_is_dropped: "48", Rough, [ThirdUnit], ["CallsTimedOut", "RepliesLate"];
     the_time_out_can_be_changed_while_running: "48", Rough, [], ["CallsTimedOut"];
 ];
 

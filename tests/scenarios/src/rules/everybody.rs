@@ -6,8 +6,8 @@ use crate::scenario::scenarios;
 use crate::{Seen, Service, Spec, World, number, secs};
 
 scenarios![
-    a_blocking_request_to_all_has_an_outcome_for_each: "asynchronous request", Rough, [], ["RequestsRun"];
-    an_asynchronous_request_to_all_has_an_id_for_each: "asynchronous request", Rough, [], ["failure came back"];
+    a_blocking_request_to_all_has_an_outcome_for_each: "asynchronous request", Rough, [ThirdUnit], ["RequestsRun"];
+    an_asynchronous_request_to_all_has_an_id_for_each: "asynchronous request", Rough, [ThirdUnit], ["failure came back"];
 ];
 
 /// A manager with three AGVs that offer `note`, of which one fails, one that does not offer it, and one that has left; with the

@@ -7,9 +7,9 @@ use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
 
 scenarios![
-    a_restart_and_a_twin_are_told_apart: "known identity, new epoch", Light, [Crash],
+    a_restart_and_a_twin_are_told_apart: "known identity, new epoch", Light, [Crash, ThirdUnit],
         ["power-cut", "restart", "Restarted", "RefusedDuplicate", "challenged", "twin took over"];
-    a_twin_is_refused_while_the_first_lives: "known identity, new epoch", Light, [], ["RefusedDuplicate"];
+    a_twin_is_refused_while_the_first_lives: "known identity, new epoch", Light, [ThirdUnit], ["RefusedDuplicate"];
     a_board_that_draws_the_same_numbers_comes_back: "known identity, new epoch", Light, [Crash, SameSeed],
         ["restart", "Restarted"];
 ];

@@ -10,7 +10,7 @@ use crate::{Service, Spec, Unit, World, millis, number, secs};
 scenarios![
     a_blocking_request_waits_for_the_interval: "49–50", Rough, [], ["RequestsWithheld", "interval removed"];
     an_asynchronous_request_too_soon_is_refused: "49–50", Rough, [], ["RequestsWithheld", "interval removed"];
-    each_node_has_an_interval_of_its_own: "49", Rough, [], ["RequestsRun"];
+    each_node_has_an_interval_of_its_own: "49", Rough, [ThirdUnit], ["RequestsRun"];
     the_callee_tells_its_interval: "49", Rough, [], ["RequestsWithheld"];
     a_wait_beyond_the_deadline_is_refused: "49", Rough, [], ["RequestsWithheld"];
 ];

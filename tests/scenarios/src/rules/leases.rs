@@ -23,7 +23,7 @@ scenarios![
     a_loop_that_hangs_ends_what_it_wanted_and_nothing_else: "heart of a loop", Light, [], ["hung"];
     a_heart_that_is_dropped_releases_all_that_it_renewed: "heart of a loop", Light, [DroppedHearts], ["released"];
     a_renewal_that_comes_after_the_end_revives_nothing: "lease of a service", Light, [Suspend], ["LeasesExpired"];
-    a_manager_that_takes_over_has_the_vehicle_alone: "terms of managers", Light, [], ["fenced"];
+    a_manager_that_takes_over_has_the_vehicle_alone: "terms of managers", Light, [ThirdUnit], ["fenced"];
     an_operator_and_the_program_of_a_manager_hold_for_themselves: "lease of a service", Light, [], ["taken over"];
     a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
     what_a_service_that_goes_has_started_stops_at_once: "lease of a service", Light, [], ["gone"];

@@ -12,8 +12,8 @@ scenarios![
     asynchronous_requests_are_executed_or_reported: "full queues", Rough, [], ["RequestsBusy", "reported"];
     blocking_requests_beyond_the_limit_are_busy: "full queues", Rough, [], ["RequestsBusy"];
     calls_in_flight_beyond_the_table_end_all_the_same: "full queues", Rough, [], ["CallsTimedOut"];
-    few_buffers_delay_and_lose_nothing: "full queues", Rough, [], ["executed"];
-    a_slow_reader_does_not_delay_the_others: "slow reader", Own, [Path], ["SendRefused", "bandwidth"];
+    few_buffers_delay_and_lose_nothing: "full queues", Rough, [ThirdUnit], ["executed"];
+    a_slow_reader_does_not_delay_the_others: "slow reader", Own, [Path, ThirdUnit], ["SendRefused", "bandwidth"];
 ];
 
 fn asynchronous_requests_are_executed_or_reported(world: &mut dyn World) {

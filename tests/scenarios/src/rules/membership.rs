@@ -8,15 +8,15 @@ use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Spec, Unit, UnknownClient, World, millis, number, secs};
 
 scenarios![
-    an_index_keeps_its_meaning_when_another_node_leaves: "47", Rough, [], ["agv came back"];
-    an_agv_joins_its_own_manager_only: "23", Rough, [], ["WrongManager"];
-    different_fleets_do_not_meet: "fleet", Rough, [], ["DatagramFleet"];
+    an_index_keeps_its_meaning_when_another_node_leaves: "47", Rough, [ThirdUnit], ["agv came back"];
+    an_agv_joins_its_own_manager_only: "23", Rough, [ThirdUnit], ["WrongManager"];
+    different_fleets_do_not_meet: "fleet", Rough, [ThirdUnit], ["DatagramFleet"];
     another_version_is_refused_by_name: "version", Rough, [UnknownClients],
         ["DatagramVersion", "datagram was counted", "client was told"];
-    the_maximum_of_nodes_refuses_the_next: "51", Rough, [], ["RefusedFull"];
+    the_maximum_of_nodes_refuses_the_next: "51", Rough, [ThirdUnit], ["RefusedFull"];
     two_m_units_meet_and_call_both_ways: "18, 20", Rough, [], ["Dialled"];
-    an_m_unit_meets_the_m_units_that_it_has_chosen: "a choice of m_units", Rough, [Choice], ["WrongManager"];
-    an_m_unit_has_m_units_and_s_units: "16–17, 19", Rough, [], ["Joined"];
+    an_m_unit_meets_the_m_units_that_it_has_chosen: "a choice of m_units", Rough, [Choice, ThirdUnit], ["WrongManager"];
+    an_m_unit_has_m_units_and_s_units: "16–17, 19", Rough, [ThirdUnit], ["Joined"];
     an_agv_finds_its_manager_at_a_new_address: "address change", Rough, [AddressChange], ["address-change"];
 ];
 

@@ -9,10 +9,10 @@ use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
 
 scenarios![
-    published_to_one_is_hidden_from_others: "43–44", Rough, [], ["RequestsRun"];
-    published_to_all_reaches_those_that_come_later: "45–46", Rough, [], ["RequestsRun"];
-    published_to_one_survives_its_reconnection: "44", Rough, [], ["RequestsRun", "agv came back"];
-    publishing_waits_until_everybody_has_read: "45", Rough, [], ["MessagesSent"];
+    published_to_one_is_hidden_from_others: "43–44", Rough, [ThirdUnit], ["RequestsRun"];
+    published_to_all_reaches_those_that_come_later: "45–46", Rough, [ThirdUnit], ["RequestsRun"];
+    published_to_one_survives_its_reconnection: "44", Rough, [ThirdUnit], ["RequestsRun", "agv came back"];
+    publishing_waits_until_everybody_has_read: "45", Rough, [ThirdUnit], ["MessagesSent"];
     publishing_returns_at_once_or_waits_as_asked: "45b", Light, [Freeze], ["freeze"];
     a_changed_function_is_stale_until_it_is_published_again: "12", Rough, [], ["RequestsRejected"];
     a_removed_function_is_gone_and_the_others_stay: "12", Rough, [], ["RequestsRun"];

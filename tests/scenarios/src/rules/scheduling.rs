@@ -18,7 +18,7 @@ scenarios![
     calls_that_move_begin_in_their_order_whatever_their_deadlines: "74", Light, [], ["RequestsRun"];
     a_call_that_has_waited_half_its_time_out_is_next: "74", Light, [ExactTime], ["RequestsAhead"];
     one_slow_run_refuses_short_calls_for_seconds_only: "74", Light, [ExactTime], ["RequestsBusy"];
-    a_peer_with_short_deadlines_keeps_no_other_peer_waiting: "74", Light, [], ["RequestsRun"];
+    a_peer_with_short_deadlines_keeps_no_other_peer_waiting: "74", Light, [ThirdUnit], ["RequestsRun"];
 ];
 
 const fn within(timeout: Duration) -> RequestOptions {

@@ -8,7 +8,7 @@ use crate::scenario::scenarios;
 use crate::{Seen, Service, Spec, World, number, secs};
 
 scenarios![
-    a_slow_handler_delays_no_other_peer: "handlers run outside", Light, [], ["RequestsRun"];
+    a_slow_handler_delays_no_other_peer: "handlers run outside", Light, [ThirdUnit], ["RequestsRun"];
     a_slow_handler_delays_no_keep_alive: "handlers run outside", Light, [LongTime], ["DatagramsReceived"];
     a_quick_call_overtakes_slow_ones_that_began_before_it: "handlers run outside", Light, [], ["overtook"];
     a_service_calls_its_caller_back: "handlers run outside", Rough, [], ["RequestsRun"];

@@ -15,7 +15,7 @@ scenarios![
     a_stream_delays_no_call: "streams", Rough, [Streams], ["SamplesSent", "RequestsRun"];
     too_many_subscriptions_are_refused: "streams", Light, [Streams], ["SubscriptionsRefused"];
     a_subscription_survives_a_reconnection: "streams", Own, [Streams, Reset], ["SamplesReceived"];
-    two_readers_have_each_its_pace: "streams", Light, [Streams], ["SamplesReplaced"];
+    two_readers_have_each_its_pace: "streams", Light, [Streams, ThirdUnit], ["SamplesReplaced"];
 ];
 
 /// A manager, and an AGV with a stream `pose(n: int)` and a service.

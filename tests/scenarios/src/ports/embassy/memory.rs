@@ -1,6 +1,7 @@
 //! The memory of boards: static on a controller, so here it is never given back.
 
 use cara_core::error::Error;
+use cara_embassy::line::Line;
 use cara_embassy::{Config, Handle, Limits, Runner, resources};
 use embassy_net::Stack;
 
@@ -46,28 +47,44 @@ const TIGHT: Limits = Limits { message_buffers: 2, ..MANAGER };
 const HUGE: Limits =
     Limits { links: 3, message_size: 128 * 1024, message_buffers: 3, arguments: 130_000, tasks: 1, ..MANAGER };
 
-macro_rules! unit {
-    ($limits:ident, $stack:expr, $config:expr) => {
-        cara_embassy::new($stack, Box::leak(Box::new(<resources!((), $limits)>::new())), $config, ())
-    };
+/// On a line.
+const fn with_one_link(limits: Limits) -> Limits {
+    Limits { links: 1, ..limits }
 }
 
-/// A unit in memory that suits its description.
-pub(super) fn unit(spec: &Spec, stack: Stack<'static>, config: Config) -> Result<(Handle, Runner<()>), Error> {
-    if spec.their_functions <= 4 {
-        return unit!(FORGETFUL, stack, config);
-    }
-    if spec.one_call_at_a_time {
-        return unit!(ONE_AT_A_TIME, stack, config);
-    }
-    if spec.message_buffers < FEW && spec.constraints.message_size < LONG {
-        return unit!(TIGHT, stack, config);
-    }
-    match spec.constraints.message_size {
-        LONG.. => unit!(HUGE, stack, config),
-        ..=SHORT if spec.constraints.maximum_nodes == 1 => unit!(AGV, stack, config),
-        _ => unit!(MANAGER, stack, config),
-    }
+/// On a network.
+const fn with_its_links(limits: Limits) -> Limits {
+    limits
+}
+
+/// A unit in memory that suits its description, with as many links as its transport carries.
+macro_rules! unit {
+    ($links:ident, $limits:ident, $transport:expr, $config:expr) => {
+        cara_embassy::new($transport, Box::leak(Box::new(<resources!((), $links($limits))>::new())), $config, ())
+    };
+    ($links:ident, $spec:expr => $transport:expr, $config:expr) => {{
+        let Spec { constraints, their_functions, message_buffers, one_call_at_a_time, .. } = $spec;
+        match constraints.message_size {
+            _ if *their_functions <= 4 => unit!($links, FORGETFUL, $transport, $config),
+            _ if *one_call_at_a_time => unit!($links, ONE_AT_A_TIME, $transport, $config),
+            ..LONG if *message_buffers < FEW => unit!($links, TIGHT, $transport, $config),
+            LONG.. => unit!($links, HUGE, $transport, $config),
+            ..=SHORT if constraints.maximum_nodes == 1 => unit!($links, AGV, $transport, $config),
+            _ => unit!($links, MANAGER, $transport, $config),
+        }
+    }};
+}
+
+type Made = Result<(Handle, Runner<()>), Error>;
+
+/// A unit on a network.
+pub(super) fn on_network(spec: &Spec, stack: Stack<'static>, config: Config) -> Made {
+    unit!(with_its_links, spec => stack, config)
+}
+
+/// A unit on a line.
+pub(super) fn on_line(spec: &Spec, line: Line, config: Config) -> Made {
+    unit!(with_one_link, spec => line, config)
 }
 
 /// Nodes that it can have.

@@ -1,4 +1,5 @@
-//! Scenarios on boards: the embassy port over embassy-net, on a switch in memory and in virtual time.
+//! Scenarios on boards, in virtual time: the embassy port over embassy-net on a switch in memory, and on a serial line between
+//! two boards.
 
 mod memory;
 mod node;
@@ -10,16 +11,23 @@ use std::rc::Rc;
 use cara_core::config::Mode;
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
-use cara_embassy_host::{Bench, Faults};
+use cara_embassy_host::{Bench, Faults, Wire};
 
 use self::node::BoardNode;
 use self::visitor::Visitor;
 use crate::run::Report;
 use crate::{Fault, FaultProfile, Need, Port, Spec, Unit, UnknownClient, Unsupported, World};
 
+/// Of the line.
+const BAUD: u32 = 1_000_000;
+/// Of so many bytes on a line one is changed and one is lost, under the rough profile.
+const DAMAGED: u64 = 2_000;
+
 pub(super) struct EmbassyWorld {
     bench: Bench,
     mode: Mode,
+    /// In place of the switch.
+    wire: Option<Wire>,
     units: Vec<Rc<BoardNode>>,
     random: Random,
     report: Report,
@@ -30,7 +38,14 @@ impl EmbassyWorld {
         let bench = Bench::new(seed);
         let mut random = Random::new(seed ^ 0x00E3_BA55);
         bench.set_faults(faults(&mut random, profile));
-        Self { bench, mode, units: Vec::new(), random, report: Report::default() }
+        Self { bench, mode, wire: None, units: Vec::new(), random, report: Report::default() }
+    }
+
+    /// Two boards with keys on a serial line.
+    pub(super) fn on_line(seed: u64, profile: FaultProfile) -> Self {
+        let wire = Wire::new(BAUD, seed);
+        wire.set_damage(if profile == FaultProfile::Rough { DAMAGED } else { 0 });
+        Self { wire: Some(wire), ..Self::new(seed, profile, Mode::Secured) }
     }
 
     fn node(&self, unit: &Unit) -> &Rc<BoardNode> {
@@ -71,9 +86,32 @@ impl EmbassyWorld {
     }
 }
 
+impl EmbassyWorld {
+    fn inject_into_line(&mut self, wire: &Wire, fault: Fault<'_>) -> Result<(), Unsupported> {
+        let pull = |to: &Unit| wire.pull(to.number(), true);
+        match fault {
+            Fault::PowerCut(unit) | Fault::Kill(unit) => self.node(unit).cut_power(),
+            Fault::Restart(unit) => self.node(unit).boot(),
+            Fault::Cut(one, other) => [one, other].into_iter().for_each(pull),
+            Fault::CutOneWay(_, to) => pull(to),
+            Fault::Heal => [0, 1].into_iter().for_each(|end| wire.pull(end, false)),
+            Fault::Suspend(unit, span) => self.node(unit).board().suspend(span),
+            Fault::FreezeStreams(..) => return Err(Unsupported(Need::Freeze)),
+            Fault::FreezeLink(..) => return Err(Unsupported(Need::FreezeLink)),
+            Fault::ChangeAddress(_) => return Err(Unsupported(Need::AddressChange)),
+            Fault::Reset(_) => return Err(Unsupported(Need::Reset)),
+            Fault::Path(..) => return Err(Unsupported(Need::Path)),
+            Fault::SlowReader(..) => return Err(Unsupported(Need::SlowReader)),
+            Fault::UnknownClient(..) => return Err(Unsupported(Need::UnknownClients)),
+            Fault::Unplug(_) | Fault::Plug(_) => return Err(Unsupported(Need::Interface)),
+        }
+        Ok(())
+    }
+}
+
 impl World for EmbassyWorld {
     fn port(&self) -> Port {
-        Port::Embassy
+        if self.wire.is_some() { Port::Line } else { Port::Embassy }
     }
 
     fn now(&self) -> Instant {
@@ -81,7 +119,8 @@ impl World for EmbassyWorld {
     }
 
     fn add(&mut self, spec: Spec) -> Unit {
-        let node = BoardNode::new(self.units.len(), &self.bench, self.mode, spec);
+        assert!(self.wire.is_none() || self.units.len() < 2, "a line has two ends");
+        let node = BoardNode::new(self.units.len(), &self.bench, self.mode, self.wire.clone(), spec);
         self.units.push(Rc::clone(&node));
         Rc::new(node)
     }
@@ -91,6 +130,9 @@ impl World for EmbassyWorld {
     }
 
     fn inject(&mut self, fault: Fault<'_>) -> Result<(), Unsupported> {
+        if let Some(wire) = self.wire.clone() {
+            return self.inject_into_line(&wire, fault);
+        }
         match fault {
             Fault::PowerCut(unit) | Fault::Kill(unit) => self.node(unit).cut_power(),
             Fault::Restart(unit) => self.node(unit).boot(),
@@ -138,6 +180,10 @@ impl World for EmbassyWorld {
     fn report(&self) -> Report {
         let mut report = self.report.clone();
         for (name, count) in self.bench.counts().iter().filter(|(_, count)| *count > 0) {
+            *report.faults.entry(name).or_default() += count;
+        }
+        let wire = self.wire.as_ref().map(Wire::counts).unwrap_or_default();
+        for (name, count) in [("changed-byte", wire.changed), ("lost-byte", wire.lost)] {
             *report.faults.entry(name).or_default() += count;
         }
         report

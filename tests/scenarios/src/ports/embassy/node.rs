@@ -19,7 +19,7 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_embassy::{Config, Handle, LeaseWatch, Peer};
-use cara_embassy_host::{Bench, Board, now, security};
+use cara_embassy_host::{Bench, Board, Wire, now, security};
 use embassy_time::with_timeout;
 
 use super::super::lent;
@@ -32,6 +32,8 @@ pub(super) struct BoardNode {
     bench: Bench,
     mode: Mode,
     spec: Spec,
+    /// In place of a network; the unit's number is its end.
+    wire: Option<Wire>,
     board: RefCell<Board>,
     unit: RefCell<Option<Handle>>,
     /// Services of this life, with their leases.
@@ -45,12 +47,13 @@ pub(super) struct BoardNode {
 }
 
 impl BoardNode {
-    pub(super) fn new(number: usize, bench: &Bench, mode: Mode, spec: Spec) -> Rc<Self> {
+    pub(super) fn new(number: usize, bench: &Bench, mode: Mode, wire: Option<Wire>, spec: Spec) -> Rc<Self> {
         let node = Rc::new(Self {
             number,
             bench: bench.clone(),
             mode,
             spec,
+            wire,
             board: RefCell::new(bench.board()),
             unit: RefCell::new(None),
             services: RefCell::default(),
@@ -100,7 +103,12 @@ impl BoardNode {
 
     fn begin(self: &Rc<Self>) {
         let board = self.board();
-        let made = self.config().and_then(|config| memory::unit(&self.spec, board.stack(), config));
+        let made = self.config().and_then(|config| match &self.wire {
+            Some(wire) => {
+                memory::on_line(&self.spec, wire.line(self.number, &board, self.bench.random(u64::MAX)), config)
+            }
+            None => memory::on_network(&self.spec, board.stack(), config),
+        });
         let (unit, mut runner) = made.expect("a unit can be made");
         self.unit.replace(Some(unit));
         let losses = Rc::clone(&self.losses);
@@ -124,7 +132,8 @@ impl BoardNode {
     fn config(&self) -> Result<Config, Error> {
         let Spec { role, name, id, fleet, mut constraints, same_seed, .. } = self.spec.clone();
         let seed = if same_seed { 4 } else { self.bench.random(u64::MAX) };
-        constraints.maximum_nodes = constraints.maximum_nodes.min(memory::links(&self.spec));
+        let links = if self.wire.is_some() { 1 } else { memory::links(&self.spec) };
+        constraints.maximum_nodes = constraints.maximum_nodes.min(links);
         let security = security(self.mode, &self.spec.identity(), fleet, seed);
         let config = match role {
             SpecRole::Manager => Config::m_unit(&name, id, security)?,
