@@ -162,7 +162,7 @@ impl Shared {
                         break;
                     }
                     if allowed < usize::MAX {
-                        thread::sleep(Duration::from_secs(1));
+                        thread::sleep(Duration::from_secs_f64(count as f64 / allowed as f64));
                     }
                 }
                 Err(error)
