@@ -1,8 +1,10 @@
 //! The share of calls that meet their deadlines while more is asked of a unit than it can do, by earliest deadline, with and
-//! without admission, and in the order of arrival: in the simulator, so that each run gives the same figures.
+//! without admission, and in the order of arrival: in the simulator, so that each run gives the same figures, and on Linux.
 
-use std::cell::Cell;
+pub(crate) mod linux;
+
 use std::rc::Rc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::{Result, ensure};
 use cara_core::config::{Constraints, Scheduling};
@@ -10,6 +12,7 @@ use cara_core::error::ServiceError;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_sim::{Service, UnitHandle, World, boxed_parameters};
+use serde::{Serialize, Serializer};
 
 /// Percent of what the unit can do that is asked of it.
 pub(crate) const LOADS: [u64; 5] = [50, 80, 100, 120, 150];
@@ -21,12 +24,21 @@ const TAKES: u64 = 10_000;
 const TIMEOUTS: [u64; 4] = [50, 100, 200, 400];
 
 /// The share at one load.
+#[derive(Serialize)]
 pub(crate) struct Share {
+    #[serde(serialize_with = "word")]
     pub(crate) scheduling: Scheduling,
     pub(crate) load: u64,
+    pub(crate) calls: u64,
     pub(crate) met: f64,
     /// By time-out, the shortest first.
     pub(crate) by_timeout: [f64; TIMEOUTS.len()],
+    /// How long runs took, in proportion to what they were to take: with 1.1 the load was a tenth higher than it says.
+    pub(crate) run_time: f64,
+}
+
+fn word<S: Serializer>(scheduling: &Scheduling, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(scheduling.word())
 }
 
 /// Every load in each order; in each order the same calls at the same times.
@@ -52,6 +64,57 @@ impl Draw {
     }
 }
 
+/// A call that is made, with times in microseconds.
+struct Call {
+    /// Since the first one could be due.
+    due: u64,
+    takes: u64,
+    /// Its time-out.
+    which: usize,
+}
+
+impl Call {
+    /// Those at a load, for ever.
+    fn at(load: u64) -> impl Iterator<Item = Self> {
+        let (mut draw, mut due) = (Draw(1), 0);
+        std::iter::repeat_with(move || {
+            due += draw.exponential(TAKES * 100 / load);
+            Self { due, takes: TAKES / 2 + draw.below(TAKES), which: draw.below(TIMEOUTS.len() as u64) as usize }
+        })
+    }
+
+    fn timeout_ms(&self) -> u64 {
+        TIMEOUTS[self.which]
+    }
+}
+
+/// How calls ended, by time-out.
+#[derive(Default)]
+struct Tally([Ended; TIMEOUTS.len()]);
+
+#[derive(Default)]
+struct Ended {
+    calls: AtomicU64,
+    in_time: AtomicU64,
+}
+
+impl Tally {
+    fn ended(&self, which: usize, in_time: bool) {
+        self.0[which].calls.fetch_add(1, Ordering::Relaxed);
+        self.0[which].in_time.fetch_add(in_time.into(), Ordering::Relaxed);
+    }
+
+    /// Of so many calls, all of which must have ended.
+    fn share(&self, scheduling: Scheduling, load: u64, calls: u64) -> Result<Share> {
+        let each =
+            self.0.each_ref().map(|ended| [&ended.calls, &ended.in_time].map(|count| count.load(Ordering::Relaxed)));
+        let sum = each.iter().fold([0, 0], |sum, [calls, in_time]| [sum[0] + calls, sum[1] + in_time]);
+        ensure!(sum[0] == calls, "{} of {calls} calls have ended", sum[0]);
+        let of = |[calls, in_time]: [u64; 2]| in_time as f64 / calls.max(1) as f64;
+        Ok(Share { scheduling, load, calls, met: of(sum), by_timeout: each.map(of), run_time: 1.0 })
+    }
+}
+
 /// Two m_units of which one runs one call of the other at a time.
 fn pair(scheduling: Scheduling) -> Result<(World, UnitHandle)> {
     let mut world = World::new(1);
@@ -72,30 +135,21 @@ fn pair(scheduling: Scheduling) -> Result<(World, UnitHandle)> {
 
 fn share(scheduling: Scheduling, load: u64) -> Result<Share> {
     let (mut world, main) = pair(scheduling)?;
-    let (mut draw, mut due) = (Draw(1), world.now());
-    let met: Rc<[(Cell<u64>, Cell<u64>); TIMEOUTS.len()]> = Rc::default();
-    for _ in 0..CALLS {
-        due = due + Duration::from_micros(draw.exponential(TAKES * 100 / load));
-        let (takes, which) = (TAKES / 2 + draw.below(TAKES), draw.below(TIMEOUTS.len() as u64) as usize);
-        let timeout = Duration::from_millis(TIMEOUTS[which]);
-        world.run_for(due.since(world.now()));
-        let (met, unit) = (met.clone(), main.clone());
+    let (start, tally) = (world.now(), Rc::<Tally>::default());
+    for call in Call::at(load).take(CALLS as usize) {
+        world.run_for((start + Duration::from_micros(call.due)).since(world.now()));
+        let (tally, unit) = (tally.clone(), main.clone());
         main.spawn(async move {
             let mut parameters = boxed_parameters(64);
-            let set = parameters.add_int("takes", 1).and_then(|()| parameters.set_value("takes", takes as i64));
-            let options = RequestOptions { timeout: Some(timeout), ..RequestOptions::default() };
+            let set = parameters.add_int("takes", 1).and_then(|()| parameters.set_value("takes", call.takes as i64));
+            let timeout = Some(Duration::from_millis(call.timeout_ms()));
+            let options = RequestOptions { timeout, ..RequestOptions::default() };
             let called = unit.block_request_with("passive", "work", &mut parameters, options).await;
-            let (made, in_time) = &met[which];
-            made.set(made.get() + 1);
-            in_time.set(in_time.get() + u64::from(set.is_ok() && called.is_ok()));
+            tally.ended(call.which, set.is_ok() && called.is_ok());
         });
     }
     world.run_for(Duration::from_secs(1));
-    let of = |made: u64, in_time: u64| in_time as f64 / made.max(1) as f64;
-    let all = met.iter().fold((0, 0), |sum, (made, in_time)| (sum.0 + made.get(), sum.1 + in_time.get()));
-    ensure!(all.0 == CALLS, "{} of {CALLS} calls have ended", all.0);
-    let by_timeout = std::array::from_fn(|which| of(met[which].0.get(), met[which].1.get()));
-    Ok(Share { scheduling, load, met: of(all.0, all.1), by_timeout })
+    tally.share(scheduling, load, CALLS)
 }
 
 /// A table for people.
@@ -103,7 +157,7 @@ pub(crate) fn table(shares: &[Share]) -> String {
     let timeouts: String = TIMEOUTS.iter().map(|timeout| format!(" {timeout} ms |")).collect();
     let mut text =
         format!("| order | load | deadlines met |{timeouts}\n|---|---|---|{}\n", "---|".repeat(TIMEOUTS.len()));
-    for Share { scheduling, load, met, by_timeout } in shares {
+    for Share { scheduling, load, met, by_timeout, .. } in shares {
         let each: String = by_timeout.iter().map(|share| format!(" {:.1} % |", 100.0 * share)).collect();
         text += &format!("| `{}` | {load} % | {:.1} % |{each}\n", scheduling.word(), 100.0 * met);
     }

@@ -50,7 +50,10 @@ enum Command {
     },
     /// The share of deadlines met at loads of 50 to 150 %, in the simulator; prints a table.
     Deadlines {
-        /// Where the figure goes.
+        /// On Linux in place of the simulator, which takes five minutes.
+        #[arg(long)]
+        linux: bool,
+        /// Where the figure goes, and the rows of Linux.
         folder: Option<PathBuf>,
     },
     /// Counts what each end of a round trip asks of the kernel; an error where that has grown.
@@ -84,10 +87,10 @@ fn main() -> Result<()> {
             experiments::run(&options)
         }
         Command::Plots { json, folder } => plots::draw(&results::Results::read(&json)?, &folder),
-        Command::Deadlines { folder } => {
-            let shares = deadlines::measure()?;
+        Command::Deadlines { linux, folder } => {
+            let shares = if linux { deadlines::linux::measure() } else { deadlines::measure() }?;
             print!("{}", deadlines::table(&shares));
-            folder.map_or(Ok(()), |folder| plots::draw_deadlines(&shares, &folder))
+            folder.map_or(Ok(()), |folder| plots::draw_deadlines(&shares, linux, &folder))
         }
         Command::Counts => counts::check(),
         Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),

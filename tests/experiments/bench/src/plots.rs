@@ -41,8 +41,8 @@ pub(crate) fn draw(results: &Results, folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Draws the share of deadlines that are met over the load.
-pub(crate) fn draw_deadlines(shares: &[Share], folder: &Path) -> Result<()> {
+/// Draws the share of deadlines that are met over the load, and writes what was measured on Linux.
+pub(crate) fn draw_deadlines(shares: &[Share], linux: bool, folder: &Path) -> Result<()> {
     let line = |scheduling: Scheduling| {
         let of = shares.iter().filter(|share| share.scheduling == scheduling);
         let points = of.map(|share| Point::new(share.load as f64, share.met)).collect();
@@ -50,9 +50,15 @@ pub(crate) fn draw_deadlines(shares: &[Share], folder: &Path) -> Result<()> {
     };
     let (x, y) = (Axis::linear("load, %"), Axis::share("deadlines met / calls"));
     let chart = Chart::new("Deadlines met, one call at a time", x, y, Scheduling::ALL.map(line).into());
-    let about = ["simulator; calls of 5 to 15 ms", "time-outs of 50, 100, 200 and 400 ms"].map(str::to_owned);
+    let (name, about) = match linux {
+        false => ("deadlines", ["simulator; calls of 5 to 15 ms", "time-outs of 50, 100, 200 and 400 ms"]),
+        true => ("deadlines-linux", ["Linux, loopback; calls of 25 to 75 ms", "time-outs of 0.25, 0.5, 1 and 2 s"]),
+    };
     std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-    chart::draw(&[vec![chart]], &about, &folder.join("deadlines"))
+    if linux {
+        std::fs::write(folder.join(format!("{name}.json")), serde_json::to_string_pretty(shares)? + "\n")?;
+    }
+    chart::draw(&[vec![chart]], &about.map(str::to_owned), &folder.join(name))
 }
 
 fn figures(results: &Results) -> Vec<Figure> {
