@@ -1,7 +1,7 @@
 //! Names of nodes as parts of names of files.
 
-/// Letters, digits, `_` and `-` stay, and `.` behind the first character; of the rest each byte in hexadecimal.
-pub(crate) fn escape(name: &str) -> String {
+/// A node's name as a part of a file's name. Letters, digits, `_` and `-` stay, and `.` behind the first character; of the rest each byte in hexadecimal.
+pub fn escape(name: &str) -> String {
     let mut escaped = String::new();
     for (index, byte) in name.bytes().enumerate() {
         match byte {

@@ -146,6 +146,7 @@ pub use config::Capacities;
 pub use engine::details::Canceller;
 pub use error::{CallError, HandOverError, StartError};
 pub use event::{Finding, UnitEvent};
+pub use file_name::escape as file_name;
 pub use growing::{CallParameters, GrowingParameters};
 pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{IntoHandler, Served, ServiceOptions};

@@ -53,6 +53,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Top(arguments) => commands::top::run(arguments, global),
         Verb::Record(arguments) => commands::record::run(arguments, global),
         Verb::Replay(arguments) => commands::replay::run(arguments, global),
+        Verb::BlackBox(arguments) => commands::black_box::run(arguments, global),
         Verb::Stream(arguments) => commands::stream::run(arguments, global),
         Verb::Counters(arguments) => commands::counters::run(arguments, global),
         Verb::Ping(arguments) => commands::ping::run(arguments, global),

@@ -516,6 +516,33 @@ fn the_end_of_the_node_makes_safe_once() {
 }
 
 #[test]
+fn what_led_to_a_stop_is_in_a_black_box() {
+    let halt = "[[functions]]\nsignature = \"halt(n: int) -> (n: int)\"\nanswer = \"echo\"\nstop = true\n";
+    let mut node = Node::start_with(halt, &["--state", "state"]);
+    let (_unit, manager) = node.vehicle("agv", 7);
+    manager.block_request("halt", &mut number(17)).unwrap();
+    assert!(node.process.terminate(PATIENCE).unwrap().success());
+    let cara = |arguments: &[&str]| {
+        let ran = Command::new(cara()).args(arguments).current_dir(node.folder.path()).output().unwrap();
+        assert!(ran.status.success(), "{}", text(&ran.stderr));
+        text(&ran.stdout)
+    };
+    let listed: serde_json::Value =
+        serde_json::from_str(&cara(&["black-box", "plant", "--state", "state", "--json"])).unwrap();
+    let boxes = listed["black_boxes"].as_array().unwrap();
+    assert_eq!(
+        (boxes.len(), &boxes[0]["cause"], &boxes[0]["node"]),
+        (1, &"stop".into(), &"plant/1".into()),
+        "{listed}"
+    );
+    let replayed = cara(&["replay", boxes[0]["file"].as_str().unwrap()]);
+    for part in ["joined", "halt {\"n\":17}", "signal=\"SIGTERM\""] {
+        assert!(replayed.contains(part), "`{part}` is not in {replayed}");
+    }
+    assert!(cara(&["black-box", "other/1", "--state", "state"]).contains("no black box"));
+}
+
+#[test]
 fn a_service_manager_hears_that_the_node_is_up_that_it_lives_and_that_it_ends() {
     let folder = TempDir::new().unwrap();
     let socket = UnixDatagram::bind(folder.path().join("notify")).unwrap();

@@ -159,8 +159,8 @@ pub(super) const fn constraints(constraints: &Constraints) -> ConstraintsInfo {
     }
 }
 
-/// An event in words; `at` is the time since the unit was made.
-pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
+/// An event in words, as [`Question::Watch`](super::protocol::Question::Watch) has it; `at` is the time since the unit was made.
+pub fn event(event: &UnitEvent, at: Duration) -> Answer {
     let (name, node, text) = match event {
         UnitEvent::Joined { peer } => ("joined", Some(peer), "is connected".to_owned()),
         UnitEvent::Left { peer, reason } => ("left", Some(peer), reason.to_string()),

@@ -41,6 +41,7 @@ pub use client::{
     Answers, Client, Closer, ControlError, RunningUnit, UnitState, first_of, running, running_called, running_in,
 };
 pub(crate) use commands::{Commands, FollowedCall, Recorded};
+pub use describe::event as described;
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use forgetting::{ForgetError, Forgotten, forget_claims, state_folder};
 pub use location::{directories, directory};

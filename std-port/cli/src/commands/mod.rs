@@ -1,6 +1,7 @@
 //! The verbs, one file each.
 
 pub(crate) mod access;
+pub(crate) mod black_box;
 pub(crate) mod call;
 pub(crate) mod completions;
 pub(crate) mod counters;

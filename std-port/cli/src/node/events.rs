@@ -8,6 +8,10 @@ use std::time::{Duration, Instant};
 
 use cara_std::{Claim, CloseReason, Identity, UnitEvent};
 
+use super::black_box::BlackBox;
+
+/// The target of its lines.
+pub(super) const TARGET: &str = module_path!();
 /// How often what is left out is looked for.
 const LOOK: Duration = Duration::from_secs(1);
 
@@ -16,13 +20,21 @@ const LOOK: Duration = Duration::from_secs(1);
 pub(super) fn log(
     events: Receiver<UnitEvent>,
     address: impl Fn(&Identity) -> Option<SocketAddr> + Send + 'static,
+    black_box: BlackBox,
     fenced: impl Fn(Claim) + Send + 'static,
 ) -> anyhow::Result<()> {
-    std::thread::Builder::new().name("cara-log".into()).spawn(move || log_all(&events, &address, &fenced))?;
+    std::thread::Builder::new()
+        .name("cara-log".into())
+        .spawn(move || log_all(&events, &address, &black_box, &fenced))?;
     Ok(())
 }
 
-fn log_all(events: &Receiver<UnitEvent>, address: &dyn Fn(&Identity) -> Option<SocketAddr>, fenced: &dyn Fn(Claim)) {
+fn log_all(
+    events: &Receiver<UnitEvent>,
+    address: &dyn Fn(&Identity) -> Option<SocketAddr>,
+    black_box: &BlackBox,
+    fenced: &dyn Fn(Claim),
+) {
     let mut sparing = Sparing::default();
     // As many as there are peers.
     let mut addresses = HashMap::new();
@@ -31,6 +43,9 @@ fn log_all(events: &Receiver<UnitEvent>, address: &dyn Fn(&Identity) -> Option<S
             true => events.recv().map_err(|_| RecvTimeoutError::Disconnected),
             false => events.recv_timeout(LOOK),
         };
+        if let Ok(event) = &event {
+            black_box.event(event);
+        }
         match event {
             Ok(UnitEvent::Fenced { claim }) => fenced(claim),
             Ok(event) => {

@@ -42,6 +42,8 @@ pub(super) struct File {
     #[serde(default)]
     pub(super) log: Log,
     #[serde(default)]
+    pub(super) black_box: BlackBox,
+    #[serde(default)]
     pub(super) functions: Vec<Spanned<Function>>,
 }
 
@@ -131,6 +133,14 @@ pub(super) struct Metrics {
 #[serde(deny_unknown_fields)]
 pub(super) struct Log {
     pub(super) level: Maybe<String>,
+}
+
+/// `[black_box]`
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct BlackBox {
+    pub(super) keep: Maybe<Size>,
+    pub(super) size: Maybe<Size>,
 }
 
 /// `[[functions]]`

@@ -4,6 +4,7 @@ use std::ops::{Range, RangeInclusive};
 
 use cara_std::{Capacities, Constraints, Duration, Scheduling};
 
+use super::black_box::Budget;
 use super::file::{self, Maybe, Role};
 use super::mistake::Mistake;
 use super::values::{Size, Time};
@@ -62,6 +63,14 @@ pub(super) fn capacities(table: &file::Capacities, mistakes: &mut Vec<Mistake>) 
     set(&mut sizes.signature_bytes, &table.signature_bytes, SIGNATURE_BYTES, mistakes);
     set(&mut sizes.their_signature_bytes, &table.their_signature_bytes, SIGNATURE_BYTES, mistakes);
     sizes
+}
+
+/// What the black box may take with what the file says.
+pub(super) fn black_box(table: &file::BlackBox, mistakes: &mut Vec<Mistake>) -> Budget {
+    let mut budget = Budget::default();
+    set(&mut budget.keep, &table.keep, 0..=1000, mistakes);
+    set(&mut budget.size, &table.size, 64 * 1024..=256 << 20, mistakes);
+    budget
 }
 
 fn set<T: TryFrom<u64>>(place: &mut T, value: &Maybe<Size>, range: RangeInclusive<u64>, mistakes: &mut Vec<Mistake>) {

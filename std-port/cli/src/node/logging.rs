@@ -1,13 +1,19 @@
 //! The node's log: lines on standard error, at a level that can change while it runs. A queue stands before it: a terminal or
 //! pipe that takes nothing holds up no thread of the unit.
 
+use std::fmt::{self, Write as _};
 use std::io::{IsTerminal, Write};
 use std::time::Duration;
 
 use cara_std::LineQueue;
-use tracing_subscriber::EnvFilter;
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::filter::{LevelFilter, ParseError};
+use tracing_subscriber::layer::{Context, SubscriberExt};
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
 
+use super::black_box::{BlackBox, Cause};
 use cara_tools::exit::Ended;
 
 /// The default log filter.
@@ -50,9 +56,42 @@ pub(super) fn filter(text: &str) -> Result<EnvFilter, LevelError> {
     }
 }
 
+/// Lines of the log on their way into the black box.
+struct Boxed(BlackBox);
+
+impl<S: Subscriber> Layer<S> for Boxed {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        let metadata = event.metadata();
+        // Those events are in the box in a form of their own.
+        if metadata.target() != super::events::TARGET {
+            self.0.note("log", None, || {
+                let mut text = metadata.level().to_string();
+                event.record(&mut Fields(&mut text));
+                text
+            });
+        }
+        if *metadata.level() == Level::ERROR {
+            self.0.freeze(Cause::Error);
+        }
+    }
+}
+
+/// Writes the fields of an event behind its level.
+struct Fields<'t>(&'t mut String);
+
+impl Visit for Fields<'_> {
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        // A string takes all.
+        let _ = match field.name() {
+            "message" => write!(self.0, " {value:?}"),
+            name => write!(self.0, " {name}={value:?}"),
+        };
+    }
+}
+
 impl Logging {
     /// Begins to log. The command line's level stands above `RUST_LOG`, and that above the file's.
-    pub(super) fn start(command_line: Option<&str>, file: Option<&str>) -> anyhow::Result<Self> {
+    pub(super) fn start(command_line: Option<&str>, file: Option<&str>, black_box: &BlackBox) -> anyhow::Result<Self> {
         let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
         let fixed = command_line.is_some() || environment.is_some();
         let filter = match (command_line, environment) {
@@ -83,7 +122,7 @@ impl Logging {
         let builder = builder.with_filter_reloading();
         let handle = builder.reload_handle();
         // Another one is there only if a test has set it; that one may stay.
-        let _ = builder.try_init();
+        let _ = builder.finish().with(Boxed(black_box.clone())).try_init();
         let change = Box::new(move |filter| {
             // Fails only once the subscriber is gone.
             let _ = handle.reload(filter);

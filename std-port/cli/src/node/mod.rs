@@ -1,5 +1,6 @@
 //! `cara node`: a unit that stays up, with a configuration file instead of code.
 
+pub(crate) mod black_box;
 mod events;
 mod file;
 mod functions;
@@ -26,6 +27,7 @@ use cara_std::keys::KeyRing;
 use cara_std::{Fleet, Identity, Interfaces};
 use serde_json::json;
 
+use black_box::BlackBox;
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::files;
 use cara_tools::global::Global;
@@ -110,8 +112,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         report_correct(&settings, global)?;
         return Ok(Exit::Done.into());
     }
-    let logging = logging::Logging::start(over.log.as_deref(), settings.file_log.as_deref())?;
-    running::run(settings, &over, &logging, global)?;
+    let black_box = BlackBox::new(&settings);
+    let logging = logging::Logging::start(over.log.as_deref(), settings.file_log.as_deref(), &black_box)?;
+    running::run(settings, &over, &logging, &black_box, global)?;
     Ok(Exit::Done.into())
 }
 

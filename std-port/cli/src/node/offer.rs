@@ -5,13 +5,14 @@ use std::time::Duration;
 
 use cara_std::{Definition, Error, MyFunctionList, ParametersView, Served, ServiceError, ServiceOptions, Shown};
 
+use super::black_box::{BlackBox, Cause};
 use super::functions::{Service, Work};
 use super::json;
 use super::program::{Programs, Task};
 
 /// How long a program that makes safe may run.
 const SAFE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Longest text of arguments in a line of the log.
+/// Longest text of arguments in a line of the log, and in the black box.
 const LOGGED_BYTES: usize = 1024;
 
 /// Adds a service to the list.
@@ -20,6 +21,7 @@ pub(super) fn offer(
     number: usize,
     service: &Service,
     programs: &Arc<Programs>,
+    black_box: &BlackBox,
 ) -> Result<(), Error> {
     let definition = service.definition.clone();
     let mut options = ServiceOptions::new().attributes(service.attributes);
@@ -27,10 +29,10 @@ pub(super) fn offer(
         options = options.lease(length, make_safe(number, service, programs));
     }
     match &service.work {
-        Work::Echo => list.add_service(&service.definition, options, echo)?,
+        Work::Echo => list.add_service(&service.definition, options, boxed(service, black_box, echo))?,
         Work::Log => {
             let log = move |call: &Served, view: &mut ParametersView| log(&definition, call, view);
-            list.add_service(&service.definition, options, log)?
+            list.add_service(&service.definition, options, boxed(service, black_box, log))?
         }
         Work::Program { command, timeout } => {
             let (command, timeout, programs) = (command.clone(), (*timeout).into(), programs.clone());
@@ -38,10 +40,40 @@ pub(super) fn offer(
                 let task = Serving { number, definition: &definition, command: &command, timeout };
                 task.run(&programs, call, view)
             };
-            list.add_service(&service.definition, options, run)?
+            list.add_service(&service.definition, options, boxed(service, black_box, run))?
         }
     };
     Ok(())
+}
+
+/// What a service does, with each call and its outcome put into the black box.
+fn boxed(
+    service: &Service,
+    black_box: &BlackBox,
+    work: impl Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
+) -> impl Fn(&Served, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
+    let (definition, attributes, black_box) = (service.definition.clone(), service.attributes, black_box.clone());
+    move |call, view| {
+        black_box.note("called", Some(&call.caller), || shown(&definition, view));
+        let outcome = work(call, view);
+        black_box.note("answered", Some(&call.caller), || match &outcome {
+            Ok(()) => definition.name().to_owned(),
+            Err(error) => format!("{}: {error}", definition.name()),
+        });
+        match outcome {
+            Ok(()) if attributes.stop => black_box.freeze(Cause::Stop),
+            Ok(()) if attributes.reset => black_box.freeze(Cause::Reset),
+            _ => {}
+        }
+        outcome
+    }
+}
+
+/// A call as its name and arguments.
+fn shown(definition: &Definition, view: &ParametersView) -> String {
+    let mut text = format!("{} {}", definition.name(), json::arguments(definition.signature(), view));
+    text.truncate(text.floor_char_boundary(LOGGED_BYTES));
+    text
 }
 
 fn echo(_: &Served, _: &mut ParametersView) -> Result<(), ServiceError> {

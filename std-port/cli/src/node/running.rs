@@ -11,6 +11,7 @@ use serde_json::json;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
+use super::black_box::BlackBox;
 use super::logging::Logging;
 use super::mistake::Mistakes;
 use super::offer::offer;
@@ -23,7 +24,13 @@ use cara_tools::global::Global;
 use cara_tools::output;
 
 /// Runs a node until it is asked to end.
-pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, global: &Global) -> anyhow::Result<()> {
+pub(super) fn run(
+    settings: Settings,
+    over: &Overrides,
+    logging: &Logging,
+    black_box: &BlackBox,
+    global: &Global,
+) -> anyhow::Result<()> {
     // First, so that a signal during the start ends the node in an orderly way too.
     let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("signals cannot be waited for")?;
     let programs = Arc::new(Programs::default());
@@ -35,11 +42,12 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
             Ended::usage(format!("the audit log {path} cannot be written: {error}"))
         }
     })?;
-    offer_all(&node, &settings, &programs)?;
+    offer_all(&node, &settings, &programs, black_box)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     let (ending, fenced) = (signals.handle(), Arc::new(OnceLock::new()));
     let reported = fenced.clone();
-    events::log(node.events(), node.addresses(), move |term| {
+    black_box.start(&settings, node.look());
+    events::log(node.events(), node.addresses(), black_box.clone(), move |term| {
         let _ = reported.set(term);
         ending.close();
     })?;
@@ -52,6 +60,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
         tracing::warn!(%error, "the line that the node is up could not be written");
     }
     service::up(&node);
+    node.follow_commands(black_box.clone());
     let mut settings = settings;
     for signal in signals.forever() {
         tracing::info!(signal = signal_hook::low_level::signal_name(signal), "signal");
@@ -66,6 +75,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     // Only now, since a service manager that hangs may hold this up.
     service::ends();
     programs.finish();
+    black_box.end();
     match fenced.get() {
         None => Ok(()),
         Some(claim) => Err(Ended::fenced(*claim)),
@@ -73,10 +83,10 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
 }
 
 /// Puts the file's services into the unit's list, and publishes them to all.
-fn offer_all(node: &Node, settings: &Settings, programs: &Arc<Programs>) -> anyhow::Result<()> {
+fn offer_all(node: &Node, settings: &Settings, programs: &Arc<Programs>, black_box: &BlackBox) -> anyhow::Result<()> {
     let list = node.my_function_list();
     for (number, service) in settings.services.iter().enumerate() {
-        offer(&list, number, service, programs).map_err(|error| {
+        offer(&list, number, service, programs, black_box).map_err(|error| {
             let help = "the unit does not take this function; [capacities] says how much it has room for";
             wrong(settings.mistake(service.span.clone(), &error.to_string(), help))
         })?;

@@ -8,6 +8,7 @@ use cara_std::access::AccessTable;
 use cara_std::control::{Control, Operators};
 use cara_std::{Capacities, Constraints, Identity, Interfaces};
 
+use super::black_box::Budget;
 use super::file::{self, File, Maybe, Role};
 use super::functions::{self, Service};
 use super::limits;
@@ -47,13 +48,14 @@ pub(super) struct Settings {
     pub(super) forces: bool,
     /// It waits until no live one has its identity.
     pub(super) stands_by: bool,
-    /// Where it keeps its term.
+    /// Where it keeps its claims and black boxes.
     pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<Placed<SocketAddr>>,
     /// The file of the access table.
     pub(super) access: Option<PathBuf>,
     /// The file's level of the log.
     pub(super) file_log: Option<String>,
+    pub(super) black_box: Budget,
     pub(super) services: Vec<Service>,
 }
 
@@ -155,6 +157,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         metrics: metrics(file, over, mistakes),
         access: access(file, over, mistakes),
         file_log: log(file, mistakes),
+        black_box: limits::black_box(&file.black_box, mistakes),
         services: functions::services(&source, &file.functions, capacities.functions, mistakes),
         capacities,
         source,

@@ -1,17 +1,21 @@
 //! The node's unit, whichever role it has.
 
 use std::net::SocketAddr;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
 use cara_std::access::AccessError;
+use cara_std::control::execute;
+use cara_std::control::protocol::{Answer, Question};
 use cara_std::{
     BuildError, Builder, CommunicationSystem, Constraints, Error, Identity, Mode, MyFunctionList, StartError, Unit,
     UnitEvent,
 };
 
+use super::black_box::{BlackBox, Cause};
 use super::http::Metrics;
 use super::settings::Settings;
 
@@ -170,6 +174,61 @@ impl Node {
                 let unit = unit.downgrade();
                 Box::new(move |within| Some(unit.upgrade()?.keeps_time(within)))
             }
+        }
+    }
+
+    /// What is so at a moment, as the answers of a control socket; holds no unit alive but meanwhile.
+    pub(super) fn look(&self) -> Box<dyn Fn(&mut dyn FnMut(Answer)) + Send> {
+        match self {
+            Self::Manager(system) => {
+                let system = system.downgrade();
+                Box::new(move |found| {
+                    let Some(system) = system.upgrade() else { return };
+                    let questions = [
+                        Question::Unit,
+                        Question::Nodes { offering: None },
+                        Question::Orders { node: None },
+                        Question::Counters { node: None },
+                    ];
+                    for question in questions {
+                        execute(&system, &question, &mut |answer| {
+                            found(answer);
+                            ControlFlow::Continue(())
+                        });
+                    }
+                })
+            }
+            Self::Vehicle(unit) => {
+                let unit = unit.downgrade();
+                Box::new(move |found| {
+                    let Some(unit) = unit.upgrade() else { return };
+                    let counters = unit.counters().into_iter().map(|(name, count)| (name.to_owned(), count));
+                    found(Answer::Counters { node: None, counters: counters.collect() });
+                })
+            }
+        }
+    }
+
+    /// Has a manager's commands put into the black box, until it stops.
+    pub(super) fn follow_commands(&self, black_box: BlackBox) {
+        let Self::Manager(system) = self else { return };
+        let system = system.downgrade();
+        let follow = move || {
+            let Some(system) = system.upgrade() else { return };
+            execute(&system, &Question::Commands, &mut |answer| {
+                if let Answer::Command { question, .. } = &answer {
+                    black_box.take(&answer);
+                    match **question {
+                        Question::Stop { .. } => black_box.freeze(Cause::Stop),
+                        Question::Reset { .. } => black_box.freeze(Cause::Reset),
+                        _ => {}
+                    }
+                }
+                ControlFlow::Continue(())
+            });
+        };
+        if let Err(error) = std::thread::Builder::new().name("cara-commands".into()).spawn(follow) {
+            tracing::warn!(%error, "the black box has no commands");
         }
     }
 

@@ -38,11 +38,12 @@ pub(super) struct Files {
     limits: Limits,
     about: Metadata,
     state: Arc<State>,
-    open: Option<Open>,
+    open: Option<Open<Patient>>,
 }
 
-struct Open {
-    mcap: mcap::Writer<NoSeek<BufWriter<Patient>>>,
+/// A file with its channels.
+pub(super) struct Open<W: Write> {
+    mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
     /// Each with its number and that of its last message, by topic and form.
     channels: HashMap<(String, String), (u16, u32)>,
 }
@@ -90,12 +91,7 @@ impl Files {
 
     fn begin(&mut self, file: File) -> McapResult<()> {
         self.state.begins();
-        let to = NoSeek::new(BufWriter::new(Patient { file, state: self.state.clone() }));
-        let options = WriteOptions::new().compression(None).chunk_size(Some(CHUNK)).disable_seeking(true);
-        let mut mcap = options.profile("cara").library(super::LIBRARY).create(to)?;
-        mcap.write_metadata(&self.about)?;
-        mcap.flush()?;
-        self.open = Some(Open { mcap, channels: HashMap::new() });
+        self.open = Some(Open::begin(Patient { file, state: self.state.clone() }, &self.about)?);
         Ok(())
     }
 
@@ -115,10 +111,7 @@ impl Files {
 
     /// Writes what a reader needs to find its way, which makes the file a whole one.
     pub(super) fn finish(&mut self) -> McapResult<()> {
-        let Some(mut open) = self.open.take() else { return Ok(()) };
-        open.mcap.finish()?;
-        open.mcap.into_inner().into_inner().flush()?;
-        Ok(())
+        self.open.take().map_or(Ok(()), |open| open.finish().map(drop))
     }
 
     fn next(&mut self) -> McapResult<()> {
@@ -135,8 +128,23 @@ impl Files {
     }
 }
 
-impl Open {
-    fn write(&mut self, message: &Message, came: u64) -> McapResult<()> {
+impl<W: Write> Open<W> {
+    pub(super) fn begin(to: W, about: &Metadata) -> McapResult<Self> {
+        let options = WriteOptions::new().compression(None).chunk_size(Some(CHUNK)).disable_seeking(true);
+        let mut mcap = options.profile("cara").library(super::LIBRARY).create(NoSeek::new(BufWriter::new(to)))?;
+        mcap.write_metadata(about)?;
+        mcap.flush()?;
+        Ok(Self { mcap, channels: HashMap::new() })
+    }
+
+    /// Writes what a reader needs to find its way.
+    pub(super) fn finish(mut self) -> McapResult<W> {
+        self.mcap.finish()?;
+        let written = self.mcap.into_inner().into_inner();
+        written.into_inner().map_err(|error| error.into_error().into())
+    }
+
+    pub(super) fn write(&mut self, message: &Message, came: u64) -> McapResult<()> {
         let key = (message.topic.to_string(), message.form.clone());
         if !self.channels.contains_key(&key) {
             if self.channels.len() >= MOST_CHANNELS {
@@ -160,7 +168,7 @@ impl Open {
 }
 
 /// A new file that only its owner can read, and that this process alone records into.
-fn create(path: &Path) -> io::Result<File> {
+pub(super) fn create(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
     // A file system without locks has none of another process either.
     let _ = file.try_lock();

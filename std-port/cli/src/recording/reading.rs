@@ -1,6 +1,6 @@
 //! Reads the messages of an MCAP file from its beginning, also of one that was cut off.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::Path;
@@ -17,6 +17,8 @@ pub(crate) struct Reading<R> {
     from: R,
     reader: LinearReader,
     topics: HashMap<u16, String>,
+    /// The metadata that `cara` writes.
+    about: BTreeMap<String, String>,
     /// Of the chunk that was read last.
     found: VecDeque<Message>,
     /// It is an MCAP file.
@@ -54,12 +56,25 @@ impl<R: Read> Reading<R> {
     pub(crate) fn of(from: R) -> Self {
         let options = LinearReaderOptions::default().with_emit_chunks(true).with_record_length_limit(LONGEST);
         let reader = LinearReader::new_with_options(options);
-        Self { from, reader, topics: HashMap::new(), found: VecDeque::new(), is_begun: false, end: None }
+        Self {
+            from,
+            reader,
+            topics: HashMap::new(),
+            about: BTreeMap::new(),
+            found: VecDeque::new(),
+            is_begun: false,
+            end: None,
+        }
     }
 
     /// How it has ended, once there are no more messages.
     pub(crate) fn end(&self) -> Option<&End> {
         self.end.as_ref()
+    }
+
+    /// What the recording says of itself, once the first message has been read.
+    pub(crate) fn about(&self) -> &BTreeMap<String, String> {
+        &self.about
     }
 
     /// Reads on until a message is found; `None` at the end of the messages.
@@ -80,6 +95,11 @@ impl<R: Read> Reading<R> {
                     self.is_begun = true;
                     match opcode {
                         op::DATA_END => return Ok(None),
+                        op::METADATA => {
+                            if let Ok(Record::Metadata(about)) = parse_record(opcode, data) {
+                                self.about = about.metadata;
+                            }
+                        }
                         op::CHUNK => take_chunk(data, &mut self.topics, &mut self.found)?,
                         opcode => take(opcode, data, &mut self.topics, &mut self.found),
                     }

@@ -13,7 +13,7 @@ use mcap::McapResult;
 use serde_json::json;
 
 use super::file::{Files, Limits};
-use super::layout;
+use super::layout::{self, Message};
 
 /// Longest message; a longer one is lost. With the 1024 lines of the queue this bounds its memory to 256 MiB.
 const LONGEST: usize = 256 * 1024;
@@ -49,10 +49,9 @@ impl Recorder {
 
     /// Records an answer. Never waits: what finds no place is counted.
     pub(crate) fn take(&self, answer: &Answer) {
-        let mut line = now().to_le_bytes().to_vec();
-        match serde_json::to_writer(&mut line, answer) {
-            Ok(()) if line.len() <= LONGEST => self.queue.write(&line),
-            _ => drop(self.state.too_long.fetch_add(1, Ordering::Relaxed)),
+        match line_of(answer) {
+            Some(line) => self.queue.write(&line),
+            None => drop(self.state.too_long.fetch_add(1, Ordering::Relaxed)),
         }
     }
 
@@ -191,9 +190,7 @@ impl Writer {
     }
 
     fn write(&mut self, line: &[u8], lost: u64) -> io::Result<()> {
-        let (came, body) = line.split_first_chunk::<TIME>().ok_or(io::ErrorKind::InvalidData)?;
-        let came = u64::from_le_bytes(*came);
-        let Some(message) = layout::message(&serde_json::from_slice(body)?, came) else { return Ok(()) };
+        let Some((message, came)) = message_of(line)? else { return Ok(()) };
         self.note_losses(lost).and_then(|()| self.files.write(&message, came)).map_err(io::Error::other)?;
         self.state.messages.fetch_add(1, Ordering::Relaxed);
         self.unflushed += 1;
@@ -212,7 +209,26 @@ impl Writer {
     }
 }
 
+/// An answer that comes now, with its time before it; `None` if it is too long.
+pub(super) fn line_of(answer: &Answer) -> Option<Vec<u8>> {
+    let mut line = now().to_le_bytes().to_vec();
+    serde_json::to_writer(&mut line, answer).ok().filter(|()| line.len() <= LONGEST)?;
+    Some(line)
+}
+
+/// When a line came, in nanoseconds since 1970.
+pub(super) fn came(line: &[u8]) -> Option<u64> {
+    line.first_chunk::<TIME>().map(|came| u64::from_le_bytes(*came))
+}
+
+/// What is recorded of a line, and when that came; `None` if nothing is.
+pub(super) fn message_of(line: &[u8]) -> io::Result<Option<(Message, u64)>> {
+    let came = came(line).ok_or(io::ErrorKind::InvalidData)?;
+    let answer = serde_json::from_slice(line.get(TIME..).unwrap_or_default())?;
+    Ok(layout::message(&answer, came).map(|message| (message, came)))
+}
+
 /// Nanoseconds since 1970.
-fn now() -> u64 {
+pub(super) fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
 }
