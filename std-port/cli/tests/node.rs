@@ -662,6 +662,21 @@ fn without_values(metrics: &str) -> Vec<&str> {
     names.map(Option::unwrap).collect()
 }
 
+/// Metrics that alert rules and dashboard name and no node has.
+fn unknown(metrics: &str) -> Vec<&'static str> {
+    const FILES: [&str; 2] = [
+        include_str!("../../../packaging/prometheus/cara.rules.yml"),
+        include_str!("../../../packaging/grafana/cara.json"),
+    ];
+    let is_there =
+        |name: &str| metrics.lines().any(|line| line.strip_prefix(name).is_some_and(|rest| rest.starts_with('{')));
+    let words =
+        FILES.iter().flat_map(|file| file.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_'));
+    let names: Vec<_> = words.filter(|word| word.starts_with("cara_")).collect();
+    assert!(names.len() > 30, "{names:?}");
+    names.into_iter().filter(|name| !is_there(name)).collect()
+}
+
 #[test]
 fn metrics_are_the_counters() {
     let node = Node::start(&format!("[metrics]\nlisten = \"127.0.0.1:0\"\n{SERVED}"));
@@ -708,6 +723,7 @@ fn metrics_are_the_counters() {
     assert_eq!(without_values(&text(&printed.stdout)), without_values(body));
     let received = before.iter().find(|(of, name, _)| of.is_some() && name == "RequestsReceived").unwrap().2;
     assert_eq!(received, 5);
+    assert_eq!(unknown(body), Vec::<&str>::new());
 }
 
 #[test]
