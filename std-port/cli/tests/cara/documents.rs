@@ -190,3 +190,26 @@ fn the_reference_has_every_verb_option_and_exit_code() {
         assert!(reference.contains(&format!("| {code} | {meaning} |")), "no `| {code} | {meaning} |`");
     }
 }
+
+/// Pages below a folder of documents, as `docs/SUMMARY.md` links them.
+fn pages(folder: &Path, below: &str, found: &mut BTreeSet<String>) {
+    for entry in std::fs::read_dir(folder).unwrap().map(Result::unwrap) {
+        let name = format!("{below}{}", entry.file_name().to_str().unwrap());
+        match entry.path().is_dir() {
+            true => pages(&entry.path(), &format!("{name}/"), found),
+            false if name.ends_with(".md") && name != "SUMMARY.md" => drop(found.insert(name)),
+            false => {}
+        }
+    }
+}
+
+#[test]
+fn every_page_is_in_the_book_once() {
+    let docs = Path::new("../../docs");
+    let mut there = BTreeSet::new();
+    pages(docs, "", &mut there);
+    let summary = std::fs::read_to_string(docs.join("SUMMARY.md")).unwrap();
+    let mut linked: Vec<_> = summary.split("](").skip(1).filter_map(|rest| Some(rest.split_once(')')?.0)).collect();
+    linked.sort_unstable();
+    assert_eq!(linked, there.iter().map(String::as_str).collect::<Vec<_>>());
+}
