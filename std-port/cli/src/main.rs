@@ -32,7 +32,12 @@ fn main() -> ExitCode {
 fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
     let ends_at_signals = matches!(
         verb,
-        Verb::Scan(_) | Verb::Watch(_) | Verb::Stream(_) | Verb::Replay(_) | Verb::Doctor(_) | Verb::HandOver(_)
+        Verb::Scan(_)
+            | Verb::Watch(_)
+            | Verb::Stream(_)
+            | Verb::Replay(_)
+            | Verb::Doctor(_)
+            | Verb::HandOver(_)
     );
     if ends_at_signals {
         interrupt::end_at_signals()?;
@@ -61,6 +66,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Node(arguments) => node::run(arguments, global),
         Verb::Line(arguments) => cara_line::run(arguments, global),
         Verb::Doctor(arguments) => cara_doctor::run(arguments, global),
+        Verb::SupportBundle(arguments) => commands::support_bundle::run(arguments, global),
         Verb::Keys(arguments) => cara_keys::run(arguments, global),
         Verb::Access(arguments) => commands::access::run(arguments, global),
         Verb::Provision(arguments) => cara_provision::run(arguments, global),

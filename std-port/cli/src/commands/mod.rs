@@ -19,6 +19,7 @@ pub(crate) mod scan;
 pub(crate) mod set;
 pub(crate) mod stop;
 pub(crate) mod stream;
+pub(crate) mod support_bundle;
 pub(crate) mod top;
 pub(crate) mod watch;
 pub(crate) mod web;

@@ -130,3 +130,48 @@ fn tools_of_pypi_read_a_recording() {
     assert_eq!((&whole["metadata"]["unit"], &cut["metadata"]["unit"]), (&"manager/1".into(), &"manager/1".into()));
     agv.stop();
 }
+
+/// A secret in every file that may have one, and in the environment.
+#[test]
+fn a_support_bundle_has_no_secret_and_says_what_it_could_not_get() {
+    let (folder, keys) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let secret = |number: u8| format!("{number:02x}5ec7e7").repeat(8);
+    let put = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    };
+    std::fs::write(keys.path().join("agv-7-s_unit-0.keys"), format!("pair {}\n", secret(1))).unwrap();
+    put("agv-7-s_unit-0.claims", &secret(2));
+    put("page.token", &secret(3));
+    put("black-box/no.mcap", &secret(4));
+    put("audit.log", &format!("{{\"ask\":\"stop\",\"node\":\"agv/7\",\"more\":\"{}\"}}\n{}\n", secret(5), secret(6)));
+    let run = format!("run = [\"curl\", \"{}\"]", secret(7));
+    put("plant.toml", &format!("name = \"plant\" # {}\n[[functions]]\nsignature = \"f()\"\n{run}\n", secret(8)));
+    put("log", &format!("first\nsays {}\nsays {}\nsays {}\nlast\n", secret(9), secret(1), secret(3)));
+    let stage = Stage::empty();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (bundle, config, log, state) = (path("bundle.tar"), path("plant.toml"), path("log"), path(""));
+    let arguments = ["--state", &state, "--config", &config, "--log", &log, "--listen", "1ms", "--json"];
+    let mut command = stage.command(&[&["support-bundle", &bundle], &arguments[..]].concat());
+    command.env("CARA_KEYS", keys.path()).env("SMTP_PASSWORD", secret(9)).env("OTHER", secret(10));
+    let ran = crate::support::Ran::of(command.output().unwrap());
+    let listed: Vec<_> =
+        ran.json()["members"].as_array().unwrap().iter().map(|name| name.as_str().unwrap().to_owned()).collect();
+    let members = ["configuration.toml", "doctor.json", "log.txt", "audit.jsonl", "about.json"];
+    assert_eq!(listed, members, "{}", ran.everything());
+    let archive = std::fs::read(&bundle).unwrap();
+    let text = String::from_utf8_lossy(&archive);
+    let found: Vec<_> = (1..=10).filter(|number| text.contains(&secret(*number))).collect();
+    assert!(found.is_empty(), "{found:?}");
+    for part in
+        ["first\n(left out", "last\n", "\"ask\":\"stop\"", "run = [\"curl\", \"…\"]", "no m_unit runs on this host"]
+    {
+        assert!(text.contains(part), "{part} is not in {text}");
+    }
+    match Command::new("tar").args(["-tf", &bundle]).output() {
+        Ok(ran) => assert_eq!(String::from_utf8_lossy(&ran.stdout).lines().collect::<Vec<_>>(), members),
+        Err(_) => println!("not read: no tar here"),
+    }
+    stage.ends(1, &["support-bundle", &bundle, "--listen", "1ms"]);
+}
