@@ -9,6 +9,7 @@ mod again;
 mod bad_input;
 mod bench;
 mod binaries;
+mod chaos;
 mod claims;
 mod command;
 mod demo;
@@ -28,6 +29,7 @@ mod licences;
 mod links;
 mod manifests;
 mod msrv;
+mod mutants;
 mod names;
 mod orders;
 mod packages;
@@ -121,6 +123,10 @@ enum Task {
     Orders(orders::Orders),
     /// Runs libFuzzer over the targets of tests/fuzz; or over bugs that are planted on purpose.
     Fuzz(fuzz::Fuzz),
+    /// Runs fleets on the simulator under all faults at once, judged all the time; or with planted bugs.
+    Chaos(chaos::Chaos),
+    /// Tries mutants of what decides about motion and membership: the tests of core and simulator have to find each.
+    Mutants(mutants::Mutants),
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
     Fleet {
         /// How many s_units; 1,000 if not given.
@@ -175,6 +181,8 @@ fn main() -> ExitCode {
         Task::Peers { names } => peers::run(&names),
         Task::Orders(options) => orders::run(&options),
         Task::Fuzz(options) => fuzz::run(&options),
+        Task::Chaos(options) => chaos::run(&options),
+        Task::Mutants(options) => mutants::run(&options),
         Task::Sanitize => sanitize::run(),
         Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),
