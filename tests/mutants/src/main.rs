@@ -45,24 +45,31 @@ fn main() -> Result<ExitCode> {
     let sources = files.into_iter().map(|file| Ok((fs::read_to_string(tree.join(&file))?, file)));
     let sources: BTreeMap<String, String> =
         sources.map(|pair| pair.map(|(text, file)| (file, text))).collect::<Result<_>>()?;
-    let programs = build_all(tree, &sources, &mut mutants)?;
-    programs.check()?;
-    let equivalent = equivalents(Path::new(equivalent))?;
     let known = known(state, &sources)?;
+    for mutant in mutants.iter_mut().filter(|mutant| known.contains(&(State::Unviable.name(), mutant.name.clone()))) {
+        mutant.state = State::Unviable;
+    }
+    let programs = build_all(tree, &sources, &mut mutants)?;
+    let equivalent = equivalents(Path::new(equivalent))?;
     let mut log = fs::OpenOptions::new().create(true).append(true).open(state)?;
+    let mut note = |mutant: &Mutant| {
+        writeln!(log, "{:016x} {} {}", hash(&sources[&mutant.file]), mutant.state.name(), mutant.name)
+    };
+    mutants.iter().filter(|mutant| mutant.state == State::Unviable).try_for_each(&mut note)?;
+    programs.check()?;
     for number in 0..mutants.len() {
         let mutant = &mut mutants[number];
         if mutant.state != State::Wanted || number % shards != index {
             continue;
         }
         mutant.state = State::Killed;
-        if known.contains(&mutant.name) {
+        if known.contains(&(State::Killed.name(), mutant.name.clone())) {
             continue;
         }
         match programs.kills(number)? {
             Some(by) => {
                 println!("killed    {}: {by}", mutant.name);
-                writeln!(log, "{:016x} {}", hash(&sources[&mutant.file]), mutant.name)?;
+                note(mutant)?;
             }
             None => {
                 mutant.state = if equivalent.contains(&mutant.name) { State::Equivalent } else { State::Survived };
@@ -140,13 +147,16 @@ fn hash(text: &str) -> u64 {
     hasher.finish()
 }
 
-/// The mutants that were killed already, in files that have not changed since.
-fn known(state: &Path, sources: &BTreeMap<String, String>) -> Result<BTreeSet<String>> {
+/// What is known of mutants in files that have not changed since: a line `HASH STATE NAME` each.
+fn known(state: &Path, sources: &BTreeMap<String, String>) -> Result<BTreeSet<(String, String)>> {
     let text = if state.exists() { fs::read_to_string(state)? } else { String::new() };
-    let hashes: BTreeSet<String> =
-        sources.iter().map(|(file, source)| format!("{:016x} {file}:", hash(source))).collect();
-    let current = |line: &&str| hashes.iter().any(|hash| line.starts_with(hash.as_str()));
-    Ok(text.lines().filter(current).filter_map(|line| Some(line.split_once(' ')?.1.to_owned())).collect())
+    let line = |line: &str| {
+        let (hash_of, rest) = line.split_once(' ')?;
+        let (state, name) = rest.split_once(' ')?;
+        let source = sources.get(name.split_once(": ")?.0)?;
+        (hash_of == format!("{:016x}", hash(source))).then(|| (state.to_owned(), name.to_owned()))
+    };
+    Ok(text.lines().filter_map(line).collect())
 }
 
 /// Those that change nothing that anybody can see: a line `NAME | REASON` each.

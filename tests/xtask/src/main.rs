@@ -139,8 +139,8 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
-    /// Runs the Linux port's unit and port tests under the thread sanitizer; needs a nightly compiler.
-    Sanitize,
+    /// Runs the Linux port's tests under the thread sanitizer, or the core's in Miri; needs a nightly compiler.
+    Sanitize(sanitize::Sanitize),
     /// Attacks units on the simulator, a board in QEMU and Linux units, and prints what was tried and what came of it.
     Security(security::Security),
     /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
@@ -183,7 +183,7 @@ fn main() -> ExitCode {
         Task::Fuzz(options) => fuzz::run(&options),
         Task::Chaos(options) => chaos::run(&options),
         Task::Mutants(options) => mutants::run(&options),
-        Task::Sanitize => sanitize::run(),
+        Task::Sanitize(options) => sanitize::run(&options),
         Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),
         Task::Bench(options) => bench::run(&options),

@@ -1,16 +1,47 @@
-//! `cargo xtask sanitize`: the thread sanitizer over the Linux port. It needs a nightly compiler, which the project uses for
-//! nothing else, so it is a command of its own and no group of checks.
+//! `cargo xtask sanitize`: the thread sanitizer over the Linux port, or Miri over the core. Both need a nightly compiler, which the
+//! project uses for nothing else, so this is a command of its own and no group of checks.
 
 use std::process::ExitCode;
 
 use anyhow::{Result, bail};
+use clap::Args;
 
 use crate::command::{Run, exists};
 
 const TARGET: &str = "x86_64-unknown-linux-gnu";
 
+/// What to look at, and with what.
+#[derive(Args)]
+pub(crate) struct Sanitize {
+    /// Runs the unit tests of the core and of its cipher in Miri instead: the named ones, or all, which takes hours.
+    #[arg(long, value_name = "TEST", num_args = 0..)]
+    miri: Option<Vec<String>>,
+}
+
+pub(crate) fn run(sanitize: &Sanitize) -> Result<ExitCode> {
+    match &sanitize.miri {
+        Some(tests) => miri(tests),
+        None => threads(),
+    }
+}
+
+/// Miri finds reads of what was not written, references that alias, and bytes that are of no value of their type.
+fn miri(tests: &[String]) -> Result<ExitCode> {
+    let miri = Run::new("rustup").args(["run", "nightly", "cargo", "miri", "--version"]).captured()?;
+    if !miri.0 {
+        bail!("Miri is missing: rustup toolchain install nightly --component miri --component rust-src");
+    }
+    let cargo = ["run", "nightly", "cargo", "miri", "test", "--target-dir", "target/miri"];
+    let tests =
+        ["-p", "cara-core", "-p", "cara-secure", "--lib", "--"].into_iter().chain(tests.iter().map(String::as_str));
+    // Properties ask the clock for seeds; a few cases of each are what the interpreter has time for.
+    let run = Run::new("rustup").args(cargo).args(tests).env("MIRIFLAGS", "-Zmiri-disable-isolation");
+    run.env("PROPTEST_CASES", "2").env("RUST_BACKTRACE", "0").stream()?;
+    Ok(ExitCode::SUCCESS)
+}
+
 /// Runs the unit and port tests of the Linux port. A data race, or a thread that is never joined, fails them.
-pub(crate) fn run() -> Result<ExitCode> {
+fn threads() -> Result<ExitCode> {
     if !exists("rustup") {
         bail!("rustup is missing: see https://rustup.rs");
     }
