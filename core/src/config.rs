@@ -196,6 +196,9 @@ impl Constraints {
         subscriptions_per_peer: 1_024,
         stream_bytes: 1_000_000,
     };
+    /// Defaults of an m_unit that stands by. Three of these keep-alives leave a standby time to listen for answers, and to be obeyed
+    /// within 3 s of its manager's failure.
+    pub const STANDBY: Self = Self { keep_alive: Duration::from_millis(700), ..Self::M_UNIT };
     /// Defaults of an s_unit, sized for a microcontroller.
     pub const S_UNIT: Self = Self {
         request_timeout: Duration::from_secs(2),

@@ -48,7 +48,8 @@ pub struct Builder<T, R> {
     pub(crate) identity: Identity,
     pub(crate) target: Target<SocketAddr>,
     fleet: Fleet,
-    constraints: Constraints,
+    /// What was set by hand.
+    constraints: Option<Constraints>,
     capacities: Capacities,
     interfaces: Interfaces,
     keys: KeySource,
@@ -87,19 +88,11 @@ impl<R> Builder<(), R> {
             Role::MUnit => crate::control::Control::Default,
             Role::SUnit => crate::control::Control::Off,
         };
-        let constraints = match identity.role() {
-            Role::MUnit => Constraints::M_UNIT,
-            Role::SUnit => Constraints {
-                message_size: Constraints::M_UNIT.message_size,
-                chunk_size: Constraints::M_UNIT.chunk_size,
-                ..Constraints::S_UNIT
-            },
-        };
         Self {
             identity,
             target,
             fleet: Fleet(0),
-            constraints,
+            constraints: None,
             capacities: Capacities::default(),
             interfaces: Interfaces::from_environment(),
             keys: KeySource::Found,
@@ -159,7 +152,7 @@ impl<T: Send + 'static> Builder<T, MUnit> {
     /// vehicle has heard one for three keep-alives. Then it commands, and its s_units come to it. Where another one commands with a
     /// higher [claim](crate::Claim) it stands by again, in place of [`UnitEvent::Fenced`](crate::UnitEvent::Fenced). It
     /// takes nothing over by [`take_over`](Self::take_over). Two of them on two hosts, each with a [folder of
-    /// state](Self::state_folder) of its own, are one manager that outlives a host. It takes keys:
+    /// state](Self::state_folder) of its own and the same `keep_alive`, are one manager that outlives a host. It takes keys:
     /// [`BuildError::StandbyWithoutKeys`] in plain mode.
     ///
     /// ```no_run
@@ -244,9 +237,10 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
-    /// The limits to begin with.
+    /// The limits to begin with: [`Constraints::M_UNIT`] unless set, of a [standby](Builder::standby) [`Constraints::STANDBY`]; of an
+    /// s_unit [`Constraints::S_UNIT`] with messages as long as an m_unit's.
     pub fn constraints(mut self, constraints: Constraints) -> Self {
-        self.constraints = constraints;
+        self.constraints = Some(constraints);
         self
     }
 
@@ -371,7 +365,8 @@ impl<T: Send + 'static, R> Builder<T, R> {
     }
 
     fn engine(self) -> Result<Arc<Engine<T>>, BuildError> {
-        check(&self.constraints)?;
+        let constraints = self.constraints.unwrap_or_else(|| defaults(self.identity.role(), self.stands_by));
+        check(&constraints)?;
         let keys = self.keys.open(&self.identity, &self.target, self.fleet)?;
         if self.stands_by && keys.mode() == Mode::Plain {
             return Err(BuildError::StandbyWithoutKeys);
@@ -388,7 +383,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             Role::SUnit => None,
         };
         let capacities = self.capacities;
-        let nodes = usize::from(self.constraints.maximum_nodes);
+        let nodes = usize::from(constraints.maximum_nodes);
         let maximum_links = nodes + capacities.pending_links;
         crate::sys::limits::make_room_for(maximum_links);
         let config = NodeConfig {
@@ -398,7 +393,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             target: self.target,
             tcp_port: listener.as_ref().map_or(0, Listener::port),
             udp_port: datagrams.own_port(),
-            constraints: self.constraints,
+            constraints,
             seed: sys::random(),
         };
         let mut node = Node::new(threads.thread_pool().clock.now(), config, node_storage(nodes, maximum_links));
@@ -412,7 +407,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =
             FunctionList::new(filled_with(capacities.functions, Entry::empty), filled(capacities.signature_bytes, 0));
-        let size = message_buffer_bytes(&self.constraints, keys.mode());
+        let size = message_buffer_bytes(&constraints, keys.mode());
         let parts = EngineParts {
             threads,
             own_threads,
@@ -516,6 +511,16 @@ pub(crate) const LONGEST_MESSAGE: u32 = 256 * 1024;
 
 /// Shortest `message_size`: with less nearly every request is refused.
 pub(crate) const SHORTEST_MESSAGE: u32 = 16;
+
+/// The constraints of a unit that says nothing about them.
+const fn defaults(role: Role, stands_by: bool) -> Constraints {
+    let Constraints { message_size, chunk_size, .. } = Constraints::M_UNIT;
+    match role {
+        Role::MUnit if stands_by => Constraints::STANDBY,
+        Role::MUnit => Constraints::M_UNIT,
+        Role::SUnit => Constraints { message_size, chunk_size, ..Constraints::S_UNIT },
+    }
+}
 
 /// What this port can hold.
 pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {

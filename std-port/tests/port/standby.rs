@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
 use cara_std::{
-    BuildError, Claim, Definition, ParametersView, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
+    BuildError, Claim, Constraints, Definition, ParametersView, Served, ServiceError, ServiceOptions, StartError, Unit,
+    UnitEvent,
 };
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -237,6 +238,7 @@ fn a_standby_needs_keys_and_starts_beside_a_manager() {
     standby.start().unwrap();
     assert!(matches!(events.recv_timeout(PATIENCE), Ok(UnitEvent::StandsBy { by: None })));
     assert!(standby.is_standby() && standby.claim() == Claim::NONE);
+    assert_eq!(standby.constraints(), Constraints::STANDBY);
     // Another manager is refused by the one that runs, and not by a standby.
     let refused = build("another").build().unwrap().start();
     assert!(matches!(refused, Err(StartError::AlreadyRunning { .. })), "{refused:?}");

@@ -18,9 +18,12 @@ const ENTRIES: RangeInclusive<u64> = 1..=65_535;
 /// Bytes of a table of signatures, likewise.
 const SIGNATURE_BYTES: RangeInclusive<u64> = 512..=16 * 1024 * 1024;
 
-/// The constraints of a role with what the file says.
-pub(super) fn constraints(table: &file::Constraints, role: Role, mistakes: &mut Vec<Mistake>) -> Constraints {
-    let mut limits = defaults(role);
+/// These constraints with what the file says.
+pub(super) fn constraints(
+    table: &file::Constraints,
+    mut limits: Constraints,
+    mistakes: &mut Vec<Mistake>,
+) -> Constraints {
     set_time(&mut limits.request_timeout, &table.request_timeout, Duration::from_millis(1), mistakes);
     set_time(&mut limits.minimum_interval, &table.minimum_interval, Duration::ZERO, mistakes);
     set_time(&mut limits.keep_alive, &table.keep_alive, Duration::from_millis(1), mistakes);
@@ -39,9 +42,10 @@ pub(super) fn constraints(table: &file::Constraints, role: Role, mistakes: &mut 
 }
 
 /// The constraints of a unit on Linux that says nothing about them.
-pub(super) fn defaults(role: Role) -> Constraints {
+pub(super) fn defaults(role: Role, stands_by: bool) -> Constraints {
     let Constraints { message_size, chunk_size, .. } = Constraints::M_UNIT;
     match role {
+        Role::MUnit if stands_by => Constraints::STANDBY,
         Role::MUnit => Constraints::M_UNIT,
         Role::SUnit => Constraints { message_size, chunk_size, ..Constraints::S_UNIT },
     }
@@ -104,7 +108,7 @@ mod tests {
 
     fn read(text: &str) -> Result<Constraints, Vec<Mistake>> {
         let mut mistakes = Vec::new();
-        let limits = constraints(&toml::from_str(text).unwrap(), Role::MUnit, &mut mistakes);
+        let limits = constraints(&toml::from_str(text).unwrap(), Constraints::M_UNIT, &mut mistakes);
         if mistakes.is_empty() { Ok(limits) } else { Err(mistakes) }
     }
 
@@ -159,9 +163,9 @@ mod tests {
     #[test]
     fn the_defaults_are_those_of_the_library() {
         let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
-        assert_eq!(system.build().unwrap().constraints(), defaults(Role::MUnit));
+        assert_eq!(system.build().unwrap().constraints(), defaults(Role::MUnit, false));
         let unit = Unit::builder("limits", 1, "manager", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
-        assert_eq!(unit.build().unwrap().constraints(), defaults(Role::SUnit));
+        assert_eq!(unit.build().unwrap().constraints(), defaults(Role::SUnit, false));
         assert_eq!(capacities(&file::Capacities::default(), &mut Vec::new()), Capacities::default());
     }
 }

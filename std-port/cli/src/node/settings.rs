@@ -151,7 +151,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         keys: keys(file, over, mistakes),
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
-        constraints: limits::constraints(&file.constraints, role, mistakes),
+        constraints: limits::constraints(&file.constraints, limits::defaults(role, over.stands_by), mistakes),
         control: control(&file.control, role, mistakes),
         audit: audit(&file.control, mistakes),
         metrics: metrics(file, over, mistakes),

@@ -1,5 +1,5 @@
 use cara_std::control::Control;
-use cara_std::{Capacities, Definition, Parameters};
+use cara_std::{Capacities, Constraints, Definition, Parameters};
 use proptest::prelude::*;
 
 use super::file::Role;
@@ -10,8 +10,12 @@ use super::{EXAMPLE, limits};
 use cara_tools::keys::Keys;
 
 fn settings(text: &str) -> Result<Settings, String> {
+    settings_over(text, &Overrides::default())
+}
+
+fn settings_over(text: &str, over: &Overrides) -> Result<Settings, String> {
     let source = Source { name: "test.toml".into(), text: text.into() };
-    Settings::of(source, &Overrides::default()).map_err(|mistakes| mistakes.to_string())
+    Settings::of(source, over).map_err(|mistakes| mistakes.to_string())
 }
 
 #[test]
@@ -49,7 +53,7 @@ fn an_address_at_which_no_manager_can_be_is_a_mistake() {
 fn the_example_shows_the_defaults() {
     let example = settings(EXAMPLE).unwrap();
     let least = settings("name = \"AGV_manager\"\nid = 1\n").unwrap();
-    assert_eq!(example.constraints, limits::defaults(Role::MUnit));
+    assert_eq!(example.constraints, limits::defaults(Role::MUnit, false));
     assert_eq!(example.capacities, Capacities::default());
     assert_eq!((example.fleet, &example.control), (least.fleet, &Control::Default));
     assert_eq!((&example.keys, &example.discovery_port), (&Keys::Found, &None));
@@ -57,6 +61,10 @@ fn the_example_shows_the_defaults() {
         (least.constraints, least.capacities, least.control),
         (example.constraints, example.capacities, example.control)
     );
+    let over = Overrides { stands_by: true, ..Overrides::default() };
+    let of_standby = |text: &str| settings_over(text, &over).unwrap().constraints;
+    assert_eq!(of_standby("name = \"AGV_manager\"\nid = 1\n"), Constraints::STANDBY);
+    assert_eq!(of_standby(EXAMPLE), Constraints::M_UNIT, "what is written counts");
 }
 
 /// With the comment signs of keys and tables taken out, the example is that of an s_unit.
