@@ -400,6 +400,9 @@ impl<T: Send + 'static, R> Builder<T, R> {
         if let Some(m_units) = self.m_units {
             node.choose(m_units);
         }
+        if self.authority.is_some() {
+            node.claims_by_key();
+        }
         if let Keys::Ring(live) = &keys {
             node.expect(live.ring().nodes());
         }

@@ -170,9 +170,10 @@ impl Claims {
         if identity.role() == Role::MUnit {
             if file.is_none() {
                 tracing::info!("no folder of state is set (CARA_STATE): the claim of this manager is not stored");
-                // The clock usually makes it higher than at the last start; if not, vehicles fence it until it raises its claim.
+                // The clock usually makes it higher than at the last start, also within a second of that one; if not, vehicles fence it
+                // until it raises its claim.
                 let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-                kept.own.term = since.map_or(0, |since| since.as_secs());
+                kept.own.term = since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or_default());
             }
             if !self.stands_by {
                 kept.own = kept.own.max(heard).raised(random());

@@ -237,3 +237,18 @@ fn a_handler_that_hangs_is_cut_off_before_the_next_manager_moves_anything() {
     until("the handler ends", || log.lock().unwrap().len() == 4);
     assert_eq!(log.lock().unwrap()[3], "no late commit");
 }
+
+/// Without a folder of state nothing but the clock ranks a manager's starts.
+#[test]
+fn a_manager_without_a_folder_claims_above_its_start_of_the_same_second() {
+    let fleet = fleet();
+    let claims = (0..12).map(|_| {
+        let manager = system(fleet).control(Control::Off).beside_another().build().unwrap();
+        manager.start().unwrap();
+        // No process starts twice within a millisecond.
+        std::thread::sleep(std::time::Duration::from_millis(1));
+        manager.claim()
+    });
+    let claims: Vec<_> = claims.collect();
+    assert!(claims.is_sorted_by(|one, next| one < next), "{claims:?}");
+}

@@ -64,6 +64,7 @@ entry!(node_hears, {
     node().keep_obeyed(*unknown(), unknown(), *unknown());
     node().claim_kept(unknown(), *unknown(), *unknown());
     node().left_unread();
+    node().claims_by_key();
     node().store_claims();
     keep((node().claim(), node().take_claim_event(), node().obeyed(unknown())));
     node().stand_by(*unknown());

@@ -110,8 +110,8 @@ impl Obeyed {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Rival {
     pub(super) claim: Claim,
-    /// For how long its manager had not been heard, by whoever heard it last, when a vehicle said so last: that nobody says
-    /// anything any more is no sign that it is gone.
+    /// For how long its manager had not been heard, by whoever heard it last, when a vehicle said so last. That nobody says anything
+    /// any more is no sign that it is gone: this unit may be cut off from both. Who has an authority's key may command all the same.
     silent: Duration,
     reported: Instant,
 }
@@ -153,6 +153,8 @@ pub(super) struct Claims {
     next_raise: Instant,
     pause: Duration,
     pub(super) event: Option<ClaimEvent>,
+    /// This m_unit claims only while an authority has given it the key.
+    by_key: bool,
     /// The port stores what this unit obeys.
     stores: bool,
     obeyed: heapless::Vec<(Identity, Obeyed), OBEYED_MANAGERS>,
@@ -179,6 +181,7 @@ impl Claims {
             next_raise: Instant::START,
             pause: FIRST_PAUSE,
             event: None,
+            by_key: false,
             stores: false,
             obeyed: heapless::Vec::new(),
         }
@@ -191,8 +194,8 @@ impl Claims {
     /// From here on it stands by, and asks next at `next`. What it has heard, and obeyed of others, stays.
     pub(super) fn stand_by(&mut self, now: Instant, next: Instant) {
         let obeyed = core::mem::take(&mut self.obeyed);
-        let (rival, stores) = (self.rival, self.stores);
-        *self = Self { stage: Stage::StandsBy, has_stood_by: true, rival, stores, obeyed, ..Self::new(now) };
+        let Self { rival, by_key, stores, .. } = *self;
+        *self = Self { stage: Stage::StandsBy, has_stood_by: true, rival, by_key, stores, obeyed, ..Self::new(now) };
         self.questions.next = next;
     }
 
@@ -279,6 +282,12 @@ impl<P: Port> Node<P> {
     /// it was the highest once.
     pub fn take_over(&mut self, now: Instant) {
         (self.claims.took_over, self.claims.takes_over) = (Some(now), true);
+    }
+
+    /// An authority decides which m_unit of this identity may claim: without its key the port answers [`ClaimEvent::Raise`] by
+    /// [`Self::not_raised`]. So one that has the key need not wait for vehicles that are gone to say that the other one is, too.
+    pub fn claims_by_key(&mut self) {
+        self.claims.by_key = true;
     }
 
     /// The port stores what this unit obeys, and answers [`ClaimEvent::Keep`].
@@ -538,7 +547,9 @@ impl<P: Port> Node<P> {
         if self.claims.questions.asked.is_none_or(|asked| now >= asked + PERIOD) {
             let questions = &mut self.claims.questions;
             questions.unanswered = questions.unanswered.saturating_add(questions.asked.is_some().into());
-            let is_alone = questions.unanswered >= QUESTIONS && rival.silent >= UNHEARD;
+            let is_silent =
+                if self.claims.by_key { now >= rival.silent_from(UNHEARD) } else { rival.silent >= UNHEARD };
+            let is_alone = questions.unanswered >= QUESTIONS && is_silent;
             let is_allowed = is_alone && now >= self.claims.next_raise;
             let asked_vehicles = core::mem::replace(&mut questions.asked_vehicles, is_allowed);
             if is_allowed && asked_vehicles {

@@ -253,6 +253,40 @@ fn a_claim_that_could_not_be_raised_is_raised_on_new_evidence_only() {
     }
 }
 
+/// The vehicle that heard the other manager is switched off before it has not heard it for 3 s.
+#[test]
+fn a_manager_with_an_authority_raises_its_claim_although_no_vehicle_speaks_any_more() {
+    let fenced = |since| {
+        let mut node = managed(5);
+        node.claims_by_key();
+        assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), since))), FENCED);
+        node
+    };
+    let mut node = fenced(500);
+    // Three questions, and one to the vehicles.
+    assert_eq!(watch(&mut node, at(1_000), at(4_900)).0, vec![]);
+    assert_eq!(watch(&mut node, at(4_950), at(5_200)).0, vec![ClaimEvent::Raise(claim(7))]);
+    // Without the key it may not, and asks anew.
+    node.not_raised(at(5_200));
+    assert_eq!(watch(&mut node, at(5_200), at(9_000)).0, vec![]);
+    assert_eq!(watch(&mut node, at(9_050), at(11_000)).0, vec![ClaimEvent::Raise(claim(7))]);
+    // A vehicle that is there says that it hears the other one.
+    let mut node = fenced(500);
+    for now in (1_000..60_000).step_by(2_000) {
+        assert_eq!(admit_at(&mut node, at(now), 0, &agv(2, report(claim(7), 200))), FENCED);
+        assert_eq!(watch(&mut node, at(now), at(now + 1_990)).0, vec![]);
+    }
+    // As does the other one itself.
+    let mut node = fenced(500);
+    for now in (1_000..60_000).step_by(2_000) {
+        let mut outbox = Outbox::default();
+        while node.poll(at(now), &mut outbox, &Keyed).is_some() {}
+        let nonce = node.claims.questions.nonce;
+        hear(&mut node, at(now), &answer(nonce, None));
+        assert_eq!(watch(&mut node, at(now), at(now + 1_990)).0, vec![]);
+    }
+}
+
 /// A manager searches for them every 1 to 2 s.
 #[test]
 fn a_thousand_vehicles_do_not_say_at_the_same_moment_what_they_have_obeyed() {
