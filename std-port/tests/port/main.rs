@@ -16,6 +16,7 @@ mod details;
 mod growing;
 mod handlers;
 mod hearts;
+mod hosts;
 mod in_use;
 mod junk;
 #[path = "../keyed/mod.rs"]

@@ -9,10 +9,11 @@ use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use cara_processes::network::Namespace;
 use cara_std::control::Control;
 use cara_std::{
-    BuildError, Claim, Constraints, Definition, ParametersView, Served, ServiceError, ServiceOptions, StartError, Unit,
-    UnitEvent,
+    BuildError, Claim, Constraints, Definition, Interfaces, ParametersView, Served, ServiceError, ServiceOptions,
+    StartError, Unit, UnitEvent,
 };
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -20,7 +21,7 @@ use crate::support::{PATIENCE, counter, fleet, number, system, unit, until, valu
 
 const PART: &str = "CARA_TEST_STANDBY";
 /// How often the manager that commands is killed; a measurement sets more.
-const RUNS: &str = "CARA_TEST_RUNS";
+pub(crate) const RUNS: &str = "CARA_TEST_RUNS";
 /// Between two commands to a vehicle, and between two looks.
 const PAUSE: Duration = Duration::from_millis(20);
 
@@ -28,17 +29,26 @@ const PAUSE: Duration = Duration::from_millis(20);
 type Obeyed = (Instant, i64, Claim);
 
 /// A manager that stands by, and commands every vehicle all the time once it may.
-struct Manager {
+pub(crate) struct Manager {
     child: Child,
     lines: Receiver<String>,
 }
 
 impl Manager {
     fn start(fleet: u32, state: &Path) -> Self {
+        Self::start_on(None, fleet, state)
+    }
+
+    /// On a host of its own, or here on loopback.
+    pub(crate) fn start_on(host: Option<&Namespace>, fleet: u32, state: &Path) -> Self {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command.args(["--exact", "standby::as_child", "--ignored", "--test-threads=1", "--nocapture"]);
-        command.env(PART, format!("{fleet} {}", state.display()));
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        command.env(PART, format!("{fleet} {} {}", host.is_some(), state.display()));
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = match host {
+            Some(host) => host.within(|| Ok(command.spawn()?)).unwrap(),
+            None => command.spawn().unwrap(),
+        };
         let (output, (say, lines)) = (BufReader::new(child.stdout.take().unwrap()), channel());
         std::thread::spawn(move || output.lines().map_while(Result::ok).try_for_each(|line| say.send(line)));
         let manager = Self { child, lines };
@@ -46,22 +56,22 @@ impl Manager {
         manager
     }
 
-    fn number(&self) -> i64 {
+    pub(crate) fn number(&self) -> i64 {
         i64::from(self.child.id())
     }
 
     /// Waits until it says so.
-    fn says(&self, what: &str) {
+    pub(crate) fn says(&self, what: &str) {
         let end = Instant::now() + PATIENCE;
         // The first one stands behind the test's name.
         while !self.lines.recv_timeout(end.saturating_duration_since(Instant::now())).unwrap().ends_with(what) {}
     }
 
-    fn signal(&self, signal: Signal) {
+    pub(crate) fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    fn kill(mut self) {
+    pub(crate) fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
@@ -78,8 +88,9 @@ impl Drop for Manager {
 #[ignore = "run by the other tests here, in processes of their own"]
 fn as_child() {
     let part = std::env::var(PART).expect("the part to play");
-    let (fleet, state) = part.split_once(' ').unwrap();
-    let manager = system(fleet.parse().unwrap()).control(Control::Off).standby().state_folder(state).build().unwrap();
+    let [fleet, is_on_host, state] = part.splitn(3, ' ').collect::<Vec<_>>().try_into().unwrap();
+    let manager = system(fleet.parse().unwrap()).interfaces(interfaces(is_on_host == "true"));
+    let manager = manager.control(Control::Off).standby().state_folder(state).build().unwrap();
     let events = manager.events();
     manager.start().unwrap();
     let commanding = manager.clone();
@@ -106,8 +117,12 @@ fn as_child() {
     std::process::exit(0);
 }
 
+fn interfaces(is_on_host: bool) -> Interfaces {
+    if is_on_host { Interfaces::All } else { Interfaces::Loopback }
+}
+
 /// Vehicles, and what each has executed.
-struct Vehicles {
+pub(crate) struct Vehicles {
     fleet: u32,
     units: Vec<Unit>,
     obeyed: Vec<Arc<Mutex<Vec<Obeyed>>>>,
@@ -115,9 +130,14 @@ struct Vehicles {
 
 impl Vehicles {
     fn start(fleet: u32, state: &Path) -> Self {
+        Self::start_on(false, fleet, state)
+    }
+
+    /// On the host of this thread, or here on loopback.
+    pub(crate) fn start_on(is_host: bool, fleet: u32, state: &Path) -> Self {
         let mut vehicles = Self { fleet, units: Vec::new(), obeyed: Vec::new() };
         for (name, id) in [("agv-7", 7), ("agv-8", 8), ("agv-9", 9)] {
-            let unit = unit(name, id, fleet).state_folder(state).build().unwrap();
+            let unit = unit(name, id, fleet).interfaces(interfaces(is_host)).state_folder(state).build().unwrap();
             let obeyed = Arc::<Mutex<Vec<Obeyed>>>::default();
             let (noted, claimed) = (obeyed.clone(), unit.downgrade());
             let drive = move |_: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
@@ -138,7 +158,7 @@ impl Vehicles {
     }
 
     /// When each has first obeyed a manager since then, once all have.
-    fn obey(&self, manager: i64, since: Instant) -> Vec<Instant> {
+    pub(crate) fn obey(&self, manager: i64, since: Instant) -> Vec<Instant> {
         let first = |obeyed: &Arc<Mutex<Vec<Obeyed>>>| {
             let obeyed = obeyed.lock().unwrap();
             obeyed.iter().find(|(at, by, _)| *at >= since && *by == manager).map(|(at, ..)| *at)
@@ -151,14 +171,13 @@ impl Vehicles {
         all().unwrap()
     }
 
-    /// No vehicle has obeyed two managers by turns: claims never decrease, and each claim is of one process.
-    fn check(&self) {
-        for obeyed in &self.obeyed {
-            let obeyed = obeyed.lock().unwrap();
-            for pair in obeyed.windows(2) {
-                let ((_, by, claim), (_, then, after)) = (pair[0], pair[1]);
-                assert!(claim <= after && (claim == after) == (by == then), "{claim} of {by}, then {after} of {then}");
-            }
+    /// Two managers were never obeyed by turns, by whichever vehicles: claims never decrease, and each claim is of one process.
+    pub(crate) fn check(&self) {
+        let mut obeyed: Vec<_> = self.obeyed.iter().flat_map(|obeyed| obeyed.lock().unwrap().clone()).collect();
+        obeyed.sort_by_key(|(at, ..)| *at);
+        for pair in obeyed.windows(2) {
+            let ((_, by, claim), (_, then, after)) = (pair[0], pair[1]);
+            assert!(claim <= after && (claim == after) == (by == then), "{claim} of {by}, then {after} of {then}");
         }
     }
 }
@@ -192,13 +211,15 @@ fn a_standby_commands_when_the_manager_is_killed() {
     }
     drop((active, standby));
     vehicles.check();
+    show("killed", first, last);
+}
+
+/// Of all runs, when the first vehicle obeyed, and the last.
+pub(crate) fn show(fault: &str, first: Vec<Duration>, last: Vec<Duration>) {
     for (what, mut took) in [("first", first), ("last", last)] {
         took.sort();
-        println!(
-            "{what} vehicle obeys, of {runs}: median {:?}, worst {:?}",
-            took[took.len() / 2],
-            took[took.len() - 1]
-        );
+        let [median, worst] = [took.len() / 2, took.len() - 1].map(|index| took[index]);
+        println!("{fault}: the {what} vehicle obeys, of {} runs: median {median:.2?}, worst {worst:.2?}", took.len());
     }
 }
 

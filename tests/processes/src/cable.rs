@@ -42,11 +42,11 @@ impl Cable {
         }
         let holders = [Holder::start()?, Holder::start()?];
         let host = |number: usize| {
-            let namespace = Namespace::of(holders[number].0.id())?;
+            let namespace = Namespace::of(holders[number].id())?;
             anyhow::Ok(Host { namespace, address: ADDRESSES[number] })
         };
         let hosts = [host(0)?, host(1)?];
-        hosts[0].run(&format!("ip link add wire type veth peer name wire netns {}", holders[1].0.id()))?;
+        hosts[0].run(&format!("ip link add wire type veth peer name wire netns {}", holders[1].id()))?;
         for host in &hosts {
             // Frames of the size that a cable carries, so that the bucket sees what it would see there.
             host.run("ip link set wire gso_max_segs 1")?;
@@ -88,10 +88,10 @@ impl Deref for Host {
 }
 
 /// A process that holds a fresh namespace until it is open here.
-struct Holder(Child);
+pub(crate) struct Holder(Child);
 
 impl Holder {
-    fn start() -> Result<Self> {
+    pub(crate) fn start() -> Result<Self> {
         let mut command = Command::new("unshare");
         command.args(["--net", "sh", "-c", "ip link set lo up && echo && read end"]).env("PATH", paths());
         let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
@@ -99,6 +99,10 @@ impl Holder {
         let mut output = holder.0.stdout.take().context("the holder has an output")?;
         ensure!(output.read(&mut [0])? == 1, "this user may not make a network: it takes root");
         Ok(holder)
+    }
+
+    pub(crate) fn id(&self) -> u32 {
+        self.0.id()
     }
 }
 

@@ -4,6 +4,7 @@
 pub mod cable;
 pub mod files;
 pub mod network;
+pub mod switch;
 
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Write};

@@ -49,11 +49,12 @@ pub fn test(name: &str, needs: &[&str], tap: bool) -> bool {
             return false;
         }
     };
-    let output = again.args(["--exact", name, "--nocapture", "--test-threads=1"]).output();
+    let output = again.args(["--exact", name, "--include-ignored", "--nocapture", "--test-threads=1"]).output();
     let output = output.expect("`unshare` was just there");
     let said = [output.stdout, output.stderr].concat();
     let said = String::from_utf8_lossy(&said);
     assert!(output.status.success() && said.contains("1 passed"), "it failed in its own network:\n{said}");
+    print!("{said}");
     false
 }
 

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 37] = [
+pub(crate) const GROUPS: [Group; 38] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -350,6 +350,15 @@ pub(crate) const GROUPS: [Group; 37] = [
         run: |_| needing(install::program("etcd", "etcd-server"), etcd),
     },
     Group {
+        name: "standby",
+        what: "two managers and their vehicles on a host each: killed, frozen, without power, cut off either way; no two are obeyed by turns; times are printed",
+        budget: 500,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| needing(install::program("nft", "nftables"), standby),
+    },
+    Group {
         name: "rp2040",
         what: "an RP2040's image in rp2040js with a W5500, against the Linux manager: calls, the motors' pin, losses of power, cuts in flash",
         budget: 1_200,
@@ -516,6 +525,11 @@ fn recordings() -> Result<()> {
     Run::new(&of_folder("pip").to_string_lossy()).args(["install", "--quiet", "mcap", "jsonschema"]).stream()?;
     let test = Run::cargo().args(["test", "-p", "cara-cli", "--test", "cara", "--", "--ignored", "tools_of_pypi"]);
     test.env("CARA_TEST_PYTHON", &of_folder("python").to_string_lossy()).stream()
+}
+
+fn standby() -> Result<()> {
+    let test = Run::cargo().args(["test", "-p", "cara-std", "--test", "port", "--"]);
+    test.args(["hosts::", "--ignored", "--nocapture", "--test-threads=1"]).stream()
 }
 
 fn etcd() -> Result<()> {
