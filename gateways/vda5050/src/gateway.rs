@@ -15,8 +15,8 @@ use crate::driver::Driver;
 use crate::errors::{Kind, Refusal};
 use crate::machine::{Machine, Topic};
 use crate::message::{
-    BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State, Visualization,
-    read,
+    Action, BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State,
+    Visualization, read,
 };
 use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, Link, Place};
@@ -76,7 +76,7 @@ struct Gateway {
     link: Link,
     client: Option<Client>,
     began: Instant,
-    /// A probe was sent, and one came back.
+    /// When a probe was sent, and when the last one was sent that came back.
     probed: [Instant; 2],
     is_broker_there: bool,
     /// What topic `connection` says.
@@ -255,18 +255,30 @@ impl Gateway {
             }
             Heard::Message(topic, is_retained, bytes) => match topic.as_str() {
                 "order" => match self.checked::<Order>("order", is_retained, &bytes) {
-                    Ok(order) => self.driver.machine.order(order),
+                    Ok(order) if self.is_broker_there => self.driver.machine.order(order),
+                    Ok(order) => self.refuse(&late("order", &order.header)),
                     Err(refusal) => self.refuse(&refusal),
                 },
                 "instantActions" => match self.checked::<InstantActions>("instantActions", is_retained, &bytes) {
-                    Ok(message) => self.driver.machine.instant_actions(message),
+                    Ok(message) => self.at_once(message),
                     Err(refusal) => self.refuse(&refusal),
                 },
                 "connection" => self.hear_connection(&bytes),
-                _ => self.probed[1] = Instant::now(),
+                _ => self.hear_probe(&bytes),
             },
             Heard::Acknowledged => {}
         }
+    }
+
+    /// What came while the broker did not answer was sent who knows when. What stops the vehicle counts all the same.
+    fn at_once(&mut self, mut message: InstantActions) {
+        let sent = message.actions.len();
+        let stops = |action: &Action| matches!(action.action_type.as_str(), "startPause" | "cancelOrder");
+        message.actions.retain(|action| self.is_broker_there || stops(action));
+        if message.actions.len() < sent {
+            self.refuse(&late("instantActions", &message.header));
+        }
+        self.driver.machine.instant_actions(message);
     }
 
     fn refuse(&mut self, refusal: &Refusal) {
@@ -317,6 +329,13 @@ impl Gateway {
         Ok(message)
     }
 
+    /// A probe says when it was sent: one that was held up proves nothing of now, nor do messages behind it.
+    fn hear_probe(&mut self, bytes: &[u8]) {
+        let sent = std::str::from_utf8(bytes).ok().and_then(|text| text.parse().ok()).map(Duration::from_millis);
+        let sent = sent.filter(|sent| *sent <= self.began.elapsed()).map(|sent| self.began + sent);
+        self.probed[1] = sent.map_or(self.probed[1], |sent| sent.max(self.probed[1]));
+    }
+
     /// Sends probes, and takes a broker that does not return them for one that is away.
     fn probe(&mut self) {
         let every = Duration::from_millis(self.config.broker.probe);
@@ -326,7 +345,8 @@ impl Gateway {
         }
         if self.probed[0].elapsed() >= every {
             self.probed[0] = Instant::now();
-            let _ = client.try_publish(format!("{}/cara-probe", self.prefix), QoS::AtMostOnce, false, "");
+            let sent = self.began.elapsed().as_millis().to_string();
+            let _ = client.try_publish(format!("{}/cara-probe", self.prefix), QoS::AtMostOnce, false, sent);
         }
         let answers = self.probed[1].elapsed() < Duration::from_millis(self.config.broker.probe_timeout);
         if !answers && self.is_broker_there {
@@ -470,6 +490,11 @@ fn header(config: &Config, serial_number: &str, header_id: u32) -> Header {
         manufacturer: config.vda5050.manufacturer.clone(),
         serial_number: serial_number.to_owned(),
     }
+}
+
+fn late(topic: &str, header: &Header) -> Refusal {
+    let refusal = Refusal::new(Kind::Validation, "the message came while the broker did not answer");
+    refusal.about("topic", topic).about("headerId", header.header_id)
 }
 
 trait HasHeader {

@@ -5,7 +5,11 @@
 mod fake;
 mod plant;
 
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -286,6 +290,72 @@ fn without_a_broker_the_vehicle_stops_within_its_bound() {
         plant.wait_for("it is paused", |plant| plant.state()["paused"] == true && plant.has_error("brokerLost"));
         plant.instant("stopPause", "p1");
         plant.wait_for_end("o1", "k");
+    }
+}
+
+/// A proxy before the broker that holds back all that comes, as a network does that loses everything: nothing is closed.
+fn black_hole(broker: u16) -> (u16, Arc<AtomicBool>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let (port, holds) = (listener.local_addr().unwrap().port(), Arc::new(AtomicBool::new(false)));
+    let held = holds.clone();
+    std::thread::spawn(move || {
+        for client in listener.incoming().flatten() {
+            let Ok(server) = TcpStream::connect(("127.0.0.1", broker)) else { continue };
+            for (from, to) in [(&client, &server), (&server, &client)] {
+                let (mut from, mut to, held) = (from.try_clone().unwrap(), to.try_clone().unwrap(), held.clone());
+                std::thread::spawn(move || {
+                    let mut bytes = [0; 65_536];
+                    while let Ok(read @ 1..) = from.read(&mut bytes) {
+                        while held.load(Ordering::SeqCst) {
+                            sleep(Duration::from_millis(1));
+                        }
+                        if to.write_all(&bytes[..read]).is_err() {
+                            break;
+                        }
+                    }
+                    let _ = to.shutdown(Shutdown::Both);
+                });
+            }
+        }
+    });
+    (port, holds)
+}
+
+/// Nothing gets through, and nothing says so.
+#[test]
+fn a_network_that_loses_everything_stops_the_vehicle() {
+    for (policy, bound) in [
+        // The probe's time-out, and a limit.
+        ("{ do = \"stop\" }", 2_500),
+        ("{ do = \"finish-base\", seconds = 1.0, metres = 50.0 }", 3_500),
+    ] {
+        let mut plant = Plant::start(policy);
+        let (port, holds) = black_hole(plant.port);
+        plant.kill_gateway();
+        let text = std::fs::read_to_string(plant.file()).unwrap();
+        let proxied = text.replace(&format!("port = {}\n", plant.port), &format!("port = {port}\n"));
+        assert_ne!(text, proxied);
+        std::fs::write(plant.file(), proxied).unwrap();
+        plant.heard.lock().unwrap().clear();
+        plant.start_gateway();
+        plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE" && plant.state() != Value::Null);
+        plant.order("o1", 0, 0, "a! k!");
+        plant.vehicle.wait_for("drive 1 k");
+        let lost = Instant::now();
+        holds.store(true, Ordering::SeqCst);
+        // These arrive when the network is back, and are old then.
+        plant.order("o1", 1, 2, "k! l!");
+        plant.instant("beep", "late");
+        plant.vehicle.wait_for("stood");
+        let took = plant.vehicle.at("stood").unwrap().duration_since(lost);
+        println!("{policy}, black hole: stood after {took:?}");
+        assert!(took < Duration::from_millis(bound), "{policy}: {took:?}");
+        holds.store(false, Ordering::SeqCst);
+        plant.wait_for("it is paused", |plant| plant.state()["paused"] == true && plant.has_error("brokerLost"));
+        plant.wait_for("what is late is refused", |plant| plant.has_error("validationError"));
+        plant.instant("stopPause", "p1");
+        plant.wait_for_end("o1", "k");
+        assert_eq!([plant.count("drive "), plant.count("act ")], [1, 0], "{:?}", plant.vehicle.lines());
     }
 }
 
