@@ -239,7 +239,7 @@ fn a_vehicle_that_is_lost_is_a_broken_connection() {
     let states = plant.heard.lock().unwrap()["state"].len();
     sleep(Duration::from_millis(500));
     assert_eq!(plant.heard.lock().unwrap()["state"].len(), states, "nothing is said of a vehicle that is away");
-    plant.vehicle = vehicle(plant.folder.path(), plant.fleet);
+    plant.vehicle = vehicle(plant.folder.path(), plant.fleet, 1);
     plant.wait_for_end("o1", "e");
     assert_eq!(plant.connection(), "ONLINE");
 }

@@ -1,10 +1,9 @@
 // The master control of vda-5050-lib (npm): an order with an update, instant actions and a cancelled order.
 //
-// node master.js PORT; prints what it is told, and ends with 0 if all of it came.
+// node master.js PORT VEHICLES, all at a time; prints what it is told, and ends with 0 if all of it came.
 
 const {BlockingType, MasterController} = require("vda-5050-lib");
 
-const agv = {manufacturer: "KIT", serialNumber: "0001"};
 const header = {orderUpdateId: 0};
 const place = node => ({x: 2 * (node.charCodeAt(0) - 97), y: 0, theta: 0, mapId: "hall"});
 
@@ -22,11 +21,18 @@ function order(orderId, orderUpdateId, first, way) {
 
 const action = (actionType, actionId) => ({actionType, actionId, blockingType: BlockingType.None, actionParameters: []});
 
-async function main(port) {
+async function main(port, vehicles) {
     const master = new MasterController(
         {interfaceName: "uagv", transport: {brokerUrl: `mqtt://127.0.0.1:${port}`}, vdaVersion: "2.0.0", topicFormat: "%interfaceName%/v2/%manufacturer%/%serialNumber%/%topic%"},
         {});
     await master.start();
+    await Promise.all(Array.from({length: vehicles}, (_, index) => one(master, String(index + 1).padStart(4, "0"))));
+    await master.stop();
+    console.log("done");
+}
+
+async function one(master, serialNumber) {
+    const agv = {manufacturer: "KIT", serialNumber};
     const drive = (what, onTraversed) => new Promise((resolve, reject) => master.assignOrder(agv, what, {
         onNodeTraversed: node => {
             console.log("traversed", node.nodeId, node.sequenceId);
@@ -58,11 +64,9 @@ async function main(port) {
     await new Promise(resolve => setTimeout(resolve, 700));
     console.log("cancel", await at_once(action("cancelOrder", "m-cancel")));
     if (await cancelled !== true) throw new Error("it was not cancelled");
-    await master.stop();
-    console.log("done");
 }
 
-main(Number(process.argv[2])).then(() => process.exit(0), error => {
+main(Number(process.argv[2]), Number(process.argv[3])).then(() => process.exit(0), error => {
     console.error(error);
     process.exit(1);
 });

@@ -103,6 +103,7 @@ pub struct Plant {
     pub broker: Option<Process>,
     pub gateway: Option<Process>,
     pub vehicle: Process,
+    pub others: Vec<Process>,
     pub client: Client,
     pub heard: Messages,
     pub more_of_broker: String,
@@ -118,10 +119,20 @@ impl Plant {
 
     /// `secured` makes files in a folder, and says what broker and gateway are told of them.
     pub fn with(on_broker_loss: &str, version: &'static str, secured: impl Fn(&Path) -> (String, String)) -> Self {
+        Self::of(1, on_broker_loss, version, secured)
+    }
+
+    /// With so many vehicles, whose serial numbers are 0001 and so on.
+    pub fn of(
+        vehicles: u32,
+        on_broker_loss: &str,
+        version: &'static str,
+        secured: impl Fn(&Path) -> (String, String),
+    ) -> Self {
         static FLEETS: AtomicU32 = AtomicU32::new(0);
         let fleet = 5_050_000 + std::process::id() % 10_000 * 20 + FLEETS.fetch_add(1, Ordering::SeqCst);
         let (folder, port, heard) = (tempfile::tempdir().unwrap(), free_port(), Messages::default());
-        keys(folder.path(), fleet);
+        keys(folder.path(), fleet, vehicles);
         let (more_of_broker, more_of_gateway) = secured(folder.path());
         let example = Path::new(env!("CARGO_MANIFEST_DIR"));
         std::fs::copy(example.join("example-factsheet.json"), folder.path().join("example-factsheet.json")).unwrap();
@@ -134,9 +145,15 @@ impl Plant {
         let (metrics, off) = (free_port(), "# metrics = \"127.0.0.1:9465\"");
         assert!(text.contains(off));
         let text = text.replace(off, &format!("metrics = \"127.0.0.1:{metrics}\""));
+        let more = (2..=vehicles).map(|number| {
+            let id = 100 + number;
+            format!("\n[[vehicle]]\nname = \"agv-{number}\"\nid = {id}\nserial_number = \"{number:04}\"\n")
+        });
+        let text = text + &more.collect::<String>();
         std::fs::write(folder.path().join("vda5050.toml"), text.replace("\"2.1.0\"", &format!("\"{version}\"")))
             .unwrap();
-        let vehicle = vehicle(folder.path(), fleet);
+        let others = (2..=vehicles).map(|number| vehicle(folder.path(), fleet, number)).collect();
+        let vehicle = vehicle(folder.path(), fleet, 1);
         let broker = Some(broker(folder.path(), port, &more_of_broker));
         let client = master(port, heard.clone());
         let gateway = None;
@@ -152,6 +169,7 @@ impl Plant {
             more_of_broker,
             protocol: version,
             metrics,
+            others,
         };
         plant.start_gateway();
         plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE");
@@ -264,21 +282,23 @@ pub fn tls_port(port: u16, more_of_broker: &str) -> u16 {
         .map_or(port, |rest| rest.split_whitespace().next().unwrap().parse().unwrap())
 }
 
-pub fn keys(folder: &Path, fleet: u32) {
+pub fn keys(folder: &Path, fleet: u32, vehicles: u32) {
     let manager = Identity::m_unit("vda5050", 1).unwrap();
     let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
     keys.add(&manager, &[]).unwrap();
-    keys.add_all(&[Identity::s_unit("agv-1", 101).unwrap()], &[manager]).unwrap();
+    let vehicle = |number| Identity::s_unit(&format!("agv-{number}"), 100 + number).unwrap();
+    keys.add_all(&(1..=vehicles).map(vehicle).collect::<Vec<_>>(), &[manager]).unwrap();
     std::fs::create_dir(folder.join("keys")).unwrap();
     Store::create(&folder.join("keys"), keys).unwrap();
 }
 
-pub fn vehicle(folder: &Path, fleet: u32) -> Process {
+pub fn vehicle(folder: &Path, fleet: u32, number: u32) -> Process {
     // Examples are beside the programs.
     let file = Path::new(env!("CARGO_BIN_EXE_cara-vda5050")).with_file_name("examples").join("vehicle");
     let mut command = Command::new(file);
-    command.args(["agv-1", "101", "--speed", "2", "--fleet", &fleet.to_string()]);
-    Process::start(command.env("CARA_KEYS", folder.join("keys")).env("XDG_STATE_HOME", folder.join("vehicle")))
+    let (name, id) = (format!("agv-{number}"), (100 + number).to_string());
+    command.args([&name, &id]).args(["--speed", "2", "--fleet", &fleet.to_string()]);
+    Process::start(command.env("CARA_KEYS", folder.join("keys")).env("XDG_STATE_HOME", folder.join(name)))
 }
 
 pub fn broker(folder: &Path, port: u16, more: &str) -> Process {
@@ -306,7 +326,10 @@ pub fn master(port: u16, heard: Messages) -> Client {
                     let _ = subscriber.try_subscribe("uagv/#", QoS::AtLeastOnce);
                 }
                 Ok(Event::Incoming(Packet::Publish(message))) => {
-                    let topic = message.topic.rsplit('/').next().unwrap_or_default().to_owned();
+                    let topic = message.topic.rsplit('/').next().unwrap_or_default();
+                    // Those of the first vehicle by their topic alone.
+                    let serial = message.topic.rsplit('/').nth(1).unwrap_or_default();
+                    let topic = if serial == "0001" { topic.to_owned() } else { format!("{serial}/{topic}") };
                     let value = serde_json::from_slice(&message.payload).unwrap_or_default();
                     heard.lock().unwrap().entry(topic).or_default().push((value, message.retain));
                 }
@@ -321,7 +344,8 @@ pub fn master(port: u16, heard: Messages) -> Client {
 /// Each message that was sent is valid, and its header ids rise by topic.
 pub fn check_messages(plant: &Plant) {
     for (topic, messages) in plant.heard.lock().unwrap().iter() {
-        if matches!(topic.as_str(), "order" | "instantActions" | "cara-probe") {
+        let topic = topic.rsplit('/').next().unwrap();
+        if matches!(topic, "order" | "instantActions" | "cara-probe") {
             continue;
         }
         let file = format!("schemas/2.1.0/{topic}.schema");
