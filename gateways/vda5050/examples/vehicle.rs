@@ -39,6 +39,9 @@ struct Options {
     /// Where it stands at first.
     #[arg(long, default_value_t = 0.0)]
     x: f64,
+    /// So many of them: behind agv-1 come agv-2, agv-3 …, with the ID numbers that follow.
+    #[arg(long, default_value_t = 1)]
+    vehicles: u32,
     /// Milliseconds that an action takes.
     #[arg(long, default_value_t = 300)]
     action: u64,
@@ -227,21 +230,44 @@ impl Body {
 }
 
 fn main() -> anyhow::Result<()> {
-    let Options { name, id, manager, manager_id, fleet, speed, x, action } = Options::parse();
-    let position = [x, 0.0, 0.0];
+    let options = Options::parse();
+    // agv-1 is followed by agv-2.
+    let prefix = options.name.trim_end_matches(|letter: char| letter.is_ascii_digit());
+    let first: u32 = options.name[prefix.len()..].parse().unwrap_or_default();
+    let mut all = vec![start(&options, &options.name, options.id)?];
+    for more in 1..options.vehicles {
+        all.push(start(&options, &format!("{prefix}{}", first + more), options.id + more)?);
+    }
+    let mut last = Instant::now();
+    loop {
+        std::thread::sleep(TICK);
+        let seconds = last.elapsed().as_secs_f64();
+        last = Instant::now();
+        for (vehicle, unit) in &all {
+            let done = vehicle.lock().turn(seconds);
+            done.iter().for_each(|order| {
+                unit.end_order(order);
+            });
+        }
+    }
+}
+
+fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Unit<Vehicle>)> {
+    let Options { manager, manager_id, fleet, speed, x, action, .. } = options;
+    let position = [*x, 0.0, 0.0];
     let condition = Condition { position, map: "hall".into(), charge: 80.0, ..Condition::default() };
     let vehicle = Vehicle(Arc::new(Mutex::new(Body {
         condition,
         legs: Vec::new(),
         loads: Vec::new(),
-        speed,
+        speed: *speed,
         drive: None,
         action: None,
         handling: None,
-        takes: Duration::from_millis(action),
+        takes: Duration::from_millis(*action),
     })));
     vehicle.lock().end_with(ActionStatus::Finished, "");
-    let builder = Unit::builder(&name, id, &manager, manager_id)?.fleet(fleet).interfaces(Interfaces::Loopback);
+    let builder = Unit::builder(name, id, manager, *manager_id)?.fleet(*fleet).interfaces(Interfaces::Loopback);
     let unit = builder.state(vehicle.clone()).build()?;
     // The motors' loop looks at the orders itself: nothing is left for the hooks.
     let drive = unit.my_function_list().actuator(|| ())?;
@@ -250,14 +276,5 @@ fn main() -> anyhow::Result<()> {
     unit.my_function_list().serve(EquippedServer)?;
     unit.publish_my_function_list()?;
     unit.start()?;
-    let mut last = Instant::now();
-    loop {
-        std::thread::sleep(TICK);
-        let seconds = last.elapsed().as_secs_f64();
-        last = Instant::now();
-        let done = vehicle.lock().turn(seconds);
-        done.iter().for_each(|order| {
-            unit.end_order(order);
-        });
-    }
+    Ok((vehicle, unit))
 }

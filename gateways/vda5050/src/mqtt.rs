@@ -66,7 +66,7 @@ impl Link {
         let ended = ends.clone();
         std::thread::Builder::new().name(format!("mqtt {}", place.client_id)).spawn(move || {
             while !ended.load(Ordering::SeqCst) {
-                let why = connection(&place, &sender).err().map_or_else(String::new, |error| format!("{error:#}"));
+                let why = connection(&place, &sender).err().map_or_else(String::new, |error| reason(&error));
                 if sender.send(Heard::Lost(why)).is_err() {
                     return;
                 }
@@ -86,6 +86,18 @@ impl Drop for Link {
     fn drop(&mut self) {
         self.end();
     }
+}
+
+/// An error with its causes; those of rumqttc have theirs in their own text.
+fn reason(error: &anyhow::Error) -> String {
+    let mut reason = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if !reason.contains(&cause) {
+            let colon = if reason.is_empty() { "" } else { ": " };
+            reason = format!("{reason}{colon}{cause}");
+        }
+    }
+    reason
 }
 
 /// One connection, until it ends.

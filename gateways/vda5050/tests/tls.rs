@@ -6,6 +6,7 @@ mod plant;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use cara_vda5050::config::Broker;
 use plant::{Plant, certificates, free_port, until};
@@ -13,7 +14,11 @@ use rumqttc::{Client, Event, MqttOptions, Packet, QoS, TlsConfiguration, Transpo
 
 /// What mosquitto and the gateway are told of a listener with certificates.
 fn secured(folder: &Path, port: u16, days: u32) -> (String, String) {
-    certificates(folder, &["broker", "0001", "0002", "master"], days);
+    secured_for(folder, port, days, &["0001", "0002"])
+}
+
+fn secured_for(folder: &Path, port: u16, days: u32, vehicles: &[&str]) -> (String, String) {
+    certificates(folder, &[&["broker", "master"], vehicles].concat(), days);
     let file = |name: &str| folder.join(name).display().to_string();
     let acl = Path::new(env!("CARGO_MANIFEST_DIR")).join("example-acl");
     let broker = format!(
@@ -153,4 +158,61 @@ fn certificates_that_expire_are_an_alarm_until_they_are_replaced() {
     assert!(plant.scrape().contains("cara_vda5050_broker_losses_total{vehicle=\"0001\"} 1"));
     plant.order("o1", 0, 0, "a! b!");
     plant.wait_for_end("o1", "b");
+}
+
+/// 20 vehicles, or as many as `CARA_TEST_VEHICLES` says: how much the gateway takes, and what a restart of the broker does.
+#[test]
+#[ignore = "measures"]
+fn many_vehicles_over_tls() {
+    let count = std::env::var("CARA_TEST_VEHICLES").ok().and_then(|text| text.parse().ok()).unwrap_or(20);
+    let serials: Vec<String> = (1..=count).map(|number| format!("{number:04}")).collect();
+    let tls = free_port();
+    let mut plant = Plant::of(count, "{ do = \"finish-base\", seconds = 60.0, metres = 500.0 }", "2.1.0", |folder| {
+        secured_for(folder, tls, 400, &serials.iter().map(String::as_str).collect::<Vec<_>>())
+    });
+    let topic = |serial: &str, topic: &str| match serial {
+        "0001" => topic.to_owned(),
+        _ => format!("{serial}/{topic}"),
+    };
+    let all = |plant: &Plant, what: &str, is_so: &dyn Fn(&serde_json::Value) -> bool| {
+        serials.iter().filter(|serial| !is_so(&plant.last(&topic(serial, what)).0)).count()
+    };
+    let online = |message: &serde_json::Value| message["connectionState"] == "ONLINE";
+    let drives = |state: &serde_json::Value| state["driving"] == true;
+    let began = Instant::now();
+    within(&format!("{count} are ONLINE"), || all(&plant, "connection", &online) == 0);
+    println!("{count} vehicles ONLINE after {:?}", began.elapsed());
+    let idle = plant.used(Duration::from_secs(5));
+    let way: String = ('a'..='z').map(|node| format!("{node}! ")).collect();
+    for serial in &serials {
+        let mut order = fake::order("o1", 0, 0, &way);
+        order.header.serial_number = serial.clone();
+        // Slow, so that it lasts.
+        order.edges.iter_mut().for_each(|edge| edge.max_speed = Some(0.5));
+        let message = serde_json::to_vec(&order).unwrap();
+        plant.client.publish(format!("uagv/v2/KIT/{serial}/order"), QoS::AtLeastOnce, false, message).unwrap();
+    }
+    within("all drive", || all(&plant, "state", &drives) == 0);
+    let driving = plant.used(Duration::from_secs(10));
+    println!("CPUs idle {idle:.3}, driving {driving:.3}; resident {} KB", plant.resident());
+    plant.broker.take().unwrap().kill();
+    plant.heard.lock().unwrap().clear();
+    std::thread::sleep(Duration::from_secs(1));
+    let began = Instant::now();
+    plant.restart_broker();
+    within("all are ONLINE again", || all(&plant, "connection", &online) == 0);
+    println!("all ONLINE {:?} after the broker's restart", began.elapsed());
+    within("all drive", || all(&plant, "state", &drives) == 0);
+    println!("all have said that they drive after {:?}; resident {} KB", began.elapsed(), plant.resident());
+    let stood = plant.count("stood")
+        + plant.others.iter().flat_map(|of| of.lines()).filter(|line| line.starts_with("stood")).count();
+    assert_eq!(stood, 0, "nobody stopped");
+}
+
+fn within(what: &str, mut is_so: impl FnMut() -> bool) {
+    let end = Instant::now() + Duration::from_secs(180);
+    while !is_so() {
+        assert!(Instant::now() < end, "{what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
 }

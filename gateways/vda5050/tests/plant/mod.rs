@@ -152,7 +152,11 @@ impl Plant {
         let text = text + &more.collect::<String>();
         std::fs::write(folder.path().join("vda5050.toml"), text.replace("\"2.1.0\"", &format!("\"{version}\"")))
             .unwrap();
-        let others = (2..=vehicles).map(|number| vehicle(folder.path(), fleet, number)).collect();
+        // Each a process, or one for many.
+        let others = match vehicles {
+            0..=20 => (2..=vehicles).map(|number| vehicles_from(folder.path(), fleet, number, 1)).collect(),
+            _ => vec![vehicles_from(folder.path(), fleet, 2, vehicles - 1)],
+        };
         let vehicle = vehicle(folder.path(), fleet, 1);
         let broker = Some(broker(folder.path(), port, &more_of_broker));
         let client = master(port, heard.clone());
@@ -188,6 +192,27 @@ impl Plant {
         let mut text = String::new();
         stream.read_to_string(&mut text).unwrap();
         text
+    }
+
+    /// CPUs that the gateway takes in a while.
+    pub fn used(&self, time: Duration) -> f64 {
+        let ticks = || {
+            let id = self.gateway.as_ref().unwrap().child.id();
+            let text = std::fs::read_to_string(format!("/proc/{id}/stat")).unwrap();
+            let fields: Vec<&str> = text.rsplit(')').next().unwrap().split_whitespace().collect();
+            fields[11].parse::<u64>().unwrap() + fields[12].parse::<u64>().unwrap()
+        };
+        let (before, began) = (ticks(), Instant::now());
+        sleep(time);
+        (ticks() - before) as f64 / 100.0 / began.elapsed().as_secs_f64()
+    }
+
+    /// KB of memory that it has.
+    pub fn resident(&self) -> u64 {
+        let id = self.gateway.as_ref().unwrap().child.id();
+        let text = std::fs::read_to_string(format!("/proc/{id}/status")).unwrap();
+        let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+        line.trim().split(' ').next().unwrap().parse().unwrap()
     }
 
     pub fn start_gateway(&mut self) {
@@ -293,11 +318,15 @@ pub fn keys(folder: &Path, fleet: u32, vehicles: u32) {
 }
 
 pub fn vehicle(folder: &Path, fleet: u32, number: u32) -> Process {
+    vehicles_from(folder, fleet, number, 1)
+}
+
+fn vehicles_from(folder: &Path, fleet: u32, number: u32, count: u32) -> Process {
     // Examples are beside the programs.
     let file = Path::new(env!("CARGO_BIN_EXE_cara-vda5050")).with_file_name("examples").join("vehicle");
     let mut command = Command::new(file);
     let (name, id) = (format!("agv-{number}"), (100 + number).to_string());
-    command.args([&name, &id]).args(["--speed", "2", "--fleet", &fleet.to_string()]);
+    command.args([&name, &id]).args(["--vehicles", &count.to_string(), "--speed", "2", "--fleet", &fleet.to_string()]);
     Process::start(command.env("CARA_KEYS", folder.join("keys")).env("XDG_STATE_HOME", folder.join(name)))
 }
 
