@@ -350,7 +350,9 @@ fn word<T: Copy>(words: &[T], index: i64, other: T) -> T {
 fn status(condition: Condition) -> Status {
     let unsigned = |number: i64| u64::try_from(number).unwrap_or(0);
     let [x, y, theta] = condition.position;
-    let [vx, vy, omega] = condition.velocity.map(Some);
+    // JSON has no NaN: what is not known is left out, and a charge that is not known is none.
+    let [vx, vy, omega] = condition.velocity.map(|speed| Some(speed).filter(|speed| speed.is_finite()));
+    let charge = Some(condition.charge).filter(|charge| charge.is_finite()).unwrap_or(0.0);
     let at = AgvPosition { x, y, theta, map_id: condition.map, position_initialized: true, ..AgvPosition::default() };
     Status {
         drive: unsigned(condition.drive),
@@ -367,14 +369,46 @@ fn status(condition: Condition) -> Status {
         stopped: None,
         // What is not known is not automatic.
         mode: word(&MODES, condition.mode, OperatingMode::Manual),
-        battery: BatteryState {
-            battery_charge: condition.charge,
-            charging: condition.is_charging,
-            ..BatteryState::default()
-        },
+        battery: BatteryState { battery_charge: charge, charging: condition.is_charging, ..BatteryState::default() },
         loads: None,
         e_stop: word(&E_STOPS, condition.e_stop, EStop::Manual),
         field_violation: condition.field_violation,
         boot: 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Condition, Equipment, status};
+    use crate::message::Load;
+
+    /// A sensor that has nothing to say makes no state that a master cannot read.
+    #[test]
+    fn what_is_not_a_number_is_not_reported() {
+        let nothing = f64::NAN;
+        let condition = Condition {
+            position: [nothing; 3],
+            map: "hall".into(),
+            velocity: [nothing; 3],
+            charge: nothing,
+            ..Condition::default()
+        };
+        let mut status = status(condition);
+        Equipment { load_weights: [nothing; 8], loads: 99, ..Equipment::default() }.report(&mut status);
+        let record = crate::state::Record::default();
+        let text = serde_json::to_string(&record.report(&status, &[], false)).unwrap();
+        assert!(!text.contains("null") && status.position.is_none(), "{text}");
+        assert_eq!(status.loads.map(|loads| loads.len()), Some(8));
+    }
+
+    #[test]
+    fn loads_are_read_as_they_were_told() {
+        let load = |id: &str, weight| Load { load_id: Some(id.into()), weight, ..Load::default() };
+        let loads = vec![load("pallet-7", Some(12.5)), Load::default(), load("box", None)];
+        let mut status = status(Condition::default());
+        Equipment::carrying(&loads).report(&mut status);
+        assert_eq!(status.loads, Some(loads));
+        Equipment::default().report(&mut status);
+        assert_eq!(status.loads, None, "it does not know");
     }
 }

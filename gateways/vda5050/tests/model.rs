@@ -6,9 +6,10 @@ mod fake;
 use std::collections::BTreeMap;
 
 use cara_vda5050::machine::Machine;
-use cara_vda5050::message::{Action, ActionStatus, BlockingType, InstantActions, OperatingMode, Order};
+use cara_vda5050::message::{Action, ActionStatus, BlockingType, InstantActions, OperatingMode, Order, read};
 use cara_vda5050::state::{OnBrokerLoss, Policy, Record};
 use fake::{Pair, instant, order, policy};
+use serde_json::{Value, json};
 
 /// What is sent, and may come again later.
 #[derive(Clone)]
@@ -249,4 +250,68 @@ fn no_action_twice_no_other_base_and_no_order_lost() {
     }
     println!("{sequences} sequences: {driven} edges driven, {began} actions run, {orders} nodes released");
     assert!(driven as u64 > sequences && began as u64 > sequences / 2, "the model does nothing");
+}
+
+/// Something else in the place of any value of a message.
+fn spoil(value: &mut Value, rng: &mut fastrand::Rng) {
+    let inside: Vec<&mut Value> = match value {
+        Value::Object(members) => members.values_mut().collect(),
+        Value::Array(values) => values.iter_mut().collect(),
+        _ => Vec::new(),
+    };
+    let count = inside.len();
+    if count > 0 && rng.u8(0..6) > 0 {
+        return spoil(inside.into_iter().nth(rng.usize(..count)).unwrap(), rng);
+    }
+    let others = [
+        Value::Null,
+        json!(0),
+        json!(-1),
+        json!(u32::MAX),
+        json!(u64::MAX),
+        json!(1e308),
+        json!(0.5),
+        json!(true),
+        json!(""),
+        json!("a\nb"),
+        json!("x".repeat(70)),
+        json!([]),
+        json!({}),
+        json!([[[]]]),
+    ];
+    *value = rng.choice(others).unwrap();
+}
+
+/// Messages with anything in them: the machine goes on, and keeps its rules.
+#[test]
+fn no_message_is_the_end() {
+    let mut taken = 0;
+    for seed in 0..400 {
+        let mut world = World::new(seed);
+        for _ in 0..40 {
+            let from = world.node_here();
+            let way = world.way(&from);
+            world.names += 1;
+            let mut order = serde_json::to_value(order(&format!("o{}", world.names), 0, 0, &way)).unwrap();
+            let mut action = serde_json::to_value(instant("beep", &format!("i{}", world.names))).unwrap();
+            for message in [&mut order, &mut action] {
+                (0..world.rng.u8(0..3)).for_each(|_| spoil(message, &mut world.rng));
+            }
+            if let Ok(order) = read::<Order>(order.to_string().as_bytes()) {
+                world.pair.machine.order(order.clone());
+                taken += u32::from(world.pair.machine.record().order_id == order.order_id);
+            }
+            if let Ok(action) = read(action.to_string().as_bytes()) {
+                world.pair.machine.instant_actions(action);
+            }
+            (0..world.rng.u8(0..8)).for_each(|_| world.pair.turn());
+            // The vehicle stands elsewhere where an order said so.
+            if let Some(at) = &mut world.pair.vehicle.status.position {
+                at.x = fake::place("a");
+            }
+        }
+        let text = serde_json::to_string(&world.pair.machine.report()).unwrap();
+        assert!(text.len() < 100_000);
+    }
+    assert!(taken > 300, "{taken}");
 }
