@@ -67,7 +67,7 @@ impl<T> TakenCall<T> {
             if self.is_cancelled() {
                 return Poll::Ready(());
             }
-            self.unit.shared.machine.borrow_mut().wakers.leases.register(cx.waker());
+            self.unit.shared.machine.borrow_mut().wakers.leases.register(cx);
             Poll::Pending
         })
         .await;

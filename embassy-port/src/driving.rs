@@ -40,9 +40,11 @@ use crate::time::now;
 const PATIENCE: Duration = Duration::from_millis(300);
 /// Refused links are logged at most this often.
 const LOGGED: Duration = Duration::from_secs(1);
-/// How often cable and address are checked. The stack could wake one task when they change, but only one, and that is left
-/// to the application's `wait_config_up`.
-const LOOK: Duration = Duration::from_millis(50);
+/// How often the address is checked, and the cable where another task waits for a change of the network: embassy-net wakes one
+/// task only.
+const LOOK: Duration = Duration::from_secs(3);
+/// The same while there is no address.
+const AWAY: Duration = Duration::from_millis(250);
 
 /// What the runner has to do outside of the machine.
 pub(crate) enum Job {
@@ -301,13 +303,15 @@ impl<T> Machine<T> {
 
     /// The cable was pulled or plugged in, or the address changed: every connection is dead, whatever TCP still hopes.
     #[inline(never)]
-    pub(crate) fn look_at_network(&mut self) {
+    pub(crate) fn look_at_network(&mut self, context: &mut TaskContext<'_>) {
         let now = now();
-        // Until there is an address each step looks: a connection must not be there before it.
-        if now < self.look && self.address.is_some() {
+        // Not each time: it wakes another task that waits for a change, which then takes the place, and wakes this one.
+        if now >= self.look {
+            self.look = now + if self.address.is_some() { LOOK } else { AWAY };
+            self.mail.wake_on_change(context);
+        } else if self.address.is_some() && !self.mail.is_cut() {
             return;
         }
-        self.look = now + LOOK;
         let address = self.mail.address();
         if address == self.address {
             return;

@@ -39,7 +39,7 @@ impl<T> Handle<T> {
                 if machine.has_read(link, serial, reported) {
                     return Poll::Ready(());
                 }
-                machine.wakers.news.register(cx.waker());
+                machine.wakers.news.register(cx);
                 Poll::Pending
             })
             .await;

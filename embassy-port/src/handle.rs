@@ -87,7 +87,7 @@ impl<T> Handle<T> {
             if done(self) {
                 return Poll::Ready(());
             }
-            self.shared.machine.borrow_mut().wakers.news.register(cx.waker());
+            self.shared.machine.borrow_mut().wakers.news.register(cx);
             Poll::Pending
         })
         .await;
@@ -144,7 +144,7 @@ impl<T> Handle<T> {
             if !lease.is_live() {
                 return Poll::Ready(());
             }
-            self.shared.machine.borrow_mut().wakers.leases.register(cx.waker());
+            self.shared.machine.borrow_mut().wakers.leases.register(cx);
             Poll::Pending
         })
         .await;

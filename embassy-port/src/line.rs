@@ -211,6 +211,12 @@ impl Port {
         Some(OWN)
     }
 
+    pub(crate) const fn is_cut(&self) -> bool {
+        false
+    }
+
+    pub(crate) const fn wake_on_change(&self, _: &mut Context<'_>) {}
+
     pub(crate) fn send_to(&mut self, to: SocketAddrV4, datagram: &[u8]) -> bool {
         self.line.act(|line| line.send_datagram(to.port(), self.port, datagram))
     }

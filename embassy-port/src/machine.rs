@@ -13,9 +13,11 @@ use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
 use core::cell::{Cell, RefCell};
+use core::future::Future;
 use core::net::{Ipv4Addr, SocketAddrV4};
-use core::task::Context as TaskContext;
-use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
+use core::pin::pin;
+use core::task::{Context as TaskContext, Waker};
+use embassy_sync::waitqueue::WakerRegistration;
 
 use crate::config::Table;
 use crate::event::{Events, UnitEvent};
@@ -27,10 +29,11 @@ use crate::port::{Board, LinkContext, LinkCounters, LinkSession};
 use crate::replies::ReplyBox;
 use crate::security::Proof;
 use crate::task_slots::TaskSlot;
-use crate::time::now;
+use crate::time::{now, timer};
 
-/// Tasks that can wait for the same thing without waking each other.
+/// Tasks that are woken for the same thing. Each further one looks every [`LOOK`].
 const TASKS_WAITING: usize = 4;
+const LOOK: Duration = Duration::from_millis(100);
 
 /// What a handle points to.
 pub(crate) struct Shared<T: 'static> {
@@ -134,11 +137,34 @@ pub(crate) struct Wakers {
     /// The reader of events.
     pub(crate) events: WakerRegistration,
     /// A peer came, went or was told something.
-    pub(crate) news: MultiWakerRegistration<TASKS_WAITING>,
+    pub(crate) news: Waiting,
     /// A call waits for a task.
-    pub(crate) calls: MultiWakerRegistration<TASKS_WAITING>,
+    pub(crate) calls: Waiting,
     /// A lease of one of this unit's services has ended, or gone over to a newer call; or a call that runs was given up.
-    pub(crate) leases: MultiWakerRegistration<TASKS_WAITING>,
+    pub(crate) leases: Waiting,
+}
+
+/// Tasks that wait for the same thing.
+pub(crate) struct Waiting(heapless::Vec<Waker, TASKS_WAITING>);
+
+impl Waiting {
+    const fn new() -> Self {
+        Self(heapless::Vec::new())
+    }
+
+    /// The task is woken once, for all of them or in [`LOOK`]: were another task woken to make room for it, they would wake each
+    /// other for ever.
+    pub(crate) fn register(&mut self, context: &mut TaskContext<'_>) {
+        let waker = context.waker();
+        let is_known = self.0.iter().any(|known| known.will_wake(waker));
+        if !is_known && self.0.push(waker.clone()).is_err() {
+            let _ = pin!(timer(now() + LOOK)).poll(context);
+        }
+    }
+
+    pub(crate) fn wake(&mut self) {
+        core::mem::take(&mut self.0).into_iter().for_each(Waker::wake);
+    }
 }
 
 impl Wakers {
@@ -146,9 +172,9 @@ impl Wakers {
         Self {
             runner: WakerRegistration::new(),
             events: WakerRegistration::new(),
-            news: MultiWakerRegistration::new(),
-            calls: MultiWakerRegistration::new(),
-            leases: MultiWakerRegistration::new(),
+            news: Waiting::new(),
+            calls: Waiting::new(),
+            leases: Waiting::new(),
         }
     }
 }

@@ -134,6 +134,16 @@ impl Mail {
         of!(Network: &self.network, one => one.address())
     }
 
+    /// Whether the cable is out.
+    pub(crate) fn is_cut(&self) -> bool {
+        of!(Network: &self.network, one => one.is_cut())
+    }
+
+    /// The task is woken when the cable or the address changes, unless another task waits for that as well.
+    pub(crate) fn wake_on_change(&self, context: &mut Context<'_>) {
+        of!(Network: &self.network, one => one.wake_on_change(context));
+    }
+
     /// Takes a datagram: its length and where it comes from, or that it is dropped. `None` when there is none; the task is then
     /// woken by the next.
     pub(crate) fn receive(

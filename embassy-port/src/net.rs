@@ -64,6 +64,18 @@ impl Net {
         self.config().map(|config| config.address.address())
     }
 
+    pub(crate) fn is_cut(&self) -> bool {
+        !self.stack.is_link_up()
+    }
+
+    pub(crate) fn wake_on_change(&self, context: &mut Context<'_>) {
+        // Polled once, either leaves the task's waker with the stack, which it wakes for any change.
+        let _ = match self.is_cut() {
+            true => pin!(self.stack.wait_link_up()).poll(context),
+            false => pin!(self.stack.wait_link_down()).poll(context),
+        };
+    }
+
     fn config(&self) -> Option<StaticConfigV4> {
         if self.stack.is_link_up() { self.stack.config_v4() } else { None }
     }

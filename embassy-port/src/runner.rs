@@ -93,8 +93,9 @@ impl<T> Runner<T> {
         // Each step may make something due at once. Only after a rest is it known until when nothing is due.
         let awaits_hook = machine.awaits_hook();
         let is_due = awaits_hook | (now() >= core::mem::replace(&mut self.rested_until, Instant::START));
-        if is_due || machine.address.is_none() {
-            machine.look_at_network();
+        // Until there is an address each step looks: a connection must not be there before it.
+        if is_due || machine.address.is_none() || machine.mail.is_cut() {
+            machine.look_at_network(context);
         }
         if is_due {
             for index in machine.indices() {

@@ -166,7 +166,7 @@ impl<T> Handle<T> {
             match machine.take_call(function, parameters) {
                 Some(taken) => core::task::Poll::Ready(taken),
                 None => {
-                    machine.wakers.calls.register(cx.waker());
+                    machine.wakers.calls.register(cx);
                     core::task::Poll::Pending
                 }
             }

@@ -587,8 +587,47 @@ fn an_idle_unit_lets_its_controller_sleep() {
     bench.run_for(SHORT);
     polls.set(0);
     bench.run_for(Duration::from_secs(10));
-    // It looks at the cable 20 times a second, and at its keep-alives.
-    assert!(polls.get() <= 300, "{} times in 10 s", polls.get());
+    // Keep-alives each way, and a look at the address every 3 s.
+    assert!(polls.get() <= 50, "{} times in 10 s", polls.get());
+    board.set_cable(false);
+    assert!(bench.run_until(|| !agv.is_connected(), Duration::from_millis(50)), "the cable goes unnoticed");
+    board.set_cable(true);
+    assert!(bench.run_until(|| agv.is_connected(), LONG));
+    // Another task waits for a change of the network too, and embassy-net wakes one only.
+    let (stack, sees) = (board.stack(), Rc::new(Cell::new(0)));
+    let task = Box::pin(async move { stack.wait_link_down().await });
+    board.spawn(Counted { task, polls: Rc::clone(&sees) });
+    bench.run_for(SHORT);
+    polls.set(0);
+    bench.run_for(Duration::from_secs(10));
+    assert!(polls.get() + sees.get() <= 60, "{} and {} times in 10 s", polls.get(), sees.get());
+}
+
+#[test]
+fn tasks_that_wait_for_calls_let_their_controller_sleep() {
+    const TASKS: usize = 6;
+    let bench = Bench::new(23);
+    let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    agv.my_function_list().add_service("twice(n: int) -> (n: int)", ServiceOptions::new(), Handler::task()).unwrap();
+    let polls = Rc::new(Cell::new(0));
+    for _ in 0..TASKS {
+        let task = Box::pin(async move {
+            let mut parameters = Parameters::new();
+            while let Ok(call) = agv.next_call("twice", &mut parameters).await {
+                let n = parameters.variable::<i64>("n").map_or(0, |n| n * 2);
+                let result = parameters.set_value("n", n).map_err(|_| ServiceError::BadResults);
+                call.reply(result.map(|()| &*parameters)).await;
+            }
+        });
+        agv_board.spawn(Counted { task, polls: Rc::clone(&polls) });
+    }
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "twice"), SHORT));
+    polls.set(0);
+    bench.run_for(Duration::from_secs(10));
+    // Four are woken when a call comes, and two look each 100 ms.
+    assert!(polls.get() <= 250, "{} times in 10 s", polls.get());
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "twice", 4), Ok(8));
 }
 
 /// No task of the vehicle runs any more, as when a handler hangs: its motor sees the lease end in time all the same,
