@@ -1,5 +1,6 @@
 //! `cargo xtask firmware` and `cargo xtask sizes`: what runs on boards is built, measured and run in an emulator.
 
+mod abilities;
 mod boards;
 mod breakdown;
 mod faults;
@@ -19,6 +20,7 @@ use crate::binaries;
 use crate::command::Run;
 use crate::groups::Outcome;
 use crate::{install, msrv, workspace};
+pub(crate) use abilities::{abilities, targets};
 use boards::{BOARDS, Board, Image};
 pub(crate) use boards::{built, find, image_build};
 pub(crate) use faults::{Faults, check as check_faults, faults};

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 38] = [
+pub(crate) const GROUPS: [Group; 39] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -366,6 +366,15 @@ pub(crate) const GROUPS: [Group; 38] = [
         by_default: false,
         waits: true,
         run: |_| firmware::test_rp2040(),
+    },
+    Group {
+        name: "abilities",
+        what: "the embassy port with each of its features alone, with all and with none builds for a Cortex-M0, M3 and M4, without a warning",
+        budget: 300,
+        quick: None,
+        by_default: false,
+        waits: false,
+        run: |_| needing(firmware::targets(), firmware::abilities),
     },
     Group {
         name: "mps2-an386",
