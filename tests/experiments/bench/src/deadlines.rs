@@ -155,11 +155,13 @@ fn share(scheduling: Scheduling, load: u64) -> Result<Share> {
 /// A table for people.
 pub(crate) fn table(shares: &[Share]) -> String {
     let timeouts: String = TIMEOUTS.iter().map(|timeout| format!(" {timeout} ms |")).collect();
-    let mut text =
-        format!("| order | load | deadlines met |{timeouts}\n|---|---|---|{}\n", "---|".repeat(TIMEOUTS.len()));
-    for Share { scheduling, load, met, by_timeout, .. } in shares {
+    let mut text = format!(
+        "| order | load | run time | deadlines met |{timeouts}\n|---|---|---|---|{}\n",
+        "---|".repeat(TIMEOUTS.len())
+    );
+    for Share { scheduling, load, met, by_timeout, run_time, .. } in shares {
         let each: String = by_timeout.iter().map(|share| format!(" {:.1} % |", 100.0 * share)).collect();
-        text += &format!("| `{}` | {load} % | {:.1} % |{each}\n", scheduling.word(), 100.0 * met);
+        text += &format!("| `{}` | {load} % | {run_time:.2} | {:.1} % |{each}\n", scheduling.word(), 100.0 * met);
     }
     text
 }

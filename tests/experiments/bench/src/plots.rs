@@ -41,11 +41,11 @@ pub(crate) fn draw(results: &Results, folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Draws the share of deadlines that are met over the load, and writes what was measured on Linux.
+/// Draws the share of deadlines that are met over the load, as long as runs really took, and writes what was measured on Linux.
 pub(crate) fn draw_deadlines(shares: &[Share], linux: bool, folder: &Path) -> Result<()> {
     let line = |scheduling: Scheduling| {
         let of = shares.iter().filter(|share| share.scheduling == scheduling);
-        let points = of.map(|share| Point::new(share.load as f64, share.met)).collect();
+        let points = of.map(|share| Point::new(share.load as f64 * share.run_time, share.met)).collect();
         Line::measured(scheduling.word(), points)
     };
     let (x, y) = (Axis::linear("load, %"), Axis::share("deadlines met / calls"));
