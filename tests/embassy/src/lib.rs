@@ -3,7 +3,8 @@
 //!
 //! A [`Bench`] is a switch with boards. Each [`Board`] has a network stack of its own, and tasks that end when it loses
 //! power. Time stands still unless [`Bench::run_until`] lets it pass: it polls what was woken and jumps to the next
-//! timer or frame. Benches on several threads do not know of each other, so tests run side by side.
+//! timer or frame. A [`Wire`] joins two boards by a serial line in place of the switch. Benches on several threads do not know of
+//! each other, so tests run side by side.
 //!
 //! ```
 //! use cara_core::time::Duration;

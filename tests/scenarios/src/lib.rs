@@ -1,5 +1,5 @@
-//! Every rule of CARA as a scenario: written once, run on the simulator, on Linux over loopback, and on boards with
-//! embassy-net on a switch in memory.
+//! Every rule of CARA as a scenario: written once, run on the simulator, on Linux over loopback, on boards with embassy-net on
+//! a switch in memory, and on two boards on a serial line.
 //!
 //! A [`Scenario`] is a function of a [`World`]: it builds a fleet in a few lines, lets time pass, injects faults, and
 //! asserts what the rule says. `cargo test` runs each once on every port that can; the program `seeds` runs each for
