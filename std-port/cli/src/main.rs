@@ -35,6 +35,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Scan(_)
             | Verb::Watch(_)
             | Verb::Stream(_)
+            | Verb::Logs(_)
             | Verb::Replay(_)
             | Verb::Doctor(_)
             | Verb::HandOver(_)
@@ -56,6 +57,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),
         Verb::Top(arguments) => commands::top::run(arguments, global),
+        Verb::Logs(arguments) => commands::logs::run(arguments, global),
         Verb::Record(arguments) => commands::record::run(arguments, global),
         Verb::Replay(arguments) => commands::replay::run(arguments, global),
         Verb::BlackBox(arguments) => commands::black_box::run(arguments, global),

@@ -8,6 +8,7 @@ pub(crate) mod counters;
 pub(crate) mod forget_claim;
 pub(crate) mod functions;
 pub(crate) mod hand_over;
+pub(crate) mod logs;
 pub(crate) mod man;
 pub(crate) mod orders;
 pub(crate) mod ping;

@@ -1,10 +1,10 @@
-//! `cara replay`: the events of recordings.
+//! `cara replay`: the events of recordings, and what a unit would have answered meanwhile.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use crate::recording::{Reading, ReadingEnd, event_of};
+use crate::recording::{Reading, ReadingEnd, Stage, event_of};
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output;
@@ -18,6 +18,10 @@ pub(crate) struct Arguments {
     /// Take the time between two events that it took then, divided by this number; all at once if absent.
     #[arg(long, value_name = "NUMBER", value_parser = speed)]
     speed: Option<f64>,
+    /// Make a control socket for `cara top --socket PATH` and `cara web --socket PATH`, which show what was recorded at the moment
+    /// that is replayed; as fast as it was unless --speed says otherwise. Its end stays until Ctrl-C.
+    #[arg(long, value_name = "PATH")]
+    serve: Option<PathBuf>,
 }
 
 fn speed(text: &str) -> Result<f64, String> {
@@ -25,22 +29,43 @@ fn speed(text: &str) -> Result<f64, String> {
     speed.ok_or_else(|| "a number above 0: 1 for as fast as it was".to_owned())
 }
 
-pub(crate) fn run(Arguments { file, speed }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let mut last = None;
+pub(crate) fn run(Arguments { file, speed, serve }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let stage = serve.as_ref().map(|_| Stage::default());
+    let speed = if stage.is_some() { speed.or(Some(1.0)) } else { speed };
+    let (mut last, mut is_open) = (None, false);
     for path in &file {
         let failed = |text: String| Ended::failed("Failed", format!("{}: {text}", path.display()));
         let mut reading = Reading::open(path).map_err(|error| failed(error.to_string()))?;
         for message in &mut reading {
-            let Some(event) = event_of(&message.topic, &message.body) else { continue };
+            let event = event_of(&message.topic, &message.body);
+            if event.is_none() && stage.is_none() {
+                continue;
+            }
             if let Some((speed, last)) = speed.zip(last.replace(message.came)) {
                 std::thread::sleep(pause(message.came.saturating_sub(last), speed));
             }
+            if let Some((stage, path)) = stage.as_ref().zip(serve.as_ref()) {
+                stage.show(&message);
+                if !is_open && stage.has_unit() {
+                    is_open = true;
+                    let failed = |error| Ended::failed("Failed", format!("{}: {error}", path.display()));
+                    stage.open(path).map_err(failed)?;
+                    output::warning(format_args!("a recording answers at {}", path.display()));
+                }
+            }
+            let Some(event) = event else { continue };
             super::watch::print(event, global)?;
         }
         match reading.end() {
             Some(ReadingEnd::Damaged(why)) => return Err(failed(why.clone())),
             Some(ReadingEnd::CutOff) => output::warning(format_args!("{} was cut off here", path.display())),
             Some(ReadingEnd::Whole) | None => {}
+        }
+    }
+    if is_open {
+        // A signal ends the process.
+        loop {
+            std::thread::park();
         }
     }
     Ok(Exit::Done.into())

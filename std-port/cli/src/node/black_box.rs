@@ -84,6 +84,9 @@ impl Cause {
     }
 }
 
+/// Reports what is so at a moment.
+pub(super) type Look = Box<dyn Fn(&mut dyn FnMut(Answer)) + Send>;
+
 /// Its clones fill the same box. Without a folder of state it takes nothing.
 #[derive(Clone)]
 pub(super) struct BlackBox(Option<Arc<Shared>>);
@@ -210,7 +213,7 @@ impl Shared {
         }
     }
 
-    fn write_all(&self, look: &dyn Fn(&mut dyn FnMut(Answer)), write: &dyn Fn(Cause, &[Line])) {
+    fn write_all(&self, look: &impl Fn(&mut dyn FnMut(Answer)), write: &impl Fn(Cause, &[Line])) {
         let mut last = None;
         while let Some(cause) = self.due(last) {
             last = Some(Instant::now());

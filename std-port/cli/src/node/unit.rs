@@ -15,7 +15,7 @@ use cara_std::{
     UnitEvent,
 };
 
-use super::black_box::{BlackBox, Cause};
+use super::black_box::{BlackBox, Cause, Look};
 use super::http::Metrics;
 use super::settings::Settings;
 
@@ -178,7 +178,7 @@ impl Node {
     }
 
     /// What is so at a moment, as the answers of a control socket; holds no unit alive but meanwhile.
-    pub(super) fn look(&self) -> Box<dyn Fn(&mut dyn FnMut(Answer)) + Send> {
+    pub(super) fn look(&self) -> Look {
         match self {
             Self::Manager(system) => {
                 let system = system.downgrade();

@@ -10,6 +10,7 @@ use serde_json::{Map, Value, json};
 use crate::commands::call::values as values_of;
 
 const EVENTS: &str = "/events";
+const COMMANDS: &str = "/commands";
 
 /// A message, and the channel that it belongs to.
 pub(super) struct Message {
@@ -26,7 +27,7 @@ pub(super) fn message(answer: &Answer, came: u64) -> Option<Message> {
     let from_ms = |unix_ms: u64| unix_ms.saturating_mul(1_000_000);
     let (topic, published) = match answer {
         Answer::Event { unix_ms, .. } => (EVENTS, from_ms(*unix_ms)),
-        Answer::Command { unix_ms, .. } => ("/commands", from_ms(*unix_ms)),
+        Answer::Command { unix_ms, .. } => (COMMANDS, from_ms(*unix_ms)),
         Answer::Node(_) => ("/nodes", came),
         Answer::Order(_) => ("/orders", came),
         Answer::Unit(unit) => return Some(of("/unit", came, json!(Answer::Unit(without_keys(unit))))),
@@ -54,12 +55,25 @@ pub(super) fn about_itself(body: Value, at: u64) -> Message {
     of("/recording", at, body)
 }
 
-/// The event that a message of a recording holds.
+/// The event that a message of a recording holds; of a command, one that tells it.
 pub(crate) fn event_of(topic: &str, body: &[u8]) -> Option<Answer> {
-    if topic != EVENTS {
+    if ![EVENTS, COMMANDS].contains(&topic) {
         return None;
     }
-    serde_json::from_slice(body).ok().filter(|answer| matches!(answer, Answer::Event { .. }))
+    match serde_json::from_slice(body).ok()? {
+        event @ Answer::Event { .. } => Some(event),
+        Answer::Command { unix_ms, by, question, outcome } => {
+            let who = by.name.or(by.program).unwrap_or(by.origin);
+            let outcome = match outcome.as_deref() {
+                None => "gone",
+                Some(Answer::Called { error: Some(error), .. } | Answer::Failed(error)) => &error.error,
+                Some(_) => "ok",
+            };
+            let text = format!("{who}: {}: {outcome}", without_nulls(json!(question)));
+            Some(Answer::Event { at_ms: 0, unix_ms, event: "command".to_owned(), node: None, text })
+        }
+        _ => None,
+    }
 }
 
 fn of(topic: &'static str, published: u64, body: Value) -> Message {
@@ -94,7 +108,7 @@ fn without_nulls(value: Value) -> Value {
 pub(super) fn schema(message: &Message) -> (String, Value) {
     let (name, members) = match &*message.topic {
         EVENTS => ("cara.Event", json!({ "at_ms": 0, "unix_ms": 0, "event": "", "node": "", "text": "" })),
-        "/commands" => ("cara.Command", command()),
+        COMMANDS => ("cara.Command", command()),
         "/nodes" => ("cara.Node", node()),
         "/orders" => ("cara.Order", order()),
         "/recording" => {

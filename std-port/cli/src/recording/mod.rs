@@ -6,6 +6,7 @@ mod layout;
 mod reading;
 mod recorder;
 mod ring;
+mod stage;
 
 #[cfg(test)]
 mod tests;
@@ -15,6 +16,7 @@ pub(crate) use layout::event_of;
 pub(crate) use reading::{End as ReadingEnd, Reading};
 pub(crate) use recorder::Recorder;
 pub(crate) use ring::{Line, Ring, write};
+pub(crate) use stage::Stage;
 
 /// What a program that reads a recording finds in its header.
 const LIBRARY: &str = concat!("cara ", env!("CARGO_PKG_VERSION"));

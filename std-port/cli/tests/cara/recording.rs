@@ -66,6 +66,12 @@ fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_fil
         .says("Z  joined            late-1/12")
         .says("was cut off here");
     stage.ends(2, &["record", killed.to_str().unwrap(), "--max-size", "1kB"]);
+    assert!(whole.out.contains("request_timeout") && whole.out.contains(": ok"), "{}", whole.out);
+    let socket = folder.path().join("replay.sock");
+    let (file, socket) = (file.to_str().unwrap(), socket.to_str().unwrap());
+    let _replaying = Running::start(stage.command(&["replay", file, "--serve", socket, "--speed", "1000"]));
+    until("the recording answers", || stage.cara(&["scan", "--socket", socket, "--json"]).out.contains("late-1"));
+    stage.ends(2, &["stop", "--all", "--socket", socket]).says("this is a recording");
     stage.ends(1, &["replay", folder.path().join("none").to_str().unwrap()]);
     agv.stop();
 }
