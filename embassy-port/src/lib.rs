@@ -98,6 +98,8 @@ mod limits;
 #[cfg(feature = "line")]
 pub mod line;
 mod link;
+#[cfg(feature = "logs")]
+mod log;
 mod machine;
 mod mail;
 #[cfg(feature = "net")]
@@ -141,6 +143,8 @@ pub use handler::{Free, Handler, Hook, Method, Safe, Served, ServiceOptions};
 pub use interfaces::Actuator;
 pub use lease::LeaseWatch;
 pub use limits::Limits;
+#[cfg(feature = "logs")]
+pub use log::{LOG_BYTES, Log, LogCell, LogStream};
 pub use mail::Transport;
 pub use peer::{Peer, TheirFunctionList};
 #[cfg(feature = "streams")]

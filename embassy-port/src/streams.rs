@@ -99,7 +99,7 @@ impl<T> MyFunctionList<T> {
         least_interval: Duration,
         cell: &'static StreamCell<BYTES>,
     ) -> Result<Stream<T>, Error> {
-        self.add_defined(&Definition::stream(stream).map_err(|_| Error::BadName)?, least_interval, cell)
+        self.add_defined(&Definition::stream(stream).map_err(|_| Error::BadName)?, least_interval, BYTES, cell)
     }
 
     /// The same for a stream of a struct that derives [`Variables`].
@@ -125,18 +125,19 @@ impl<T> MyFunctionList<T> {
         least_interval: Duration,
         cell: &'static StreamCell<BYTES>,
     ) -> Result<Publisher<V, T>, Error> {
-        let stream = self.add_defined(&typed::stream_of::<V>(name)?, least_interval, cell)?;
+        let stream = self.add_defined(&typed::stream_of::<V>(name)?, least_interval, BYTES, cell)?;
         Ok(Publisher { stream, values: PhantomData })
     }
 
-    fn add_defined<const BYTES: usize>(
+    pub(crate) fn add_defined(
         &self,
         definition: &Definition,
         least_interval: Duration,
-        cell: &'static StreamCell<BYTES>,
+        bytes: usize,
+        cell: &'static dyn Cell,
     ) -> Result<Stream<T>, Error> {
-        if block::longest(definition.signature().results()).is_none_or(|longest| longest > BYTES) {
-            return Err(Error::TooLarge { limit: u32::try_from(BYTES).unwrap_or(u32::MAX) });
+        if block::longest(definition.signature().results()).is_none_or(|longest| longest > bytes) {
+            return Err(Error::TooLarge { limit: u32::try_from(bytes).unwrap_or(u32::MAX) });
         }
         let least = u16::try_from(least_interval.as_millis()).unwrap_or(u16::MAX);
         let attributes = Attributes { priority: Priority::Low, stream: Some(least), ..Attributes::NORMAL };

@@ -5,15 +5,20 @@ use std::{env, fs};
 
 fn main() {
     let place = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
-    let large = env::var_os("CARGO_FEATURE_LARGE_STACK").is_some();
-    let map = if large { "memory-large-stack.x" } else { "memory.x" };
+    let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
+    let map = match () {
+        () if has("LARGE_STACK") => "memory-large-stack.x",
+        () if has("LOGS") => "memory-logs.x",
+        () => "memory-usual.x",
+    };
+    // The linker takes a memory.x of the folder of the package before this one.
     fs::copy(map, place.join("memory.x")).expect("the memory map is copied");
     // Also for images of other crates that stand on this one.
     println!("cargo::rustc-link-search={}", place.display());
     for argument in ["--nmagic", "-Tlink.x"] {
         println!("cargo::rustc-link-arg-bins={argument}");
     }
-    if env::var_os("CARGO_FEATURE_DEFMT").is_some() {
+    if has("DEFMT") {
         println!("cargo::rustc-link-arg-bins=-Tdefmt.x");
     }
     println!("cargo::rerun-if-changed={map}");

@@ -13,6 +13,7 @@ mod kept_away;
 mod keys;
 mod line;
 mod load;
+mod logs;
 mod machine;
 mod manager;
 mod places;
@@ -111,6 +112,8 @@ enum Part {
         #[arg(long, default_value_t = 300)]
         times: u32,
     },
+    /// Calls a board that logs a hundred lines a second over its link; for an image with the features `faults` and `logs`.
+    Logs,
     /// Calls a board that publishes values meanwhile; for an image with streams.
     Streams(streams::Streams),
     /// Runs a board on a serial line; for an image with SLIP, or with a line without IP.
@@ -167,6 +170,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
         Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
         Some(Part::KeptAway(options)) => kept_away::run(&bench(arguments)?, options),
+        Some(Part::Logs) => logs::run(&bench(arguments)?),
         Some(Part::Streams(options)) => streams::run(&bench(arguments)?, options),
         Some(Part::Serial(options)) => serial::run(&bench(arguments)?, options),
         Some(Part::HandOver) => {

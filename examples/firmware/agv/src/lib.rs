@@ -51,7 +51,8 @@ pub type Agv = cara_apps::agv::Agv<LeaseWatch>;
 /// An AGV.
 pub type Vehicle = Handle<Agv>;
 /// Its limits: one manager, messages of 1 KiB.
-pub const LIMITS: Limits = Limits::S_UNIT;
+pub const LIMITS: Limits =
+    Limits { functions: Limits::S_UNIT.functions + cfg!(feature = "logs") as usize, ..Limits::S_UNIT };
 /// Its memory.
 pub type VehicleResources = resources!(Agv, LIMITS);
 

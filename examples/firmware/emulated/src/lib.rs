@@ -14,6 +14,8 @@ pub mod executor;
 pub mod faults;
 #[cfg(feature = "lists")]
 pub mod lists;
+#[cfg(feature = "logs")]
+pub mod logs;
 pub mod register;
 pub mod stack;
 

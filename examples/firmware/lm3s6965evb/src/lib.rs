@@ -33,7 +33,7 @@ pub fn start() -> Option<cortex_m::Peripherals> {
     Some(peripherals)
 }
 
-#[cfg(feature = "defmt")]
+#[cfg(all(feature = "defmt", not(feature = "logs")))]
 use defmt_semihosting as _;
 #[cfg(feature = "defmt")]
 defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());

@@ -38,6 +38,10 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     cara_lm3s6965evb::faults::offer(vehicle).map_err(|_| "no room for the test's functions")?;
     #[cfg(feature = "lists")]
     cara_lm3s6965evb::lists::offer(vehicle).map_err(|_| "no room for the test's function with lists")?;
+    #[cfg(feature = "logs")]
+    spawner.spawn(cara_emulated::logs::send(vehicle).map_err(|_| NO_ROOM)?);
+    #[cfg(all(feature = "faults", feature = "logs"))]
+    spawner.spawn(cara_emulated::logs::chatter().map_err(|_| NO_ROOM)?);
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     #[cfg(feature = "faults")]
