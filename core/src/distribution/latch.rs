@@ -108,3 +108,109 @@ pub(crate) const fn odd_millis(time: Instant) -> u64 {
     let millis = time.as_micros() / 1_000;
     if millis & 1 == 0 { millis.saturating_sub(1) | 1 } else { millis }
 }
+
+#[cfg(test)]
+#[allow(clippy::arithmetic_side_effects)]
+mod tests {
+    use super::*;
+
+    const CAUSE: Latch = Latch { by: 7, reason: 3 };
+    /// After so many milliseconds the words wrap.
+    const WRAP: u64 = 1 << 32;
+
+    const fn at(micros: u64) -> Instant {
+        Instant::from_micros(micros)
+    }
+
+    fn stopped(now: u64) -> LatchWord {
+        let latch = LatchWord::new();
+        latch.inhibit(at(now), CAUSE);
+        latch
+    }
+
+    #[test]
+    fn only_a_reset_requested_after_the_last_stop_clears_it() {
+        // A time is an odd millisecond in the latch, and an age is whole milliseconds: each phase of both counts.
+        for start in [0, 5_000, 1_000_000, WRAP * 1_000 - 4_000] {
+            for phase in (0..4_000).step_by(90) {
+                let stop = start + phase;
+                for later in (0..3_000).step_by(110).map(|later| stop + 5_000 + later) {
+                    let latch = stopped(stop);
+                    latch.reset(at(later), at(stop));
+                    latch.reset(at(later), at(stop.saturating_sub(1_000)));
+                    assert!(latch.is_inhibited() && !latch.is_behind_stop(at(later), at(stop)), "{stop} {later}");
+                    assert_eq!(latch.latch(), Some(CAUSE));
+                    assert!(latch.is_behind_stop(at(later), at(stop + 4_000)), "{stop} {later}");
+                    latch.reset(at(later), at(stop + 4_000));
+                    assert!(!latch.is_inhibited() && latch.latch().is_none(), "{stop} {later}");
+                    assert!(!latch.is_behind_stop(at(later), at(stop)), "a stop counts when it was reset, too");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_reset_at_the_start_of_the_clock_is_not_later_than_a_stop_there() {
+        let latch = stopped(0);
+        latch.reset(at(0), at(0));
+        assert!(latch.is_inhibited());
+        let latch = LatchWord::new();
+        assert!(
+            latch.is_behind_stop(at(0), at(0)) && latch.is_behind_stop(at(9_000), at(9_000)),
+            "nothing was stopped"
+        );
+        latch.reset(at(9_000), at(9_000));
+        assert!(!latch.is_inhibited());
+    }
+
+    #[test]
+    fn a_latch_keeps_its_first_cause_and_the_time_of_its_last_stop() {
+        let latch = stopped(1_000_000);
+        latch.inhibit(at(2_000_000), Latch { by: 8, reason: 4 });
+        assert_eq!(latch.latch(), Some(CAUSE));
+        latch.reset(at(3_000_000), at(1_500_000));
+        assert!(latch.is_inhibited(), "the second stop was later");
+        latch.reset(at(3_000_000), at(2_500_000));
+        latch.inhibit(at(4_000_000), Latch { by: 8, reason: 4 });
+        assert_eq!(latch.latch(), Some(Latch { by: 8, reason: 4 }));
+    }
+
+    #[test]
+    fn a_stop_whose_time_reads_as_that_of_one_that_was_reset_stops() {
+        let latch = stopped(1_000_000);
+        latch.reset(at(2_000_000), at(1_500_000));
+        latch.inhibit(at(1_000_000 + WRAP * 1_000), CAUSE);
+        assert!(latch.is_inhibited());
+    }
+
+    #[test]
+    fn a_latch_is_inherited_unless_that_very_stop_was_reset() {
+        let (unit, service) = (stopped(1_000_000), LatchWord::new());
+        service.inherit(&LatchWord::new());
+        assert!(!service.is_inhibited());
+        service.inherit(&unit);
+        assert_eq!(service.latch(), Some(CAUSE));
+        service.reset(at(2_000_000), at(500_000));
+        assert!(service.is_inhibited(), "the stop is inherited with its time");
+        service.reset(at(2_000_000), at(1_500_000));
+        service.inherit(&unit);
+        assert!(!service.is_inhibited());
+        unit.inhibit(at(2_500_000), CAUSE);
+        service.inherit(&unit);
+        assert!(service.is_inhibited());
+        // What is set already keeps its cause.
+        let own = LatchWord::new();
+        own.inhibit(at(3_000_000), Latch { by: 0, reason: 1 });
+        own.inherit(&unit);
+        assert_eq!(own.latch(), Some(Latch { by: 0, reason: 1 }));
+    }
+
+    #[test]
+    fn times_are_odd_and_never_later() {
+        for millis in 1..40 {
+            let odd = odd_millis(at(millis * 1_000 + 999));
+            assert!(odd % 2 == 1 && odd <= millis && odd + 1 >= millis, "{millis}");
+        }
+        assert_eq!(odd_millis(at(999)), 1, "there is no earlier one");
+    }
+}

@@ -9,16 +9,17 @@ mod rewrite;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 
 use anyhow::{Context, Result, bail, ensure};
 
 use crate::build::Programs;
 use crate::mutant::{Mutant, State};
 
+/// In the state, before the name of a function that is needed in constants.
+const CONSTANT: &str = "constant";
 /// Kept in the core of the clone.
 const CHOOSES: &str = r#"
 /// Which mutant is active.
@@ -42,21 +43,31 @@ fn main() -> Result<ExitCode> {
     ensure!(index < shards, "shards are numbered from 0");
     let mut mutants = mutant::list(Path::new(list))?;
     let files: BTreeSet<String> = mutants.iter().map(|mutant| mutant.file.clone()).collect();
-    let sources = files.into_iter().map(|file| Ok((fs::read_to_string(tree.join(&file))?, file)));
+    let sources = files.into_iter().map(|file| Ok((committed(tree, &file)?, file)));
     let sources: BTreeMap<String, String> =
         sources.map(|pair| pair.map(|(text, file)| (file, text))).collect::<Result<_>>()?;
-    let known = known(state, &sources)?;
+    let blob = |file: &String| {
+        Ok((file.clone(), git(tree, &["rev-parse", "--short", &format!("HEAD:{file}")])?.trim().to_owned()))
+    };
+    let blobs = sources.keys().map(blob).collect::<Result<BTreeMap<_, _>>>()?;
+    let known = known(state, &blobs)?;
     for mutant in mutants.iter_mut().filter(|mutant| known.contains(&(State::Unviable.name(), mutant.name.clone()))) {
         mutant.state = State::Unviable;
     }
-    let programs = build_all(tree, &sources, &mut mutants)?;
+    // Written to the state as well, so that a run that goes on builds nothing anew.
+    let constants = known.iter().filter(|(state, _)| state == CONSTANT);
+    let mut keep_const = constants.filter_map(|(_, name)| Some(name.rsplit_once(": ")?.1.to_owned())).collect();
+    let mut programs = build_all(tree, &sources, &mut mutants, &mut keep_const)?;
     let equivalent = equivalents(Path::new(equivalent))?;
     let mut log = fs::OpenOptions::new().create(true).append(true).open(state)?;
-    let mut note = |mutant: &Mutant| {
-        writeln!(log, "{:016x} {} {}", hash(&sources[&mutant.file]), mutant.state.name(), mutant.name)
-    };
-    mutants.iter().filter(|mutant| mutant.state == State::Unviable).try_for_each(&mut note)?;
-    programs.check()?;
+    let mut note = |state: &str, file: &str, name: &str| writeln!(log, "{} {state} {name}", blobs[file]);
+    let is_new = |mutant: &&Mutant| !known.contains(&(mutant.state.name(), mutant.name.clone()));
+    for mutant in mutants.iter().filter(|mutant| mutant.state == State::Unviable).filter(is_new) {
+        note(&mutant.state.name(), &mutant.file, &mutant.name)?;
+    }
+    if let Some(file) = sources.keys().next().filter(|_| known.iter().all(|(state, _)| state != CONSTANT)) {
+        keep_const.iter().try_for_each(|name| note(CONSTANT, file, &format!("{file}: {name}")))?;
+    }
     for number in 0..mutants.len() {
         let mutant = &mut mutants[number];
         if mutant.state != State::Wanted || number % shards != index {
@@ -69,7 +80,7 @@ fn main() -> Result<ExitCode> {
         match programs.kills(number)? {
             Some(by) => {
                 println!("killed    {}: {by}", mutant.name);
-                note(mutant)?;
+                note(&mutant.state.name(), &mutant.file, &mutant.name)?;
             }
             None => {
                 mutant.state = if equivalent.contains(&mutant.name) { State::Equivalent } else { State::Survived };
@@ -94,22 +105,26 @@ fn main() -> Result<ExitCode> {
 }
 
 /// Builds all mutants that compile into the test programs.
-fn build_all(tree: &Path, sources: &BTreeMap<String, String>, mutants: &mut [Mutant]) -> Result<Programs> {
-    let library = tree.join("core/src/lib.rs");
-    let text = fs::read_to_string(&library)?;
+fn build_all(
+    tree: &Path,
+    sources: &BTreeMap<String, String>,
+    mutants: &mut [Mutant],
+    keep_const: &mut BTreeSet<String>,
+) -> Result<Programs> {
+    let library = "core/src/lib.rs";
+    let text = committed(tree, library)?;
     // The core knows `std` in its tests only.
     let std = if text.contains("\nextern crate std;") {
         text.replace("#[cfg(test)]\nextern crate std;", "extern crate std;")
     } else {
         format!("{text}\nextern crate std;")
     };
-    fs::write(&library, format!("{std}{CHOOSES}"))?;
-    let mut keep_const = BTreeSet::new();
+    write(&tree.join(library), &format!("{std}{CHOOSES}"))?;
     loop {
         let mut places = BTreeMap::new();
         for (file, source) in sources {
-            let rewritten = rewrite::rewrite(file, source, mutants, &keep_const)?;
-            fs::write(tree.join(file), &rewritten.text)?;
+            let rewritten = rewrite::rewrite(file, source, mutants, keep_const)?;
+            write(&tree.join(file), &rewritten.text)?;
             places.insert(file.clone(), rewritten.places);
         }
         let wrong = match build::build(tree)? {
@@ -141,20 +156,32 @@ fn build_all(tree: &Path, sources: &BTreeMap<String, String>, mutants: &mut [Mut
     }
 }
 
-fn hash(text: &str) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    text.hash(&mut hasher);
-    hasher.finish()
+/// A file of the clone as it is committed.
+fn committed(tree: &Path, file: &str) -> Result<String> {
+    git(tree, &["show", &format!("HEAD:{file}")])
 }
 
-/// What is known of mutants in files that have not changed since: a line `HASH STATE NAME` each.
-fn known(state: &Path, sources: &BTreeMap<String, String>) -> Result<BTreeSet<(String, String)>> {
+fn git(tree: &Path, arguments: &[&str]) -> Result<String> {
+    let output = Command::new("git").current_dir(tree).args(arguments).output()?;
+    ensure!(output.status.success(), "git {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8(output.stdout)?)
+}
+
+/// Writes a file unless it is so already: what has not changed is not built anew.
+fn write(file: &Path, text: &str) -> Result<()> {
+    if fs::read_to_string(file)? != text {
+        fs::write(file, text)?;
+    }
+    Ok(())
+}
+
+/// What is known of mutants in files that have not changed since: a line `BLOB STATE NAME` each.
+fn known(state: &Path, blobs: &BTreeMap<String, String>) -> Result<BTreeSet<(String, String)>> {
     let text = if state.exists() { fs::read_to_string(state)? } else { String::new() };
     let line = |line: &str| {
-        let (hash_of, rest) = line.split_once(' ')?;
+        let (blob, rest) = line.split_once(' ')?;
         let (state, name) = rest.split_once(' ')?;
-        let source = sources.get(name.split_once(": ")?.0)?;
-        (hash_of == format!("{:016x}", hash(source))).then(|| (state.to_owned(), name.to_owned()))
+        (blob == blobs.get(name.split_once(": ")?.0)?).then(|| (state.to_owned(), name.to_owned()))
     };
     Ok(text.lines().filter_map(line).collect())
 }
