@@ -64,6 +64,8 @@ struct Judge {
     /// When all that a vehicle moves was stopped last, by the number of the vehicle.
     stopped: BTreeMap<u32, bool>,
     reached: BTreeMap<&'static str, u64>,
+    /// Callers make no more calls.
+    is_over: bool,
 }
 
 struct Call {
@@ -221,6 +223,9 @@ impl Caller {
         loop {
             let pause = millis(1 + self.random.below(200));
             self.unit.sleep(pause).await;
+            if self.judge.borrow().is_over {
+                return;
+            }
             match self.random.below(12) {
                 0 => self.call("halt").await,
                 1 | 2 => self.call("go_on").await,
@@ -390,10 +395,16 @@ impl Run {
         assert!(ran <= received, "{ran} calls have run, and {received} were received");
         let repeated = sum(LinkCounter::RequestsRepeated);
         assert!(received <= sent + repeated, "{received} requests were received, {sent} sent, {repeated} repeated");
-        let bound = Duration::from_secs(20);
-        let idle = |unit: &UnitHandle| unit.calls_held() == 0 && unit.free_buffers() == self.buffers;
-        self.manager.stop();
-        assert!(self.world.run_until(|_| self.vehicles.iter().all(idle), bound), "what was taken is not given back");
+        // With all links live, whose end would give all back.
+        self.judge.borrow_mut().is_over = true;
+        let buffers = self.buffers;
+        let is_idle =
+            |unit: &UnitHandle| (unit.calls_held(), unit.calls_in_flight(), unit.free_buffers()) == (0, 0, buffers);
+        let (manager, vehicles) = (&self.manager, &self.vehicles);
+        let all_idle = |_: &World| std::iter::once(manager).chain(vehicles).all(is_idle);
+        let idle = self.world.run_until(all_idle, Duration::from_secs(10));
+        assert!(idle, "what was taken is not given back");
+        assert_eq!(self.manager.s_units().len(), self.vehicles.len(), "a link has ended without a fault");
     }
 }
 
