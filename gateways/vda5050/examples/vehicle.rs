@@ -2,6 +2,7 @@
 //!
 //! Its output is what really happens: `drive 4 b`, `passed b`, `arrived c`, `stood 1.25`, `act 5 pick-1`, `ended pick-1 FINISHED`.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -54,6 +55,10 @@ struct Body {
     loads: Vec<Load>,
     speed: f64,
     drive: Option<LeaseWatch>,
+    /// Whether anything may move it: an order that takes the place of another leaves no gap.
+    may_drive: Option<LeaseWatch>,
+    /// Its order has ended: it does not go on by what that one wanted.
+    is_stopped: Arc<AtomicBool>,
     /// Its id, its type, its parameters, and since when.
     action: Option<(String, String, Value, Instant)>,
     handling: Option<LeaseWatch>,
@@ -99,6 +104,7 @@ impl Guided for Vehicle {
                 body.next_leg();
             }
             body.drive = call.order();
+            body.is_stopped.store(false, Ordering::SeqCst);
         })?;
         Ok(())
     }
@@ -136,7 +142,7 @@ impl Guided for Vehicle {
 
     fn vda_condition(&mut self) -> Condition {
         let body = self.lock();
-        let is_ordered = body.drive.as_ref().is_some_and(LeaseWatch::is_live);
+        let is_ordered = body.may_drive();
         Condition { is_ordered, ..body.condition.clone() }
     }
 }
@@ -151,7 +157,7 @@ impl Body {
     /// One turn of the motors' loop; the orders that are done.
     fn turn(&mut self, seconds: f64) -> Vec<LeaseWatch> {
         let mut done = Vec::new();
-        let may_drive = self.drive.as_ref().is_some_and(LeaseWatch::is_live);
+        let may_drive = self.may_drive();
         let was_driving = self.condition.is_driving;
         self.condition.is_driving = may_drive && self.leg().is_some() && !self.condition.has_arrived;
         let mut speed = 0.0;
@@ -194,6 +200,10 @@ impl Body {
             }
         }
         done
+    }
+
+    fn may_drive(&self) -> bool {
+        self.may_drive.as_ref().is_some_and(LeaseWatch::is_live) && !self.is_stopped.load(Ordering::SeqCst)
     }
 
     fn leg(&self) -> Option<&Leg> {
@@ -262,6 +272,8 @@ fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Uni
         loads: Vec::new(),
         speed: *speed,
         drive: None,
+        may_drive: None,
+        is_stopped: Arc::default(),
         action: None,
         handling: None,
         takes: Duration::from_millis(*action),
@@ -269,8 +281,10 @@ fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Uni
     vehicle.lock().end_with(ActionStatus::Finished, "");
     let builder = Unit::builder(name, id, manager, *manager_id)?.fleet(*fleet).interfaces(Interfaces::Loopback);
     let unit = builder.state(vehicle.clone()).build()?;
-    // The motors' loop looks at the orders itself: nothing is left for the hooks.
-    let drive = unit.my_function_list().actuator(|| ())?;
+    let is_stopped = vehicle.lock().is_stopped.clone();
+    let drive = unit.my_function_list().actuator(move || is_stopped.store(true, Ordering::SeqCst))?;
+    vehicle.lock().may_drive = Some(drive.watch());
+    // What is handled looks at its order itself: nothing is left for the hook.
     let handling = unit.my_function_list().actuator(|| ())?;
     unit.my_function_list().serve(GuidedServer { drive, handling })?;
     unit.my_function_list().serve(EquippedServer)?;

@@ -12,7 +12,7 @@ use crate::errors::{Kind, Refusal};
 use crate::message::{Action, ActionStatus, BlockingType, EStop, Edge, Node, OperatingMode, Order, Report};
 use crate::order::{Held, Verdict, judge};
 use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status};
-use crate::stretch::LEGS;
+use crate::stretch::{LEGS, fits};
 
 /// Most errors that are reported at a time; the oldest go.
 pub const ERRORS: usize = 16;
@@ -579,7 +579,7 @@ impl Machine {
                 let blocks = at.actions.iter().any(|action| action.blocking_type != BlockingType::None);
                 blocks || !before.actions.is_empty() || !edge.actions.is_empty() || map(at) != map(node)
             };
-            if legs.last().is_some_and(stands) {
+            if legs.last().is_some_and(stands) || !fits(&legs, edge, node) {
                 break;
             }
             legs.push((edge.clone(), node.clone()));

@@ -9,8 +9,8 @@ use crate::message::{Action, ActionScope, Edge, Node, NodePosition, Order};
 
 /// The most bytes of a text that goes to the vehicle: identifiers, and the names of actions and maps.
 pub const ID_BYTES: usize = 64;
-/// The most bytes of an action's parameters as JSON.
-pub const PARAMETER_BYTES: usize = 1_024;
+/// The most bytes of an action's parameters as JSON: the call is shorter than the 1,024 bytes that a vehicle takes by default.
+pub const PARAMETER_BYTES: usize = 768;
 
 /// What a vehicle can do, from the gateway's configuration.
 #[derive(Clone, Debug, Deserialize, Serialize)]

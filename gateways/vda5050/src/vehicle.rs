@@ -19,7 +19,7 @@ pub const LEASE_MS: u64 = 600;
 /// How long the vehicle may take to say how it is; the loop's heart waits meanwhile.
 const PATIENCE: std::time::Duration = std::time::Duration::from_millis(250);
 /// What it carries is asked so often, if no action ends.
-const EQUIPMENT_ASKED: std::time::Duration = std::time::Duration::from_millis(500);
+const EQUIPMENT_ASKED: std::time::Duration = std::time::Duration::from_secs(2);
 /// How long it may take to begin something.
 const PATIENCE_TO_BEGIN: std::time::Duration = std::time::Duration::from_millis(500);
 
@@ -100,6 +100,8 @@ pub trait Guided {
     /// Drives over edges, past their end nodes, and stands at the last one, while its caller wants it. The first edge has this number,
     /// the next ones those that follow. What it is told replaces what it was told before: an edge that it drives over it goes on with,
     /// and those that it has driven over it skips. `Stretch` reads the variables.
+    /// Each call is an order: so that there is no gap between two, the motors' loop asks `Actuator::watch`, and the safe hook ends
+    /// what the order before wanted.
     #[actuator(drive)]
     #[lease(ms = 600)]
     #[allow(clippy::too_many_arguments, reason = "each is a variable of the service")]
@@ -108,8 +110,8 @@ pub trait Guided {
         call: &impl AnyCall<Order = Self::Order>,
         number: i64,
         count: i64,
-        #[size(519)] edges: &str,
-        #[size(519)] nodes: &str,
+        #[size(192)] edges: &str,
+        #[size(192)] nodes: &str,
         #[size(64)] map: &str,
         #[unit = "m, m, rad"] positions: [f64; 24],
         given: [bool; 16],
@@ -127,7 +129,7 @@ pub trait Guided {
         number: i64,
         #[size(64)] id: &str,
         #[size(64)] kind: &str,
-        #[size(1024)] details: &str,
+        #[size(768)] details: &str,
     ) -> Result<(), ServiceError>;
 
     /// Takes this for where it is.
@@ -326,6 +328,8 @@ fn released(answer: Result<(), Error>) -> Result<(), Failure> {
 fn failure(error: &CallError) -> Failure {
     match error.error {
         Error::Inhibited { .. } => Failure::Stopped(error.to_string()),
+        // Sent again it would be as long.
+        Error::TooLarge { .. } => Failure::Refused(error.to_string()),
         _ if error.code().is_some() => Failure::Refused(error.to_string()),
         _ => Failure::Lost(error.to_string()),
     }

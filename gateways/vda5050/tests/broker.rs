@@ -64,12 +64,20 @@ fn a_vehicle_drives_through_and_carries_something() {
     plant.wait_for("it carries nothing", |plant| plant.state()["loads"] == serde_json::json!([]));
     assert_eq!(plant.state()["batteryState"]["batteryVoltage"], 48.0);
     let mut way = order("o1", 0, 0, "a! b! c! d! e! f! g! h! i! j! k! l!:pick=HARD");
-    let parameter = ActionParameter { key: "loadId".into(), value: "pallet-7".into() };
-    way.nodes[11].actions[0].action_parameters = Some(vec![parameter]);
+    // The longest names and parameters that are taken get there.
+    let parameter = |key: &str, value: &str| ActionParameter { key: key.into(), value: value.into() };
+    let parameters = vec![parameter("loadId", "pallet-7"), parameter("note", &"n".repeat(735))];
+    way.nodes[11].actions[0].action_parameters = Some(parameters);
+    way.edges.iter_mut().for_each(|edge| edge.edge_id = "e".repeat(64));
+    for node in 1..11 {
+        way.nodes[node].node_id = format!("{}{}", way.nodes[node].node_id, "n".repeat(63));
+        way.edges[node - 1].end_node_id = way.nodes[node].node_id.clone();
+        way.edges[node].start_node_id = way.nodes[node].node_id.clone();
+    }
     plant.publish("order", false, &way);
     plant.vehicle.wait_for("passed b");
     plant.wait_for("b is reported while it drives", |plant| {
-        plant.state()["lastNodeId"] == "b" && plant.state()["driving"] == true
+        plant.state()["lastNodeSequenceId"] == 2 && plant.state()["driving"] == true
     });
     plant.instant("startPause", "p1");
     plant.vehicle.wait_for("stood");

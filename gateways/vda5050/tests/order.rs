@@ -734,8 +734,10 @@ fn a_vehicle_out_of_service_says_so_and_does_nothing() {
 fn the_vehicle_passes_nodes_at_which_nothing_is_to_be_done() {
     let roof = |order: &mut Order| order.nodes[2].node_position.as_mut().unwrap().map_id = "roof".into();
     let as_it_is: fn(&mut Order) = |_| {};
+    let long_names = |order: &mut Order| order.edges.iter_mut().for_each(|edge| edge.edge_id = "e".repeat(64));
     type Row = (&'static str, fn(&mut Order), &'static [&'static str]);
-    let rows: [Row; 9] = [
+    let rows: [Row; 10] = [
+        ("a! b! c! d! e!", long_names, &["bc", "cd", "de"]),
         ("a! b! c! d!", as_it_is, &["bcd"]),
         ("a! b! c d", as_it_is, &["b"]),
         ("a! b!:pick=HARD c!", as_it_is, &["b", "c"]),

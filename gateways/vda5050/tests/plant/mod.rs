@@ -176,7 +176,8 @@ impl Plant {
             others,
         };
         plant.start_gateway();
-        plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE");
+        let patience = PATIENCE + Duration::from_secs(vehicles.into());
+        plant.wait_within(patience, "ONLINE", |plant| plant.connection() == "ONLINE");
         plant.wait_for("a state", |plant| plant.state() != Value::Null);
         plant
     }
@@ -234,10 +235,14 @@ impl Plant {
     }
 
     pub fn wait_for(&self, what: &str, is_so: impl Fn(&Self) -> bool) {
-        let end = Instant::now() + PATIENCE;
+        self.wait_within(PATIENCE, what, is_so);
+    }
+
+    pub fn wait_within(&self, patience: Duration, what: &str, is_so: impl Fn(&Self) -> bool) {
+        let end = Instant::now() + patience;
         while !is_so(self) {
             let late = Instant::now() >= end;
-            assert!(!late, "not within {PATIENCE:?}: {what}\n{}\n{:?}", self.state(), self.vehicle.lines());
+            assert!(!late, "not within {patience:?}: {what}\n{}\n{:?}", self.state(), self.vehicle.lines());
             sleep(Duration::from_millis(10));
         }
     }
