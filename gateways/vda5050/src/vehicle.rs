@@ -12,7 +12,7 @@ use crate::driver::Vehicle;
 use crate::message::{Action, ActionStatus, AgvPosition, BatteryState, EStop, Load, OperatingMode, Velocity};
 use crate::order::{ID_BYTES, parameters};
 use crate::state::{Command, Failure, Status};
-use crate::stretch::{LEGS, Stretch, of_order};
+use crate::stretch::{LEGS, NAMES_BYTES, Stretch, of_order};
 
 /// How long the vehicle moves on after the gateway's last sign that it wants it, in milliseconds.
 pub const LEASE_MS: u64 = 600;
@@ -148,13 +148,13 @@ pub struct Equipment {
     /// How many loads it carries, 8 at most.
     pub loads: i64,
     /// Their identifiers, one a line; an empty line where it is not known.
-    #[size(519)]
+    #[size(192)]
     pub load_ids: String,
     /// Their types.
-    #[size(519)]
+    #[size(192)]
     pub load_types: String,
     /// Where on the vehicle each one is.
-    #[size(519)]
+    #[size(192)]
     pub load_positions: String,
     /// Their weights.
     #[unit = "kg"]
@@ -180,11 +180,20 @@ impl Default for Equipment {
 }
 
 impl Equipment {
-    /// With these loads.
+    /// With these loads. A name for which there is no space is left out.
     pub fn carrying(loads: &[Load]) -> Self {
         let loads = &loads[..loads.len().min(LEGS)];
         let lines = |of: fn(&Load) -> &Option<String>| {
-            loads.iter().map(|load| of(load).as_deref().unwrap_or_default()).collect::<Vec<_>>().join("\n")
+            let mut lines = String::new();
+            for (index, load) in loads.iter().enumerate() {
+                let name = of(load).as_deref().unwrap_or_default();
+                if lines.len() + name.len() + loads.len() - index <= NAMES_BYTES {
+                    lines.push_str(name);
+                }
+                lines.push('\n');
+            }
+            lines.pop();
+            lines
         };
         let mut load_weights = [f64::NAN; 8];
         load_weights.iter_mut().zip(loads).for_each(|(to, load)| *to = load.weight.unwrap_or(f64::NAN));
@@ -238,9 +247,9 @@ impl Linked {
     }
 
     /// Asks what it carries: now and then, and when an action has changed that, so that a state never shows the one without the other.
-    fn ask_equipment(&mut self, status: &mut Status) -> Result<(), Failure> {
+    fn ask_equipment(&mut self, status: &mut Status) {
         if self.peer.function("vda_equipment").is_none() {
-            return Ok(());
+            return;
         }
         let is_news = self.asked.is_none_or(|(at, action, how)| {
             at.elapsed() >= EQUIPMENT_ASKED || (action, how) != (status.action, status.action_status)
@@ -249,11 +258,11 @@ impl Linked {
             let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() };
             let answer = EquippedClient::at(&self.peer).with(options).vda_equipment().wait();
             self.beat();
-            self.equipment = answer.map_err(|error| failure(&error))?;
+            // Without an answer it is what it was: a vehicle is not lost for that.
+            self.equipment = answer.unwrap_or_else(|_| self.equipment.clone());
             self.asked = Some((Instant::now(), status.action, status.action_status));
         }
         self.equipment.report(status);
-        Ok(())
     }
 
     /// The gateway's loop has come round.
@@ -282,7 +291,7 @@ impl Vehicle for Linked {
         let boot = self.peer.epoch().map_or(0, |epoch| epoch.0);
         let stopped = latch.map(|latch| format!("stopped by {}, reason {}", latch.by, latch.reason));
         let mut status = Status { stopped, boot, ..status(condition) };
-        self.ask_equipment(&mut status)?;
+        self.ask_equipment(&mut status);
         Ok(Some(status))
     }
 
@@ -414,5 +423,9 @@ mod tests {
         assert_eq!(status.loads, Some(loads));
         Equipment::default().report(&mut status);
         assert_eq!(status.loads, None, "it does not know");
+        // Names that do not fit are left out, and no load is.
+        Equipment::carrying(&vec![load(&"x".repeat(64), None); 9]).report(&mut status);
+        let named = status.loads.unwrap().into_iter().map(|load| load.load_id.is_some()).collect::<Vec<_>>();
+        assert_eq!(named, [true, true, false, false, false, false, false, false]);
     }
 }
