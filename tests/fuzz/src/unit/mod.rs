@@ -190,8 +190,8 @@ pub(crate) struct Unit {
     pub(crate) dials: Vec<(SocketAddrV4, Option<Identity>)>,
     /// Whether claims can be stored.
     pub(crate) stores: bool,
-    /// The highest claim that it has made or obeyed.
-    highest: Claim,
+    /// The highest claim that it has made, and those that it has obeyed of `identity(1)` and `identity(3)`.
+    highest: [Claim; 3],
     /// Lent to each call.
     arguments: Option<Box<Arguments>>,
 }
@@ -261,7 +261,7 @@ impl Unit {
             motors,
             dials: Vec::new(),
             stores: true,
-            highest: Claim::NONE,
+            highest: [Claim::NONE; 3],
             arguments: None,
         };
         for slot in 0..FUNCTIONS {
@@ -339,11 +339,13 @@ impl Unit {
 
     /// What must hold whenever the unit is at rest.
     fn check(&mut self) {
-        if !self.hub.node.is_standby() {
-            let claim = self.hub.node.claim();
-            assert!(claim >= self.highest, "a claim becomes lower");
-            self.highest = claim;
-        }
+        let node = &self.hub.node;
+        let makes = node.identity().role() == Role::MUnit && !node.is_standby();
+        let made = if makes { node.claim() } else { self.highest[0] };
+        let claims = [made, node.obeyed(&identity(1)), node.obeyed(&identity(3))];
+        let become_lower = claims.iter().zip(&self.highest).any(|(claim, highest)| claim < highest);
+        assert!(!become_lower, "a claim becomes lower");
+        self.highest = claims;
         for link in self.links.iter().flatten() {
             assert!(link.session.deadline() > self.now, "a deadline passes and stays");
             assert!(!link.joined || !link.session.is_ended(), "a link has ended without an event");
@@ -413,7 +415,7 @@ impl Unit {
                 }
             }
             ClaimEvent::Lead(above) => {
-                let claim = self.highest.max(above).raised(6);
+                let claim = self.highest[0].max(above).raised(6);
                 let tagged = claim.tagged(&self.hub.node.identity().clone(), &self.keys.codes);
                 let now = self.now;
                 self.hub.node.lead(now, tagged.unwrap_or_default());
