@@ -192,6 +192,28 @@ fn what_is_left_of_a_lease_is_told_until_its_end() {
     assert_eq!(lease.left(at(0)), None);
 }
 
+#[test]
+fn a_live_order_gives_way_to_its_own_caller_or_to_a_take_over() {
+    let claim = |replaces, operator, takes_over| {
+        let (under, made) = (claim::Claim::NONE, at(1_000_000));
+        Claim { holder: 7, replaces, takes_over, operator, link: 1, call: 2, under, made }
+    };
+    for operator in [false, true] {
+        let lease = Lease::new();
+        let claims = |now: u64, made: &Claim| lease.claim(at(now), at(now + 500_000), made);
+        let first = claims(1_000_000, &claim(None, operator, false)).unwrap();
+        let held = Err(Error::Held { by: 7, operator });
+        assert_eq!(claims(1_100_000, &claim(None, operator, false)), held, "of another link");
+        assert_eq!(claims(1_100_000, &claim(Some(first), !operator, false)), held, "operator and program are two");
+        let second = claims(1_100_000, &claim(Some(first), operator, false)).unwrap();
+        assert_eq!(claims(1_200_000, &claim(Some(first), operator, false)), held, "the first was replaced");
+        let third = claims(1_200_000, &claim(None, !operator, true)).unwrap();
+        assert!(lease.is_live_for(third, at(1_300_000)) && !lease.is_live_for(second, at(1_300_000)));
+        assert_eq!(claims(1_800_000, &claim(Some(third), !operator, false)), Err(Error::Busy), "its hook comes first");
+        assert_eq!(claims(1_800_000, &claim(None, operator, true)), Err(Error::Busy), "its hook comes first");
+    }
+}
+
 /// Steps with a lease. The number is how far the reader's clock advances in between.
 #[derive(Clone, Copy, Debug)]
 enum Step {
