@@ -123,6 +123,39 @@ impl Rival {
     }
 }
 
+/// When the manager was last heard, by the answers to a standby's last questions. Who misses no keep-alive yet says that it hears the
+/// manager, and knows better a question later: so as many answers as before take the place of those. Where some were lost, both count.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Reports {
+    /// By the answers to the last question, and to those before.
+    heard: [Instant; 2],
+    answers: [u16; 2],
+}
+
+impl Reports {
+    pub(super) const NONE: Self = Self { heard: [Instant::START; 2], answers: [0; 2] };
+
+    pub(super) fn note(&mut self, heard: Instant) {
+        self.heard[0] = self.heard[0].max(heard);
+        self.answers[0] = self.answers[0].saturating_add(1);
+    }
+
+    /// What comes from here on answers another question.
+    pub(super) fn ask(&mut self) {
+        if self.answers[0] > 0 {
+            let before = self.heard().unwrap_or(Instant::START);
+            *self = Self { heard: [Instant::START, before], answers: [0, self.answers[0].max(self.answers[1])] };
+        }
+    }
+
+    /// `None` where nobody has answered.
+    pub(super) fn heard(&self) -> Option<Instant> {
+        let ([last, before], [answers, answers_before]) = (self.heard, self.answers);
+        let heard = if answers >= answers_before { last } else { last.max(before) };
+        (answers.max(answers_before) > 0).then_some(heard)
+    }
+}
+
 /// The questions for this unit's own identity.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Questions {
@@ -149,6 +182,7 @@ pub(super) struct Claims {
     takes_over: bool,
     fences: heapless::Vec<ClaimReport, FENCES>,
     pub(super) rival: Option<Rival>,
+    pub(super) reports: Reports,
     pub(super) questions: Questions,
     next_raise: Instant,
     pause: Duration,
@@ -170,6 +204,7 @@ impl Claims {
             takes_over: false,
             fences: heapless::Vec::new(),
             rival: None,
+            reports: Reports::NONE,
             questions: Questions {
                 nonce: 0,
                 asked: None,
@@ -196,6 +231,9 @@ impl Claims {
         let obeyed = core::mem::take(&mut self.obeyed);
         let Self { rival, by_key, stores, .. } = *self;
         *self = Self { stage: Stage::StandsBy, has_stood_by: true, rival, by_key, stores, obeyed, ..Self::new(now) };
+        if let Some(rival) = rival {
+            self.reports.note(rival.reported - rival.silent);
+        }
         self.questions.next = next;
     }
 

@@ -2,7 +2,7 @@
 //! Until then it answers nobody and neither accepts nor opens links. It starts because answers are missing: so only a proven
 //! answer keeps it waiting, and a question counts only if it was sent, the sockets were then read, and this unit did not pause.
 
-use super::claims::{ClaimEvent, LOOK, PERIOD, QUESTIONS, Questions, Stage};
+use super::claims::{ClaimEvent, LOOK, PERIOD, QUESTIONS, Questions, Reports, Stage};
 use super::search::{Search, fresh};
 use super::{Node, NodeCounter};
 use crate::config::MISSED_KEEP_ALIVES;
@@ -84,12 +84,14 @@ impl<P: Port> Node<P> {
         } else if announce.epoch != self.config.epoch {
             let claim = announce.claim.filter(genuine);
             self.claims.questions.unanswered = 0;
+            self.claims.reports = Reports::NONE;
             self.heard_of_manager(now, claim.map_or(Claim::NONE, |report| report.claim()), Duration::ZERO);
         }
     }
 
     /// Somebody last heard the manager with this claim this long ago.
     fn heard_of_manager(&mut self, now: Instant, claim: Claim, silent: Duration) {
+        self.claims.reports.note(now - silent);
         self.claims.meet_rival(now, claim, silent);
         if silent < self.silence() && self.claims.stage == Stage::Starts {
             self.claims.stage = Stage::StandsBy;
@@ -144,7 +146,7 @@ impl<P: Port> Node<P> {
 
     /// From when on nobody has heard the manager for long enough, as far as was reported.
     fn silent_from(&self) -> Instant {
-        self.claims.rival.map_or(Instant::START, |rival| rival.silent_from(self.silence()))
+        self.claims.reports.heard().map_or(Instant::START, |heard| heard + self.silence())
     }
 
     /// Asks for this unit's own identity; once that is unanswered, also all vehicles.
@@ -161,6 +163,7 @@ impl<P: Port> Node<P> {
         let sent =
             self.say_who_has(own.filter(|_| is_answered), 0, authenticator, |datagram| mailman.broadcast(datagram));
         self.counters.count(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed });
+        self.claims.reports.ask();
         let questions = &mut self.claims.questions;
         (questions.nonce, questions.asked) = (nonce, Some(now));
         questions.unanswered = if sent { questions.unanswered.saturating_add(1) } else { 0 };

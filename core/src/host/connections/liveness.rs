@@ -194,7 +194,9 @@ impl Liveness {
     }
 
     fn allowed(&self) -> u8 {
-        if self.hears {
+        // Where nothing has come in the stream either since datagrams ceased to pass, it is the peer that is silent.
+        let is_silent = self.is_deaf() && self.missed_at.is_some_and(|at| self.stream_heard < at);
+        if self.hears || is_silent {
             return MISSED_KEEP_ALIVES;
         }
         let periods = STREAM_ONLY_LOSS.as_micros().checked_div(self.period.as_micros()).unwrap_or(0);
@@ -271,6 +273,22 @@ mod tests {
         // A retransmission takes its time, however short the period.
         let mut fast = Liveness::new(at(0), Duration::from_millis(100));
         assert_eq!(until_lost(&mut fast), (30, 0, at(3_050)));
+    }
+
+    #[test]
+    fn a_peer_whose_last_sign_came_in_the_stream_is_lost_as_soon() {
+        let mut liveness = Liveness::new(at(0), Duration::from_millis(700));
+        liveness.heard_datagram(at(0));
+        liveness.heard(at(300));
+        assert_eq!(until_lost(&mut liveness).2, at(300 + 2_450));
+        // Only the stream passes.
+        let mut liveness = Liveness::new(at(0), Duration::from_millis(700));
+        liveness.heard_datagram(at(0));
+        for now in (0..10_000).step_by(100) {
+            liveness.heard(at(now));
+            assert!(!poll(&mut liveness, at(now)).lost);
+        }
+        assert_eq!(until_lost(&mut liveness).2, at(9_900 + 3_150));
     }
 
     #[test]

@@ -103,6 +103,37 @@ fn it_starts_when_three_questions_have_no_answer_and_nobody_has_heard_the_manage
     assert_eq!((last.wanted.clone(), last.standby), (None, true), "vehicles are asked too");
 }
 
+/// A vehicle says that it hears its manager until it misses a keep-alive, after 1.5 s.
+#[test]
+fn what_a_vehicle_knows_better_a_question_later_takes_the_place_of_what_it_has_said() {
+    for late in (0..1_000).step_by(90) {
+        let mut standby = Standby::new();
+        standby.run(10_000, manages(report(claim(5), 0)));
+        let lost = standby.now + late;
+        let took = standby.until_it_leads(5_000, |node, now, who_has| {
+            let heard = if now < lost + 1_500 { now } else { lost };
+            vehicle(heard, claim(5))(node, now, who_has);
+        });
+        assert!((3_300..=3_350).contains(&(took - late)), "{took} {late}");
+    }
+}
+
+/// One of two vehicles hears the manager, and every other answer of it is lost.
+#[test]
+fn a_lost_answer_of_a_vehicle_that_hears_its_manager_does_not_start_a_standby() {
+    let mut standby = Standby::new();
+    standby.run(10_000, manages(report(claim(5), 0)));
+    let asked = core::cell::Cell::new(0);
+    standby.run(60_000, |node, now, who_has| {
+        vehicle(0, claim(5))(node, now, who_has);
+        asked.set(asked.get() + 1);
+        if asked.get() % 2 == 0 {
+            vehicle(now, claim(5))(node, now, who_has);
+        }
+    });
+    assert_eq!(standby.leads, []);
+}
+
 #[test]
 fn a_vehicle_that_hears_its_manager_keeps_a_standby_waiting() {
     let mut standby = Standby::new();
