@@ -17,11 +17,11 @@ enum Fault {
     Frozen,
     /// Its host loses power.
     Off,
-    /// Its host hears nobody, and nobody hears it.
+    /// What its host sends is lost, and what it is sent.
     CutOff,
-    /// Nobody hears its host.
+    /// What its host sends is lost.
     Mute,
-    /// Its host hears nobody.
+    /// What its host is sent is lost.
     Deaf,
 }
 

@@ -111,7 +111,7 @@ impl Obeyed {
 pub(super) struct Rival {
     pub(super) claim: Claim,
     /// For how long its manager had not been heard, by whoever heard it last, when a vehicle said so last. That nobody says anything
-    /// any more is no sign that it is gone: this unit may be cut off from both. Who has an authority's key may command all the same.
+    /// any more is no sign that it is gone: this unit may be cut off from both. With an authority's key it may command all the same.
     silent: Duration,
     reported: Instant,
 }
@@ -123,8 +123,9 @@ impl Rival {
     }
 }
 
-/// When the manager was last heard, by the answers to a standby's last questions. Who misses no keep-alive yet says that it hears the
-/// manager, and knows better a question later: so as many answers as before take the place of those. Where some were lost, both count.
+/// When the manager was last heard, by the answers to a standby's last questions. A vehicle that misses no keep-alive yet says
+/// that it hears the manager, and knows better a question later: so as many answers as before take the place of those. Where
+/// some were lost, both count.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Reports {
     /// By the answers to the last question, and to those before.
@@ -148,7 +149,7 @@ impl Reports {
         }
     }
 
-    /// `None` where nobody has answered.
+    /// `None` without an answer.
     pub(super) fn heard(&self) -> Option<Instant> {
         let ([last, before], [answers, answers_before]) = (self.heard, self.answers);
         let heard = if answers >= answers_before { last } else { last.max(before) };
