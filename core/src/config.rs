@@ -281,7 +281,7 @@ impl Mode {
         }
     }
 
-    /// The cipher suites of a unit in this mode, a bit each: bit 0 is `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`.
+    /// The cipher suites that every unit in this mode has, a bit each: bit 0 is `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`.
     pub const fn suites(self) -> u16 {
         match self {
             Self::Plain => 0,

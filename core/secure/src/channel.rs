@@ -1,10 +1,8 @@
 //! The frames of one link, sealed in place, each with the next number of its direction: none can be lost, repeated or reordered.
 
+use crate::suite::{Key, Suite};
 use cara_core::error::CloseReason;
 use cara_core::host::secure::Seal;
-use noise_protocol::CipherState;
-
-use crate::suite::ChaCha20Poly1305;
 
 /// Bytes that sealing adds.
 pub const TAG_BYTES: usize = 16;
@@ -19,17 +17,23 @@ pub struct Channel {
     receiving: Direction,
 }
 
-#[derive(Clone)]
 struct Direction {
-    cipher: CipherState<ChaCha20Poly1305>,
+    suite: Suite,
+    key: Key,
+    /// Of the next frame.
+    number: u64,
     /// A frame could not be opened, which ends the channel: nothing after it can be trusted.
     broken: bool,
 }
 
 impl Channel {
-    pub(crate) fn new(sending: CipherState<ChaCha20Poly1305>, receiving: CipherState<ChaCha20Poly1305>) -> Self {
-        let direction = |cipher| Direction { cipher, broken: false };
-        Self { sending: direction(sending), receiving: direction(receiving) }
+    pub(crate) const fn new(suite: Suite, sending: Key, receiving: Key) -> Self {
+        Self { sending: Direction::new(suite, sending), receiving: Direction::new(suite, receiving) }
+    }
+
+    /// The suite of its frames.
+    pub const fn suite(&self) -> Suite {
+        self.sending.suite
     }
 
     /// Exchanges the sending keys with another channel.
@@ -42,32 +46,40 @@ impl Channel {
         core::mem::swap(&mut self.receiving, &mut other.receiving);
     }
 
-    pub(crate) fn is_worn(&self) -> bool {
-        let numbers = [&self.sending, &self.receiving].map(|direction| direction.cipher.get_next_n());
-        numbers.into_iter().any(|number| number >= FRAMES_PER_HANDSHAKE)
+    pub(crate) const fn is_worn(&self) -> bool {
+        self.sending.number >= FRAMES_PER_HANDSHAKE || self.receiving.number >= FRAMES_PER_HANDSHAKE
     }
 
     #[cfg(test)]
-    pub(crate) fn jump(&mut self, number: u64) {
-        self.receiving.cipher = CipherState::new(&[0; 32], number);
+    pub(crate) const fn jump(&mut self, number: u64) {
+        self.receiving.number = number;
     }
 
     /// The key and number of the next frame to be sealed.
     pub(crate) fn next_seal(&self) -> ([u8; 32], u64) {
-        let mut sending = self.sending.clone();
-        sending.turn();
-        let (key, number) = sending.cipher.extract();
-        (*key, number)
+        let Direction { suite, key, number, .. } = &self.sending;
+        (if self.sending.turns() { *suite.next(key) } else { **key }, *number)
     }
 }
 
 impl Direction {
-    /// Rekeys before every 2^20th frame (Noise, section 11.3).
-    fn turn(&mut self) {
-        let number = self.cipher.get_next_n();
-        if number != 0 && number.is_multiple_of(FRAMES_PER_KEY) {
-            self.cipher.rekey();
+    const fn new(suite: Suite, key: Key) -> Self {
+        Self { suite, key, number: 0, broken: false }
+    }
+
+    const fn turns(&self) -> bool {
+        self.number != 0 && self.number.is_multiple_of(FRAMES_PER_KEY)
+    }
+
+    /// The number of the next frame, under the key that seals it: rekeys before every 2^20th (Noise, section 11.3).
+    fn turn(&mut self) -> Result<u64, CloseReason> {
+        let number = self.number;
+        let next = number.checked_add(1).ok_or(CloseReason::Protocol)?;
+        if self.turns() {
+            self.key = self.suite.next(&self.key);
         }
+        self.number = next;
+        Ok(number)
     }
 }
 
@@ -78,19 +90,19 @@ impl Seal for Channel {
 
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason> {
         let length = frame.len().checked_sub(TAG_BYTES).ok_or(CloseReason::Protocol)?;
-        self.sending.turn();
-        self.sending.cipher.encrypt_in_place(frame, length);
+        let number = self.sending.turn()?;
+        self.sending.suite.seal(&self.sending.key, number, &[], frame, length);
         Ok(())
     }
 
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
-        let length = frame.len();
-        if self.receiving.broken || length < TAG_BYTES {
+        let receiving = &mut self.receiving;
+        if receiving.broken || frame.len() < TAG_BYTES {
             return Err(CloseReason::Protocol);
         }
-        self.receiving.turn();
-        let opened = self.receiving.cipher.decrypt_in_place(frame, length).map_err(|()| CloseReason::Protocol);
-        self.receiving.broken = opened.is_err();
+        let number = receiving.turn()?;
+        let opened = receiving.suite.open(&receiving.key, number, &[], frame).map_err(|()| CloseReason::Protocol);
+        receiving.broken = opened.is_err();
         frame.get_mut(..opened?).ok_or(CloseReason::Protocol)
     }
 }
@@ -99,12 +111,13 @@ impl Seal for Channel {
 mod tests {
     #![allow(clippy::indexing_slicing, clippy::unwrap_used)]
     use super::*;
-    use noise_protocol::Cipher as _;
+    use crate::suite::tests::suites;
+    use noise_protocol::U8Array as _;
 
     const KEY: [u8; 32] = [9; 32];
 
-    fn at(number: u64) -> CipherState<ChaCha20Poly1305> {
-        CipherState::new(&KEY, number)
+    fn at(suite: Suite, number: u64) -> Direction {
+        Direction { number, ..Direction::new(suite, Key::from_slice(&KEY)) }
     }
 
     fn frame() -> [u8; 4 + TAG_BYTES] {
@@ -116,23 +129,28 @@ mod tests {
     /// Before frame 2^20 and each multiple of it, as docs/wire.md says: both ends, or what comes next does not open.
     #[test]
     fn a_key_seals_no_more_frames_than_it_may() {
-        for times in [1, 2, 4095] {
+        for (suite, times) in suites().into_iter().flat_map(|suite| [1, 2, 4095].map(|times| (suite, times))) {
             let last = times * FRAMES_PER_KEY - 1;
-            let (mut one, mut other) = (Channel::new(at(last), at(0)), Channel::new(at(0), at(last)));
-            let rekeyed = {
-                let mut key = [0; 32];
-                key.copy_from_slice(ChaCha20Poly1305::rekey(&noise_protocol::U8Array::from_slice(&KEY)).as_slice());
-                key
-            };
+            let mut one = Channel { sending: at(suite, last), receiving: at(suite, 0) };
+            let mut other = Channel { sending: at(suite, 0), receiving: at(suite, last) };
+            let rekeyed = *suite.next(&Key::from_slice(&KEY));
             for expected in [(KEY, last), (rekeyed, last + 1), (rekeyed, last + 2)] {
                 assert_eq!(one.next_seal(), expected);
                 let mut sealed = frame();
                 one.seal(&mut sealed).unwrap();
-                let mut without = at(expected.1);
-                let opens = without.decrypt_in_place(&mut sealed.clone(), sealed.len()).is_ok();
+                let opens = suite.open(&Key::from_slice(&KEY), expected.1, &[], &mut sealed.clone()).is_ok();
                 assert_eq!(opens, expected.0 == KEY, "frame {}", expected.1);
                 assert_eq!(other.open(&mut sealed).unwrap(), b"stop");
             }
+        }
+    }
+
+    #[test]
+    fn the_last_number_is_not_used() {
+        for suite in suites() {
+            let mut channel = Channel { sending: at(suite, u64::MAX), receiving: at(suite, u64::MAX) };
+            assert_eq!(channel.seal(&mut frame()), Err(CloseReason::Protocol));
+            assert!(channel.open(&mut frame()).is_err());
         }
     }
 }

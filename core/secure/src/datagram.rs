@@ -3,14 +3,12 @@
 //! Their keys are not the stream's: each end draws its own and sends it in the first sealed frames of the link. When an end sends
 //! a new key, datagrams under the previous one are accepted until the owner ends that.
 
-use noise_protocol::Cipher;
 use noise_protocol::U8Array;
-use noise_rust_crypto::sensitive::Sensitive;
 use zeroize::{Zeroize, ZeroizeOnDrop};
 
 use crate::channel::TAG_BYTES;
 use crate::keys::KEY_BYTES;
-use crate::suite::ChaCha20Poly1305;
+use crate::suite::{Key, Suite};
 
 /// Bytes before a sealed body: the key's generation, and the datagram's number, little-endian.
 pub const HEADER_BYTES: usize = 1 + 8;
@@ -23,21 +21,25 @@ pub const WINDOW: u64 = 64;
 
 /// A key for datagrams of one direction.
 #[derive(Clone, Zeroize, ZeroizeOnDrop)]
-pub struct DatagramKey([u8; KEY_BYTES]);
+pub struct DatagramKey {
+    bytes: [u8; KEY_BYTES],
+    #[zeroize(skip)]
+    suite: Suite,
+}
 
 impl DatagramKey {
-    /// A key of 32 random bytes, drawn for it.
-    pub const fn new(bytes: [u8; KEY_BYTES]) -> Self {
-        Self(bytes)
+    /// A key of 32 random bytes, drawn for it and the link's suite.
+    pub const fn new(suite: Suite, bytes: [u8; KEY_BYTES]) -> Self {
+        Self { bytes, suite }
     }
 
     /// Its bytes, to be sent in a sealed frame.
     pub const fn expose(&self) -> &[u8; KEY_BYTES] {
-        &self.0
+        &self.bytes
     }
 
-    fn cipher_key(&self) -> Sensitive<[u8; 32]> {
-        Sensitive::from_slice(&self.0)
+    fn cipher_key(&self) -> Key {
+        Key::from_slice(&self.bytes)
     }
 }
 
@@ -88,7 +90,7 @@ impl Sealer {
 
     #[cfg(test)]
     pub(crate) const fn at(next: u64) -> Self {
-        Self { key: DatagramKey([0; KEY_BYTES]), generation: 0, next }
+        Self { key: DatagramKey::new(Suite::ChaChaPoly, [0; KEY_BYTES]), generation: 0, next }
     }
 
     /// The number of the next datagram.
@@ -104,7 +106,7 @@ impl Sealer {
         self.next = number.checked_add(1)?;
         let (header, body) = datagram.split_first_chunk_mut::<HEADER_BYTES>()?;
         *header = header_of(self.generation, number);
-        ChaCha20Poly1305::encrypt_in_place(&self.key.cipher_key(), number, &Bound::of(bound, header)?.0, body, length);
+        self.key.suite.seal(&self.key.cipher_key(), number, &Bound::of(bound, header)?.0, body, length);
         Some(())
     }
 }
@@ -178,8 +180,7 @@ impl Opener {
     /// Opens a datagram in place; returns its body. A forged datagram has no effect: it must not move the replay window.
     pub fn open<'d>(&mut self, bound: &[u8], datagram: &'d mut [u8]) -> Result<&'d mut [u8], DatagramError> {
         let (header, body) = datagram.split_first_chunk_mut::<HEADER_BYTES>().ok_or(DatagramError::Short)?;
-        let length = body.len();
-        if length < TAG_BYTES {
+        if body.len() < TAG_BYTES {
             return Err(DatagramError::Short);
         }
         let [generation, number @ ..] = *header;
@@ -193,7 +194,7 @@ impl Opener {
             return Err(DatagramError::Repeated);
         }
         let bound = Bound::of(bound, header).ok_or(DatagramError::Forged)?;
-        let opened = ChaCha20Poly1305::decrypt_in_place(&keyed.key.cipher_key(), number, &bound.0, body, length);
+        let opened = keyed.key.suite.open(&keyed.key.cipher_key(), number, &bound.0, body);
         let opened = opened.map_err(|()| DatagramError::Forged)?;
         keyed.window.take(number);
         body.get_mut(..opened).ok_or(DatagramError::Short)
@@ -242,6 +243,7 @@ fn bit(behind: u64) -> u64 {
 mod tests {
     #![allow(clippy::indexing_slicing, clippy::unwrap_used)]
     use super::*;
+    use crate::suite::tests::suites;
     use proptest::prelude::*;
     use std::collections::HashSet;
     use std::vec::Vec;
@@ -249,7 +251,7 @@ mod tests {
     const PLAIN: &[u8] = b"plain header";
 
     fn key(byte: u8) -> DatagramKey {
-        DatagramKey::new([byte; KEY_BYTES])
+        DatagramKey::new(Suite::ChaChaPoly, [byte; KEY_BYTES])
     }
 
     fn sealed(sealer: &mut Sealer, body: &[u8]) -> Vec<u8> {
@@ -270,7 +272,12 @@ mod tests {
 
     #[test]
     fn every_flipped_bit_is_noticed_and_shuts_nothing() {
-        let (mut sealer, mut opener) = (Sealer::new(key(1), 3), Opener::new(key(1), 3));
+        suites().into_iter().for_each(flip_every_bit);
+    }
+
+    fn flip_every_bit(suite: Suite) {
+        let key = DatagramKey::new(suite, [1; KEY_BYTES]);
+        let (mut sealer, mut opener) = (Sealer::new(key.clone(), 3), Opener::new(key, 3));
         let datagram = sealed(&mut sealer, b"stop");
         for bit in 0..datagram.len() * 8 {
             let mut changed = datagram.clone();
@@ -313,7 +320,7 @@ mod tests {
         let header = header_of(0, u64::MAX);
         beyond[..HEADER_BYTES].copy_from_slice(&header);
         let bound = Bound::of(PLAIN, &header).unwrap();
-        ChaCha20Poly1305::encrypt_in_place(&key(1).cipher_key(), u64::MAX, &bound.0, &mut beyond[HEADER_BYTES..], 0);
+        Suite::ChaChaPoly.seal(&key(1).cipher_key(), u64::MAX, &bound.0, &mut beyond[HEADER_BYTES..], 0);
         for _ in 0..3 {
             assert_eq!(opener.open(PLAIN, &mut beyond.clone()), Err(DatagramError::Repeated));
         }

@@ -8,12 +8,12 @@
 
 use blake2::{Blake2s256, Digest};
 use noise_protocol::patterns::noise_nn_psk0;
-use noise_protocol::{HandshakeState, U8Array};
+use noise_protocol::{Cipher, CipherState, HandshakeState, U8Array};
 use noise_rust_crypto::sensitive::Sensitive;
 
 use crate::channel::Channel;
 use crate::keys::PairKey;
-use crate::suite::{Blake2s, ChaCha20Poly1305, X25519};
+use crate::suite::{Blake2s, Key, Suite, X25519, with};
 
 /// Length of each of the two messages: a public key and a tag.
 pub const MESSAGE_BYTES: usize = 48;
@@ -27,12 +27,13 @@ pub struct HandshakeError;
 /// The initiator, until the responder has answered. It stores what its first message was made of and makes the message again
 /// then: the state of a handshake is three times as large.
 pub struct Initiator {
+    suite: Suite,
     key: PairKey,
     prologue: [u8; 32],
     ephemeral: Sensitive<[u8; 32]>,
 }
 
-type State = HandshakeState<X25519, ChaCha20Poly1305, Blake2s>;
+type State<C> = HandshakeState<X25519, C, Blake2s>;
 
 /// What both ends have agreed on.
 pub struct Agreed {
@@ -82,20 +83,20 @@ impl Default for Transcript {
     }
 }
 
-fn state(initiates: bool, key: &PairKey, prologue: &[u8; 32], ephemeral: &[u8; 32]) -> State {
+fn state<C: Cipher>(initiates: bool, key: &PairKey, prologue: &[u8; 32], ephemeral: &[u8; 32]) -> State<C> {
     let ephemeral = Sensitive::<[u8; 32]>::from_slice(ephemeral);
-    let mut state = State::new(noise_nn_psk0(), initiates, prologue, None, Some(ephemeral), None, None);
+    let mut state = HandshakeState::new(noise_nn_psk0(), initiates, prologue, None, Some(ephemeral), None, None);
     state.push_psk(key.expose());
     state
 }
 
-fn write(state: &mut State) -> Result<[u8; MESSAGE_BYTES], HandshakeError> {
+fn write<C: Cipher>(state: &mut State<C>) -> Result<[u8; MESSAGE_BYTES], HandshakeError> {
     let mut message = [0; MESSAGE_BYTES];
     state.write_message(&[], &mut message).map_err(|_| HandshakeError)?;
     Ok(message)
 }
 
-fn read(state: &mut State, message: &[u8]) -> Result<(), HandshakeError> {
+fn read<C: Cipher>(state: &mut State<C>, message: &[u8]) -> Result<(), HandshakeError> {
     if message.len() != MESSAGE_BYTES {
         return Err(HandshakeError);
     }
@@ -105,18 +106,19 @@ fn read(state: &mut State, message: &[u8]) -> Result<(), HandshakeError> {
 impl Initiator {
     /// Begins. `ephemeral` is 32 random bytes that are used for nothing else.
     pub fn begin(
+        suite: Suite,
         key: &PairKey,
         prologue: &[u8; 32],
         ephemeral: &[u8; 32],
     ) -> Result<(Self, [u8; MESSAGE_BYTES]), HandshakeError> {
-        let started =
-            Self { key: key.clone(), prologue: *prologue, ephemeral: Sensitive::<[u8; 32]>::from_slice(ephemeral) };
-        let (_, message) = started.state()?;
+        let ephemeral = Sensitive::<[u8; 32]>::from_slice(ephemeral);
+        let started = Self { suite, key: key.clone(), prologue: *prologue, ephemeral };
+        let message = with!(suite, C => started.state::<C>()?.1);
         Ok((started, message))
     }
 
     /// The state after the first message.
-    fn state(&self) -> Result<(State, [u8; MESSAGE_BYTES]), HandshakeError> {
+    fn state<C: Cipher>(&self) -> Result<(State<C>, [u8; MESSAGE_BYTES]), HandshakeError> {
         let mut state = state(true, &self.key, &self.prologue, &self.ephemeral);
         let message = write(&mut state)?;
         Ok((state, message))
@@ -124,29 +126,36 @@ impl Initiator {
 
     /// Processes the responder's answer, which proves its identity.
     pub fn finish(self, message: &[u8]) -> Result<Agreed, HandshakeError> {
-        let (mut state, _) = self.state()?;
-        read(&mut state, message)?;
-        let (to_responder, to_initiator) = state.get_ciphers();
-        Ok(Agreed { channel: Channel::new(to_responder, to_initiator), binding: binding(&state) })
+        let ([to_responder, to_initiator], binding) = with!(self.suite, C => {
+            let (mut state, _) = self.state::<C>()?;
+            read(&mut state, message)?;
+            agreed(&state)
+        });
+        Ok(Agreed { channel: Channel::new(self.suite, to_responder, to_initiator), binding })
     }
 }
 
 /// The responder answers the initiator's message. It must open a frame of the channel before it believes anything.
 pub fn answer(
+    suite: Suite,
     key: &PairKey,
     prologue: &[u8; 32],
     ephemeral: &[u8; 32],
     message: &[u8],
 ) -> Result<(Agreed, [u8; MESSAGE_BYTES]), HandshakeError> {
-    let mut state = state(false, key, prologue, ephemeral);
-    read(&mut state, message)?;
-    let answer = write(&mut state)?;
-    let (to_responder, to_initiator) = state.get_ciphers();
-    Ok((Agreed { channel: Channel::new(to_initiator, to_responder), binding: binding(&state) }, answer))
+    let (answer, ([to_responder, to_initiator], binding)) = with!(suite, C => {
+        let mut state = state::<C>(false, key, prologue, ephemeral);
+        read(&mut state, message)?;
+        (write(&mut state)?, agreed(&state))
+    });
+    Ok((Agreed { channel: Channel::new(suite, to_initiator, to_responder), binding }, answer))
 }
 
-fn binding(state: &State) -> [u8; 32] {
+/// The keys of the two directions, the initiator's first, and the handshake hash.
+fn agreed<C: Cipher>(state: &State<C>) -> ([Key; 2], [u8; 32]) {
+    let (to_responder, to_initiator) = state.get_ciphers();
+    let key = |cipher: CipherState<C>| Key::from_slice(cipher.extract().0.as_slice());
     let mut binding = [0; 32];
     binding.iter_mut().zip(state.get_hash()).for_each(|(to, from)| *to = *from);
-    binding
+    ([key(to_responder), key(to_initiator)], binding)
 }

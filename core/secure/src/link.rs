@@ -2,6 +2,7 @@
 
 use blake2::digest::Mac;
 use cara_core::config::Mode;
+use cara_core::distribution::hello;
 use cara_core::error::CloseReason;
 use cara_core::host::secure::{CONFIRMATION_BYTES, PROOF_BYTES, Plain, Seal, Secure, Unopened};
 use zeroize::{Zeroize, ZeroizeOnDrop};
@@ -10,6 +11,7 @@ use crate::channel::{Channel, TAG_BYTES};
 use crate::datagram::{self, DatagramError, DatagramKey, Opener, Sealer};
 use crate::handshake::{self, Agreed, Initiator, Transcript};
 use crate::keys::{KEY_BYTES, PairKey, keyed};
+use crate::suite::Suite;
 
 /// What a handshake needs: the pair's key, and 32 random bytes that are used for nothing else.
 #[derive(Zeroize, ZeroizeOnDrop)]
@@ -52,8 +54,8 @@ impl Fresh {
     }
 
     /// The key of this end's datagrams; differs from the other end's even if both draw the same bytes.
-    fn datagrams(&self, began: bool, binding: &[u8; 32]) -> DatagramKey {
-        DatagramKey::new(self.secret(if began { b"dgrI" } else { b"dgrR" }, binding))
+    fn datagrams(&self, suite: Suite, began: bool, binding: &[u8; 32]) -> DatagramKey {
+        DatagramKey::new(suite, self.secret(if began { b"dgrI" } else { b"dgrR" }, binding))
     }
 }
 
@@ -63,17 +65,30 @@ pub struct Noise(State);
 // Each link has one; boxing the large variants would need an allocator.
 #[allow(clippy::large_enum_variant)]
 enum State {
-    Introducing(Transcript),
+    Introducing(Transcript, Suites),
     Proving(Proving),
     Sealing(Sealing),
     Ended,
+}
+
+/// The suites of a link before its handshake, a bit each.
+struct Suites {
+    offered: u16,
+    /// Of those, what the hellos so far offer.
+    common: u16,
+}
+
+impl Suites {
+    const fn new(offered: u16) -> Self {
+        Self { offered, common: offered }
+    }
 }
 
 /// A handshake in progress.
 #[allow(clippy::large_enum_variant)]
 enum Proving {
     Initiating(Initiator, Fresh),
-    Responding([u8; 32], Credentials),
+    Responding(Suite, [u8; 32], Credentials),
 }
 
 /// A message to send, if there is one.
@@ -81,11 +96,16 @@ type Message = Option<[u8; PROOF_BYTES]>;
 
 impl Proving {
     /// Begins; the initiator has a message to send.
-    fn begin(begins: bool, prologue: [u8; 32], credentials: Credentials) -> Result<(Self, Message), CloseReason> {
+    fn begin(
+        suite: Suite,
+        begins: bool,
+        prologue: [u8; 32],
+        credentials: Credentials,
+    ) -> Result<(Self, Message), CloseReason> {
         if !begins {
-            return Ok((Self::Responding(prologue, credentials), None));
+            return Ok((Self::Responding(suite, prologue, credentials), None));
         }
-        let started = Initiator::begin(&credentials.key, &prologue, &credentials.fresh.ephemeral(&prologue));
+        let started = Initiator::begin(suite, &credentials.key, &prologue, &credentials.fresh.ephemeral(&prologue));
         let (initiator, message) = started.map_err(|_| CloseReason::BadProof)?;
         Ok((Self::Initiating(initiator, credentials.fresh.clone()), Some(message)))
     }
@@ -95,12 +115,12 @@ impl Proving {
         match self {
             Self::Initiating(initiator, fresh) => {
                 let agreed = initiator.finish(message).map_err(|_| CloseReason::BadProof)?;
-                let own = fresh.datagrams(true, &agreed.binding);
+                let own = fresh.datagrams(agreed.channel.suite(), true, &agreed.binding);
                 Ok((agreed, own, None))
             }
-            Self::Responding(prologue, credentials) => {
-                let (agreed, answer) = respond(&prologue, &credentials, message)?;
-                let own = credentials.fresh.datagrams(false, &agreed.binding);
+            Self::Responding(suite, prologue, credentials) => {
+                let (agreed, answer) = respond(suite, &prologue, &credentials, message)?;
+                let own = credentials.fresh.datagrams(suite, false, &agreed.binding);
                 Ok((agreed, own, Some(answer)))
             }
         }
@@ -154,7 +174,8 @@ impl Sealing {
         if !matches!(self.renewing, Renewing::No) {
             return Err(CloseReason::Protocol);
         }
-        let (proving, message) = Proving::begin(begins, handshake::renewal(&self.binding), credentials)?;
+        let suite = self.channel.suite();
+        let (proving, message) = Proving::begin(suite, begins, handshake::renewal(&self.binding), credentials)?;
         self.renewing = Renewing::Proving(proving);
         Ok(message)
     }
@@ -237,7 +258,22 @@ impl Sealing {
 impl Noise {
     /// The cipher of a new link.
     pub fn new() -> Self {
-        Self(State::Introducing(Transcript::new()))
+        Self(State::Introducing(Transcript::new(), Suites::new(Mode::Secured.suites())))
+    }
+
+    /// The same, which offers AES-256-GCM as well: for hosts with instructions for it. Changes nothing without the feature `ring`.
+    #[must_use]
+    pub fn offering_aes(mut self) -> Self {
+        #[cfg(feature = "ring")]
+        if let State::Introducing(_, suites) = &mut self.0 {
+            *suites = Suites::new(suites.offered | Suite::AesGcm.bit());
+        }
+        self
+    }
+
+    /// The suite that both ends have agreed on.
+    pub fn suite(&self) -> Option<Suite> {
+        self.sealed().map(|sealing| sealing.channel.suite())
     }
 
     const fn sealing(&mut self) -> Option<&mut Sealing> {
@@ -272,7 +308,7 @@ impl Seal for Noise {
         match &mut self.0 {
             State::Sealing(sealing) => sealing.channel.open(frame),
             State::Ended => Err(CloseReason::Protocol),
-            State::Introducing(_) | State::Proving(_) => Ok(frame),
+            State::Introducing(..) | State::Proving(_) => Ok(frame),
         }
     }
 }
@@ -288,9 +324,16 @@ impl Secure for Noise {
         self.sealed().is_some()
     }
 
+    fn offer(&self, hello: &mut [u8]) {
+        if let State::Introducing(_, suites) = &self.0 {
+            hello::offer(suites.offered, hello);
+        }
+    }
+
     fn introduce(&mut self, hello: &[u8]) {
-        if let State::Introducing(transcript) = &mut self.0 {
+        if let State::Introducing(transcript, suites) = &mut self.0 {
             transcript.add(hello);
+            suites.common &= hello::suites(hello);
         }
     }
 
@@ -298,10 +341,11 @@ impl Secure for Noise {
         if let Some(sealing) = self.sealing() {
             return sealing.prove(begins, credentials);
         }
-        let State::Introducing(transcript) = core::mem::replace(&mut self.0, State::Ended) else {
+        let State::Introducing(transcript, suites) = core::mem::replace(&mut self.0, State::Ended) else {
             return Err(CloseReason::Protocol);
         };
-        let (proving, message) = Proving::begin(begins, transcript.prologue(), credentials)?;
+        let suite = Suite::of(suites.common);
+        let (proving, message) = Proving::begin(suite, begins, transcript.prologue(), credentials)?;
         self.0 = State::Proving(proving);
         Ok(message)
     }
@@ -329,8 +373,9 @@ impl Secure for Noise {
 
     fn confirmed(&mut self, confirmation: &[u8]) -> Result<(), CloseReason> {
         let (&generation, key) = confirmation.split_first().ok_or(CloseReason::Protocol)?;
-        let key = DatagramKey::new(key.try_into().map_err(|_| CloseReason::Protocol)?);
-        self.sealing().ok_or(CloseReason::Protocol)?.confirmed(generation, key)
+        let key = key.try_into().map_err(|_| CloseReason::Protocol)?;
+        let sealing = self.sealing().ok_or(CloseReason::Protocol)?;
+        sealing.confirmed(generation, DatagramKey::new(sealing.channel.suite(), key))
     }
 
     fn turned(&mut self) -> Result<(), CloseReason> {
@@ -374,13 +419,14 @@ impl Secure for Noise {
 
 /// Answers with the key that the message was made with.
 fn respond(
+    suite: Suite,
     prologue: &[u8; 32],
     credentials: &Credentials,
     message: &[u8],
 ) -> Result<(Agreed, [u8; PROOF_BYTES]), CloseReason> {
     let ephemeral = credentials.fresh.ephemeral(prologue);
     let keys = core::iter::once(&credentials.key).chain(&credentials.other);
-    let mut answers = keys.filter_map(|key| handshake::answer(key, prologue, &ephemeral, message).ok());
+    let mut answers = keys.filter_map(|key| handshake::answer(suite, key, prologue, &ephemeral, message).ok());
     answers.next().ok_or(CloseReason::BadProof)
 }
 
@@ -399,6 +445,15 @@ impl Cipher {
         match mode {
             Mode::Plain => Self::Plain(Plain),
             Mode::Secured => Self::Noise(Noise::new()),
+        }
+    }
+
+    /// The cipher of a new link, which offers AES-256-GCM as well: [`Noise::offering_aes`].
+    #[must_use]
+    pub fn offering_aes(self) -> Self {
+        match self {
+            Self::Plain(plain) => Self::Plain(plain),
+            Self::Noise(noise) => Self::Noise(noise.offering_aes()),
         }
     }
 
@@ -450,6 +505,10 @@ impl Secure for Cipher {
 
     fn mode(&self) -> Mode {
         either!(self, cipher => cipher.mode())
+    }
+
+    fn offer(&self, hello: &mut [u8]) {
+        either!(self, cipher => cipher.offer(hello));
     }
 
     fn is_sealing(&self) -> bool {
@@ -534,15 +593,37 @@ mod tests {
 
     /// Two ends of a live link.
     fn live() -> (Noise, Noise) {
-        let (mut dialler, mut other) = (Noise::new(), Noise::new());
+        introduced(Noise::new().offering_aes(), Noise::new().offering_aes())
+    }
+
+    /// The same, of these two.
+    fn introduced(mut dialler: Noise, mut other: Noise) -> (Noise, Noise) {
+        let hellos = [hello(&dialler), hello(&other)];
         for end in [&mut dialler, &mut other] {
-            end.introduce(b"hello of one");
-            end.introduce(b"hello of the other");
+            hellos.iter().for_each(|hello| end.introduce(hello));
         }
         proven(&mut dialler, &mut other, 1);
         confirm(&mut dialler, &mut other).unwrap();
         confirm(&mut other, &mut dialler).unwrap();
         (dialler, other)
+    }
+
+    /// As much of a hello as a cipher reads.
+    fn hello(end: &Noise) -> [u8; 8] {
+        let mut hello = [0; 8];
+        end.offer(&mut hello);
+        hello
+    }
+
+    #[test]
+    fn the_suite_is_one_that_both_offer() {
+        for offers in [[false, false], [false, true], [true, false], [true, true]] {
+            let [one, other] = offers.map(|aes| if aes { Noise::new().offering_aes() } else { Noise::new() });
+            let (one, other) = introduced(one, other);
+            let aes = cfg!(feature = "ring") && offers == [true, true];
+            assert_eq!(one.suite().map(Suite::bit), Some(1 << u8::from(aes)));
+            assert_eq!(one.suite(), other.suite());
+        }
     }
 
     fn confirm(from: &mut Noise, to: &mut Noise) -> Result<(), CloseReason> {

@@ -110,6 +110,7 @@ mod tests {
     use crate::channel::TAG_BYTES;
     use crate::handshake::{Initiator, answer};
     use crate::keys::PairKey;
+    use crate::suite::Suite;
     use cara_core::host::secure::Seal;
     use std::collections::HashSet;
     use std::vec::Vec;
@@ -169,8 +170,8 @@ mod tests {
     /// The keys of a link are new if one end's draw is: whatever is sealed under the same number differs.
     fn first_frame(board: &mut Random, manager: [u8; 32]) -> Vec<u8> {
         let (pair, prologue) = (PairKey::new([3; KEY_BYTES]), [4; 32]);
-        let (initiator, message) = Initiator::begin(&pair, &prologue, &board.draw()).unwrap();
-        let (_, message) = answer(&pair, &prologue, &manager, &message).unwrap();
+        let (initiator, message) = Initiator::begin(Suite::ChaChaPoly, &pair, &prologue, &board.draw()).unwrap();
+        let (_, message) = answer(Suite::ChaChaPoly, &pair, &prologue, &manager, &message).unwrap();
         let mut channel = initiator.finish(&message).unwrap().channel;
         let mut frame = std::vec![0; 64 + TAG_BYTES];
         channel.seal(&mut frame).unwrap();

@@ -1,15 +1,83 @@
-//! The primitives behind `noise-protocol`'s traits. X25519 and BLAKE2s are implemented here, since the ready-made adapters draw
+//! The suites, and the primitives behind `noise-protocol`'s traits. X25519 and BLAKE2s are implemented here, since the ready-made adapters draw
 //! their own random numbers and do not build without an operating system.
 
 use blake2::{Blake2s256, Digest};
-use noise_protocol::{DH, Hash, U8Array};
+use noise_protocol::{Cipher, DH, Hash, U8Array};
 use noise_rust_crypto::sensitive::Sensitive;
 use x25519_dalek::{PublicKey, StaticSecret};
 
 #[cfg(feature = "ring")]
-pub(crate) use crate::fast::ChaCha20Poly1305;
+pub(crate) use crate::fast::{Aes256Gcm, ChaCha20Poly1305};
 #[cfg(not(feature = "ring"))]
 pub(crate) use noise_rust_crypto::ChaCha20Poly1305;
+
+/// A key of either cipher.
+pub(crate) type Key = Sensitive<[u8; 32]>;
+
+/// What the ends of a link use, of what both have offered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Suite {
+    /// `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`, which every unit has.
+    ChaChaPoly,
+    /// `Noise_NNpsk0_25519_AESGCM_BLAKE2s`, with keys of 256 bits.
+    #[cfg(feature = "ring")]
+    AesGcm,
+}
+
+/// Does something with the suite's cipher.
+macro_rules! with {
+    ($suite:expr, $cipher:ident => $act:expr) => {
+        match $suite {
+            $crate::suite::Suite::ChaChaPoly => {
+                type $cipher = $crate::suite::ChaCha20Poly1305;
+                $act
+            }
+            #[cfg(feature = "ring")]
+            $crate::suite::Suite::AesGcm => {
+                type $cipher = $crate::suite::Aes256Gcm;
+                $act
+            }
+        }
+    };
+}
+pub(crate) use with;
+
+impl Suite {
+    /// Its bit in a hello.
+    pub const fn bit(self) -> u16 {
+        match self {
+            Self::ChaChaPoly => 1,
+            #[cfg(feature = "ring")]
+            Self::AesGcm => 1 << 1,
+        }
+    }
+
+    /// The one to use where both ends offer `common`.
+    pub(crate) const fn of(common: u16) -> Self {
+        #[cfg(feature = "ring")]
+        if common & Self::AesGcm.bit() != 0 {
+            return Self::AesGcm;
+        }
+        let _ = common;
+        Self::ChaChaPoly
+    }
+
+    /// Encrypts the first `length` bytes of `buffer`, and writes the tag behind them.
+    pub(crate) fn seal(self, key: &Key, number: u64, bound: &[u8], buffer: &mut [u8], length: usize) {
+        with!(self, C => C::encrypt_in_place(key, number, bound, buffer, length));
+    }
+
+    /// Decrypts body and tag; returns the length of the body.
+    pub(crate) fn open(self, key: &Key, number: u64, bound: &[u8], sealed: &mut [u8]) -> Result<usize, ()> {
+        let length = sealed.len();
+        with!(self, C => C::decrypt_in_place(key, number, bound, sealed, length))
+    }
+
+    /// The key after this one (Noise, section 4.2).
+    pub(crate) fn next(self, key: &Key) -> Key {
+        with!(self, C => C::rekey(key))
+    }
+}
 
 /// The curve's base point.
 const BASE: [u8; 32] = {
@@ -71,5 +139,19 @@ impl Hash for Blake2s {
 
     fn result(&mut self) -> Self::Output {
         Self::Output::from_slice(&self.0.finalize_reset())
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::Suite;
+
+    /// All suites of this build.
+    pub(crate) fn suites() -> std::vec::Vec<Suite> {
+        std::vec![
+            Suite::ChaChaPoly,
+            #[cfg(feature = "ring")]
+            Suite::AesGcm,
+        ]
     }
 }

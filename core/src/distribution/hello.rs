@@ -20,6 +20,7 @@ use crate::distribution::claim::{Claim, TaggedClaim};
 
 /// Bytes before the items.
 const PREFIX_BYTES: usize = 20;
+const SUITES: core::ops::Range<usize> = 6..8;
 
 /// The manager that an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -87,6 +88,17 @@ pub struct Hello {
     pub keep_alive: u32,
     /// How many unknown items the reader has skipped. Not encoded.
     pub skipped: u16,
+}
+
+/// The cipher suites that an encoded hello offers, a bit each.
+pub fn suites(hello: &[u8]) -> u16 {
+    hello.get(SUITES).and_then(|bytes| bytes.first_chunk()).map_or(0, |bytes| u16::from_le_bytes(*bytes))
+}
+
+/// Adds cipher suites to an encoded hello.
+pub fn offer(suites: u16, hello: &mut [u8]) {
+    let bytes = hello.get_mut(SUITES).unwrap_or_default();
+    bytes.iter_mut().zip(suites.to_le_bytes()).for_each(|(to, more)| *to |= more);
 }
 
 /// Why a hello cannot be used.
@@ -371,9 +383,10 @@ mod tests {
         assert_eq!(Hello::decode(&out[..length], PLAIN), Err(HelloError::Malformed), "an emergency would not fit");
         let length = longest().encode(Mode::Secured, &mut out).unwrap();
         out[6] = 0b10;
-        assert_eq!(Hello::decode(&out[..length], Mode::Secured), Err(HelloError::Suite));
-        out[6] = 0b11;
+        assert_eq!(Hello::decode(&out[..length], Mode::Secured), Err(HelloError::Suite), "the first is everybody's");
+        offer(0x8001, &mut out[..length]);
         assert_eq!(Hello::decode(&out[..length], Mode::Secured), Ok(longest()));
+        assert_eq!((suites(&out[..length]), suites(&out[..7])), (0x8003, 0));
     }
 
     proptest! {

@@ -49,10 +49,13 @@ pub trait Secure: Seal {
     /// The mode of the link.
     fn mode(&self) -> Mode;
 
+    /// Adds to this end's hello the cipher suites that it has beside those of its mode.
+    fn offer(&self, _hello: &mut [u8]) {}
+
     /// Frames are sealed from here on. Always so in plain mode, where there is nothing to prove.
     fn is_sealing(&self) -> bool;
 
-    /// A hello as it travels: first the dialler's, then the other one's. The proof covers both.
+    /// A hello as it travels: first the dialler's, then the other one's. The proof covers both, and so the suites they offer.
     fn introduce(&mut self, hello: &[u8]);
 
     /// A proof, or, where frames are sealed, a rekey. The end that `begins` gets the message to send.

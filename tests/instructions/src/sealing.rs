@@ -7,6 +7,7 @@ use cara_core::host::secure::Seal;
 use cara_secure::channel::{Channel, TAG_BYTES};
 use cara_secure::handshake::{self, Initiator, MESSAGE_BYTES};
 use cara_secure::keys::{KEY_BYTES, PairKey, RootKey};
+use cara_secure::suite::Suite;
 
 use crate::{Meter, Of, Operation, Uncounted};
 
@@ -72,11 +73,15 @@ impl Sealing {
 
 fn agree(key: &PairKey, prologue: &[u8; 32], initiator: &mut dyn Meter, responder: &mut dyn Meter) -> [Channel; 2] {
     let mut started = None;
-    initiator.count(&mut || started = Some(Initiator::begin(key, prologue, black_box(&[1; 32])).expect("it begins")));
+    let suite = Suite::ChaChaPoly;
+    initiator.count(&mut || {
+        started = Some(Initiator::begin(suite, key, prologue, black_box(&[1; 32])).expect("it begins"));
+    });
     let (waiting, message) = started.take().expect("it has begun");
     let mut answered = None;
     responder.count(&mut || {
-        answered = Some(handshake::answer(key, prologue, black_box(&[2; 32]), &message).expect("it is answered"));
+        answered =
+            Some(handshake::answer(suite, key, prologue, black_box(&[2; 32]), &message).expect("it is answered"));
     });
     let (to_initiator, answer) = answered.take().expect("it was answered");
     let (mut waiting, mut finished) = (Some(waiting), None);

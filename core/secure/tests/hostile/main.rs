@@ -6,6 +6,7 @@ use cara_core::host::secure::Seal;
 use cara_secure::channel::{Channel, TAG_BYTES};
 use cara_secure::handshake::{HandshakeError, Initiator, MESSAGE_BYTES, answer, prologue};
 use cara_secure::keys::PairKey;
+use cara_secure::suite::Suite;
 use proptest::prelude::*;
 
 const ONE: [u8; 32] = [3; 32];
@@ -17,8 +18,8 @@ fn key() -> PairKey {
 
 fn channels() -> (Channel, Channel) {
     let prologue = prologue(b"a", b"b");
-    let (initiator, message) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
-    let (responder, reply) = answer(&key(), &prologue, &OTHER, &message).unwrap();
+    let (initiator, message) = Initiator::begin(Suite::ChaChaPoly, &key(), &prologue, &ONE).unwrap();
+    let (responder, reply) = answer(Suite::ChaChaPoly, &key(), &prologue, &OTHER, &message).unwrap();
     (initiator.finish(&reply).unwrap().channel, responder.channel)
 }
 
@@ -31,15 +32,18 @@ fn seal(channel: &mut Channel, text: &[u8]) -> Vec<u8> {
 #[test]
 fn every_flipped_bit_of_a_handshake_fails_it() {
     let prologue = prologue(b"a", b"b");
-    let (_, message) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
-    let (_, reply) = answer(&key(), &prologue, &OTHER, &message).unwrap();
+    let (_, message) = Initiator::begin(Suite::ChaChaPoly, &key(), &prologue, &ONE).unwrap();
+    let (_, reply) = answer(Suite::ChaChaPoly, &key(), &prologue, &OTHER, &message).unwrap();
     for bit in 0..MESSAGE_BYTES * 8 {
         let flip = |mut bytes: [u8; MESSAGE_BYTES]| {
             bytes[bit / 8] ^= 1 << (bit % 8);
             bytes
         };
-        assert!(answer(&key(), &prologue, &OTHER, &flip(message)).is_err(), "bit {bit} of the first message");
-        let (initiator, _) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
+        assert!(
+            answer(Suite::ChaChaPoly, &key(), &prologue, &OTHER, &flip(message)).is_err(),
+            "bit {bit} of the first message"
+        );
+        let (initiator, _) = Initiator::begin(Suite::ChaChaPoly, &key(), &prologue, &ONE).unwrap();
         assert_eq!(initiator.finish(&flip(reply)).err(), Some(HandshakeError), "bit {bit} of the second message");
     }
 }
@@ -47,14 +51,14 @@ fn every_flipped_bit_of_a_handshake_fails_it() {
 #[test]
 fn another_key_or_prologue_fails_at_the_first_message() {
     let right = prologue(b"a", b"b");
-    let (_, message) = Initiator::begin(&key(), &right, &ONE).unwrap();
+    let (_, message) = Initiator::begin(Suite::ChaChaPoly, &key(), &right, &ONE).unwrap();
     let other_key = PairKey::new([8; 32]);
-    assert!(answer(&other_key, &right, &OTHER, &message).is_err());
+    assert!(answer(Suite::ChaChaPoly, &other_key, &right, &OTHER, &message).is_err());
     for wrong in [prologue(b"a", b"c"), prologue(b"ab", b""), prologue(b"b", b"a"), [0; 32]] {
-        assert!(answer(&key(), &wrong, &OTHER, &message).is_err());
+        assert!(answer(Suite::ChaChaPoly, &key(), &wrong, &OTHER, &message).is_err());
     }
     for length in (0..100).filter(|length| *length != MESSAGE_BYTES) {
-        assert!(answer(&key(), &right, &OTHER, &vec![0; length]).is_err());
+        assert!(answer(Suite::ChaChaPoly, &key(), &right, &OTHER, &vec![0; length]).is_err());
     }
 }
 
@@ -62,7 +66,7 @@ fn another_key_or_prologue_fails_at_the_first_message() {
 #[test]
 fn a_reflected_message_is_no_answer() {
     let prologue = prologue(b"a", b"b");
-    let (initiator, message) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
+    let (initiator, message) = Initiator::begin(Suite::ChaChaPoly, &key(), &prologue, &ONE).unwrap();
     assert!(initiator.finish(&message).is_err());
 }
 
@@ -70,10 +74,10 @@ fn a_reflected_message_is_no_answer() {
 #[test]
 fn a_recorded_handshake_leads_to_no_channel() {
     let prologue = prologue(b"a", b"b");
-    let (initiator, message) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
-    let (_, reply) = answer(&key(), &prologue, &OTHER, &message).unwrap();
+    let (initiator, message) = Initiator::begin(Suite::ChaChaPoly, &key(), &prologue, &ONE).unwrap();
+    let (_, reply) = answer(Suite::ChaChaPoly, &key(), &prologue, &OTHER, &message).unwrap();
     let recorded = seal(&mut initiator.finish(&reply).unwrap().channel, b"go_to");
-    let (mut later, _) = answer(&key(), &prologue, &[5; 32], &message).unwrap();
+    let (mut later, _) = answer(Suite::ChaChaPoly, &key(), &prologue, &[5; 32], &message).unwrap();
     assert_eq!(later.channel.open(&mut recorded.clone()), Err(CloseReason::Protocol));
 }
 
@@ -81,7 +85,7 @@ fn a_recorded_handshake_leads_to_no_channel() {
 #[test]
 fn points_of_small_order_are_refused() {
     let prologue = prologue(b"a", b"b");
-    let (initiator, _) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
+    let (initiator, _) = Initiator::begin(Suite::ChaChaPoly, &key(), &prologue, &ONE).unwrap();
     let mut reply = [0; MESSAGE_BYTES];
     reply[0] = 1;
     assert!(initiator.finish(&reply).is_err());

@@ -30,7 +30,8 @@ pub(super) fn send_hello<P: Port>(wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
         (*fleet, *reported) = (hello.fleet, hello.keep_alive);
         length = hello.encode(mode, &mut bytes).unwrap_or(0);
     });
-    let bytes = bytes.get(..length).unwrap_or(&[]);
+    let bytes = bytes.get_mut(..length).unwrap_or_default();
+    wire.link.cipher().offer(bytes);
     wire.link.cipher().introduce(bytes);
     wire.send_frame(&Frame::Hello(bytes));
     wire.flush(cx);

@@ -65,6 +65,10 @@ impl Secure for Audited {
         self.cipher.mode()
     }
 
+    fn offer(&self, hello: &mut [u8]) {
+        self.cipher.offer(hello);
+    }
+
     fn is_sealing(&self) -> bool {
         self.cipher.is_sealing()
     }

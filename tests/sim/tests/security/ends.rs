@@ -137,6 +137,10 @@ fn config_of(identity: Identity, target: Target<SocketAddr>) -> NodeConfig<Socke
 
 impl End {
     fn new(agv: bool, run: u8, key: PairKey, fresh: u8) -> Self {
+        Self::with_cipher(agv, run, key, fresh, Cipher::new(Mode::Secured))
+    }
+
+    fn with_cipher(agv: bool, run: u8, key: PairKey, fresh: u8, cipher: Cipher) -> Self {
         let constraints = Constraints { chunk_size: 1_024, ..Constraints::S_UNIT };
         let storage = SessionStorage {
             small: Boxed::slice(512),
@@ -171,7 +175,7 @@ impl End {
             hub
         };
         Self {
-            session: Session::new(now, config, Cipher::new(Mode::Secured), storage),
+            session: Session::new(now, config, cipher, storage),
             functions,
             pool: Pool::new((0..BUFFERS).map(|_| Some(Boxed::slice(size))).collect()),
             sent: Sent::default(),
@@ -327,6 +331,13 @@ impl Ends {
     /// Two ends of the right key whose connection is open. The random numbers of each run are its own.
     pub(crate) fn new(run: u8) -> Self {
         Self::with_keys(run, key(), key())
+    }
+
+    /// As [`Self::new`], of whom the manager, the vehicle, both or neither offer AES.
+    pub(crate) fn offering(run: u8, manager: bool, agv: bool) -> Self {
+        let cipher = |aes| if aes { Cipher::new(Mode::Secured).offering_aes() } else { Cipher::new(Mode::Secured) };
+        let manager = End::with_cipher(false, run, key(), run, cipher(manager));
+        Self::made(manager, End::with_cipher(true, run, key(), run | 0x80, cipher(agv)))
     }
 
     pub(crate) fn with_keys(run: u8, manager: PairKey, agv: PairKey) -> Self {

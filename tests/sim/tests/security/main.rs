@@ -6,6 +6,7 @@
 //! - [`kept_away`]: recorded and forged discovery while a vehicle starts, and how long it takes to join;
 //! - [`orders`]: orders, renewals, releases, stops and resets, forged, repeated and held back;
 //! - [`renewals`]: recordings from before a link was rekeyed, and revoked or wrong keys;
+//! - [`suites`]: offers of cipher suites that are changed, removed or answered with others;
 //! - [`terms`]: forged answers and hellos that claim a newer term;
 //! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
@@ -18,6 +19,7 @@ mod frames;
 mod kept_away;
 mod orders;
 mod renewals;
+mod suites;
 mod vectors;
 
 /// Attempts of one kind, and how many of them came to something.
