@@ -26,6 +26,18 @@ pub(crate) enum Keys {
     Ring(LiveRing),
 }
 
+/// Whether this host has instructions for AES-GCM. Without them it would be slow, and its time would depend on the key.
+fn has_aes() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    return is_x86_feature_detected!("aes")
+        && is_x86_feature_detected!("pclmulqdq")
+        && is_x86_feature_detected!("ssse3");
+    #[cfg(target_arch = "aarch64")]
+    return std::arch::is_aarch64_feature_detected!("aes") && std::arch::is_aarch64_feature_detected!("pmull");
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    false
+}
+
 /// A ring as it is now, for as long as the core needs it.
 #[derive(Clone, Debug)]
 pub(crate) struct View(Arc<KeyRing>);
@@ -57,7 +69,8 @@ impl Keys {
 
     /// The cipher of a link that begins.
     pub(crate) fn cipher(&self) -> Cipher {
-        Cipher::new(self.mode())
+        let cipher = Cipher::new(self.mode());
+        if has_aes() { cipher.offering_aes() } else { cipher }
     }
 
     /// The codes of discovery, with the keys as they are now.
