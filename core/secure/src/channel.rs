@@ -31,7 +31,7 @@ impl Channel {
     }
 
     /// The suite of its frames.
-    pub const fn suite(&self) -> Suite {
+    pub(crate) const fn suite(&self) -> Suite {
         self.sending.key.suite()
     }
 

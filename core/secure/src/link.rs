@@ -270,8 +270,8 @@ impl Noise {
         self
     }
 
-    /// The suite that both ends have agreed on.
-    pub fn suite(&self) -> Option<Suite> {
+    #[cfg(test)]
+    fn suite(&self) -> Option<Suite> {
         self.sealed().map(|sealing| sealing.channel.suite())
     }
 

@@ -47,7 +47,8 @@ pub(crate) use with;
 
 impl Suite {
     /// Its bit in a hello.
-    pub const fn bit(self) -> u16 {
+    #[cfg(test)]
+    pub(crate) const fn bit(self) -> u16 {
         match self {
             Self::ChaChaPoly => 1,
             #[cfg(feature = "ring")]
@@ -58,7 +59,7 @@ impl Suite {
     /// The one to use where both ends offer `common`.
     pub(crate) const fn of(common: u16) -> Self {
         #[cfg(feature = "ring")]
-        if common & Self::AesGcm.bit() != 0 {
+        if common & AES_GCM != 0 {
             return Self::AesGcm;
         }
         let _ = common;
