@@ -198,6 +198,8 @@ impl Decoding {
 
 #[cfg(feature = "defmt")]
 mod frames {
+    use std::panic::{AssertUnwindSafe, catch_unwind};
+
     use defmt_decoder::{DecodeError, StreamDecoder, Table};
 
     use super::{LONGEST, Line, Read};
@@ -224,15 +226,17 @@ mod frames {
             self.decoder.received(bytes);
             self.waiting += bytes.len();
             loop {
-                match self.decoder.decode() {
-                    Ok(frame) => {
+                // The decoder takes its input for sound; a board may say anything.
+                let decode = AssertUnwindSafe(|| self.decoder.decode().map(|frame| frame.display(false).to_string()));
+                match catch_unwind(decode) {
+                    Ok(Ok(text)) => {
                         self.waiting = 0;
-                        found.push(Line::Text(frame.display(false).to_string()));
+                        found.push(Line::Text(text));
                     }
-                    Err(DecodeError::UnexpectedEof) => return,
+                    Ok(Err(DecodeError::UnexpectedEof)) => return,
                     // The rest of a frame whose begin is lost, or another firmware's.
-                    Err(DecodeError::Malformed) if self.table.encoding().can_recover() => {}
-                    Err(DecodeError::Malformed) => return self.cut(),
+                    Ok(Err(DecodeError::Malformed)) if self.table.encoding().can_recover() => {}
+                    Ok(Err(DecodeError::Malformed)) | Err(_) => return self.cut(),
                 }
             }
         }
