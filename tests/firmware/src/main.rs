@@ -22,6 +22,7 @@ mod security;
 mod serial;
 mod session;
 mod signals;
+mod standby;
 mod streams;
 mod trace;
 
@@ -118,6 +119,8 @@ enum Part {
     Streams(streams::Streams),
     /// Runs a board on a serial line; for an image with SLIP, or with a line without IP.
     Serial(serial::Serial),
+    /// Kills and freezes a board's manager, which has a standby.
+    Standby(standby::Standby),
     /// Hands a board over between two managers; for an image that can be.
     HandOver,
     /// Runs an RP2040 with a W5500 in rp2040js; with `--board rp2040`, for its image.
@@ -173,6 +176,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Logs) => logs::run(&bench(arguments)?),
         Some(Part::Streams(options)) => streams::run(&bench(arguments)?, options),
         Some(Part::Serial(options)) => serial::run(&bench(arguments)?, options),
+        Some(Part::Standby(options)) => standby::run(&bench(arguments)?, options),
         Some(Part::HandOver) => {
             let keys = Keys::of_two_managers(arguments.cara.as_deref())?;
             hand_over::run(&Bench::new(arguments.board, &arguments.image, arguments.logs, keys)?)
