@@ -24,14 +24,12 @@
 //! With the feature `ring`, frames and datagrams are sealed by *ring*, several times as fast on a Linux host; without it, by
 //! portable code, as on boards. Both produce the same bytes. AES-256-GCM needs that feature.
 //!
-//! Each hello offers suites, a bit each, and the handshake authenticates both; nothing else is negotiated. This crate has no source
-//! of randomness, reads no file and, but for the round keys of AES, allocates nothing: the caller supplies 32 fresh bytes for each
-//! handshake. Which peer may do what is decided by access tables, not here.
+//! Each hello offers suites, a bit each, and the handshake authenticates both; nothing else is negotiated. This crate has no source of
+//! randomness, reads no file and allocates nothing: the caller supplies 32 fresh bytes for each handshake. Which peer may do what
+//! is decided by access tables, not here.
 
 #![no_std]
 
-#[cfg(feature = "ring")]
-extern crate alloc;
 #[cfg(test)]
 extern crate std;
 

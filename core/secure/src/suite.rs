@@ -24,9 +24,6 @@ pub enum Suite {
     AesGcm,
 }
 
-/// The bit of AES-256-GCM in a hello, in a build that has it.
-pub(crate) const AES_GCM: u16 = if cfg!(feature = "ring") { 1 << 1 } else { 0 };
-
 /// Does something with the suite's cipher.
 macro_rules! with {
     ($suite:expr, $cipher:ident => $act:expr) => {
@@ -52,7 +49,7 @@ impl Suite {
         match self {
             Self::ChaChaPoly => 1,
             #[cfg(feature = "ring")]
-            Self::AesGcm => AES_GCM,
+            Self::AesGcm => 1 << 1,
         }
     }
 
@@ -80,54 +77,6 @@ impl Suite {
     /// The key after this one (Noise, section 4.2).
     pub(crate) fn next(self, key: &Key) -> Key {
         with!(self, C => C::rekey(key))
-    }
-}
-
-/// The key of one direction of a link, ready to seal.
-pub(crate) struct FrameKey {
-    suite: Suite,
-    key: Key,
-    #[cfg(feature = "ring")]
-    schedule: Option<crate::fast::Schedule>,
-}
-
-impl FrameKey {
-    pub(crate) fn new(suite: Suite, key: Key) -> Self {
-        Self {
-            #[cfg(feature = "ring")]
-            schedule: (suite == Suite::AesGcm).then(|| crate::fast::Schedule::of(&key)).flatten(),
-            suite,
-            key,
-        }
-    }
-
-    pub(crate) const fn suite(&self) -> Suite {
-        self.suite
-    }
-
-    pub(crate) const fn key(&self) -> &Key {
-        &self.key
-    }
-
-    /// The key after this one.
-    pub(crate) fn next(&self) -> Self {
-        Self::new(self.suite, self.suite.next(&self.key))
-    }
-
-    pub(crate) fn seal(&self, number: u64, buffer: &mut [u8], length: usize) {
-        #[cfg(feature = "ring")]
-        if let Some(schedule) = &self.schedule {
-            return schedule.seal(number, buffer, length);
-        }
-        self.suite.seal(&self.key, number, &[], buffer, length);
-    }
-
-    pub(crate) fn open(&self, number: u64, sealed: &mut [u8]) -> Result<usize, ()> {
-        #[cfg(feature = "ring")]
-        if let Some(schedule) = &self.schedule {
-            return schedule.open(number, sealed);
-        }
-        self.suite.open(&self.key, number, &[], sealed)
     }
 }
 
