@@ -11,7 +11,7 @@ use crate::channel::{Channel, TAG_BYTES};
 use crate::datagram::{self, DatagramError, DatagramKey, Opener, Sealer};
 use crate::handshake::{self, Agreed, Initiator, Transcript};
 use crate::keys::{KEY_BYTES, PairKey, keyed};
-use crate::suite::Suite;
+use crate::suite::{AES_GCM, Suite};
 
 /// What a handshake needs: the pair's key, and 32 random bytes that are used for nothing else.
 #[derive(Zeroize, ZeroizeOnDrop)]
@@ -264,9 +264,8 @@ impl Noise {
     /// The same, which offers AES-256-GCM as well: for hosts with instructions for it. Changes nothing without the feature `ring`.
     #[must_use]
     pub fn offering_aes(mut self) -> Self {
-        #[cfg(feature = "ring")]
         if let State::Introducing(_, suites) = &mut self.0 {
-            *suites = Suites::new(suites.offered | Suite::AesGcm.bit());
+            *suites = Suites::new(suites.offered | AES_GCM);
         }
         self
     }

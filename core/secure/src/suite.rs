@@ -24,6 +24,9 @@ pub enum Suite {
     AesGcm,
 }
 
+/// The bit of AES-256-GCM in a hello, in a build that has it.
+pub(crate) const AES_GCM: u16 = if cfg!(feature = "ring") { 1 << 1 } else { 0 };
+
 /// Does something with the suite's cipher.
 macro_rules! with {
     ($suite:expr, $cipher:ident => $act:expr) => {
@@ -49,7 +52,7 @@ impl Suite {
         match self {
             Self::ChaChaPoly => 1,
             #[cfg(feature = "ring")]
-            Self::AesGcm => 1 << 1,
+            Self::AesGcm => AES_GCM,
         }
     }
 
