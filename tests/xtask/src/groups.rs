@@ -333,7 +333,7 @@ pub(crate) const GROUPS: [Group; 39] = [
     },
     Group {
         name: "hand-over",
-        what: "the emulated board handed over between two Linux managers, through losses of its power and of its manager",
+        what: "the emulated board handed over between two Linux managers, and beside a manager that is killed or frozen and its standby",
         budget: 120,
         quick: None,
         by_default: false,
