@@ -31,10 +31,8 @@ pub(crate) fn run(bench: &Bench, Standby { rounds }: &Standby) -> Result<()> {
         let took = (0..*rounds).map(|_| round(bench, fault)).collect::<Result<Vec<_>>>();
         let mut took = took.with_context(|| format!("manager {fault:?}"))?;
         took.sort_unstable();
-        let (median, worst) = (took.get(took.len() / 2), took.last());
-        println!(
-            "manager {fault:?}: the board obeys its standby after {median:?} ms, worst {worst:?}, {rounds} rounds"
-        );
+        let [median, worst] = [took.len() / 2, took.len() - 1].map(|at| took[at]);
+        println!("manager {fault:?}: the board obeys its standby after {median} ms, worst {worst}, {rounds} rounds");
     }
     Ok(())
 }
