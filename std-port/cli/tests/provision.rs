@@ -195,11 +195,11 @@ fn boards_are_listed() {
     for board in board::BOARDS {
         assert!(shown.contains(board.name) && shown.contains(&format!("{:#x}", board.pages[1])), "{shown}");
     }
-    for word in ["0x8100000, 0x8140000", "256 KiB", "lm3s6965evb"] {
+    for word in ["0x8100000, 0x8140000", "256 KiB", "lm3s6965evb", "mps2-an386"] {
         assert!(shown.contains(word), "{word}: {shown}");
     }
     let json = done(folder.path(), &["--list", "--json"]);
-    assert_eq!(json.lines().count(), board::BOARDS.len() + 1);
+    assert_eq!(json.lines().count(), board::BOARDS.len() + 2);
     assert!(json.contains(r#""starts":[270516224,270520320]"#) && json.contains(r#""pages":null"#), "{json}");
 }
 
