@@ -7,7 +7,7 @@ use cara_core::config::{Mode, VERSIONS};
 use cara_core::distribution::datagram;
 use cara_core::distribution::function::Signature;
 use cara_core::distribution::function_list::FunctionList;
-use cara_core::distribution::hello::Hello;
+use cara_core::distribution::hello::{self, Hello};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::items::Items;
 use cara_core::distribution::message::Control;
@@ -315,7 +315,8 @@ entry!(requests, {
 });
 
 entry!(hellos, {
-    keep(Hello::decode(unknown_slice(), *unknown()));
+    keep((Hello::decode(unknown_slice(), *unknown()), hello::suites(unknown_slice())));
+    hello::offer(*unknown(), unknown_slice());
     keep((VERSIONS.common(*unknown()), unknown::<Mode>().suites()));
     keep(unknown::<Refusal>().to_wire());
     let mut items = Items::new(unknown_slice());
