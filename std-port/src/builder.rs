@@ -19,7 +19,7 @@ use crate::access::AccessTable;
 #[cfg(feature = "access")]
 use crate::access::{AccessError, watch::FileWatch};
 use crate::authority::Authority;
-use crate::config::Capacities;
+use crate::config::{Capacities, check};
 use crate::engine::claims::TakeOver;
 use crate::engine::{Engine, EngineParts, HubCell, Keys, message_buffer_bytes, node_storage};
 use crate::error::system_refused;
@@ -509,12 +509,6 @@ fn listen_error(error: std::io::Error) -> Error {
     }
 }
 
-/// The longest message that a Linux unit's parameters can hold.
-pub(crate) const LONGEST_MESSAGE: u32 = 256 * 1024;
-
-/// Shortest `message_size`: with less nearly every request is refused.
-pub(crate) const SHORTEST_MESSAGE: u32 = 16;
-
 /// The constraints of a unit that says nothing about them.
 const fn defaults(role: Role, stands_by: bool) -> Constraints {
     let Constraints { message_size, chunk_size, .. } = Constraints::M_UNIT;
@@ -523,19 +517,6 @@ const fn defaults(role: Role, stands_by: bool) -> Constraints {
         Role::MUnit => Constraints::M_UNIT,
         Role::SUnit => Constraints { message_size, chunk_size, ..Constraints::S_UNIT },
     }
-}
-
-/// What this port can hold.
-pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {
-    let chunk = usize::from(constraints.chunk_size);
-    let sound = constraints.maximum_nodes > 0
-        && (SHORTEST_MESSAGE..=LONGEST_MESSAGE).contains(&constraints.message_size)
-        && constraints.request_timeout.as_millis() > 0
-        && (cara_core::config::MINIMUM_CHUNK_BYTES..=cara_core::config::CHUNK_BYTES).contains(&chunk)
-        && (cara_core::config::SHORTEST_KEEP_ALIVE..=cara_core::config::LONGEST_KEEP_ALIVE)
-            .contains(&constraints.keep_alive)
-        && constraints.calls_per_peer > 0;
-    if sound { Ok(()) } else { Err(Error::BadConstraint) }
 }
 
 pub(crate) fn manager(name: &str, id: u32) -> Result<Target<SocketAddr>, Error> {

@@ -1,5 +1,14 @@
-//! Capacities of a unit on Linux. A link uses little memory when it opens, and grows up to these capacities when its
+//! Capacities of a unit on Linux, and the constraints that fit it. A link uses little memory when it opens, and grows up to these capacities when its
 //! peer publishes more functions, or more calls are in flight.
+
+use cara_core::config::{CHUNK_BYTES, Constraints, LONGEST_KEEP_ALIVE, MINIMUM_CHUNK_BYTES, SHORTEST_KEEP_ALIVE};
+use cara_core::error::Error;
+
+/// The longest message that a Linux unit's parameters can hold.
+pub(crate) const LONGEST_MESSAGE: u32 = 256 * 1024;
+
+/// Shortest `message_size`: with less nearly every request is refused.
+pub(crate) const SHORTEST_MESSAGE: u32 = 16;
 
 /// Sizes of a unit's tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,4 +47,16 @@ impl Default for Capacities {
             message_buffers: 256,
         }
     }
+}
+
+/// What this port can hold.
+pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {
+    let chunk = usize::from(constraints.chunk_size);
+    let sound = constraints.maximum_nodes > 0
+        && (SHORTEST_MESSAGE..=LONGEST_MESSAGE).contains(&constraints.message_size)
+        && constraints.request_timeout.as_millis() > 0
+        && (MINIMUM_CHUNK_BYTES..=CHUNK_BYTES).contains(&chunk)
+        && (SHORTEST_KEEP_ALIVE..=LONGEST_KEEP_ALIVE).contains(&constraints.keep_alive)
+        && constraints.calls_per_peer > 0;
+    if sound { Ok(()) } else { Err(Error::BadConstraint) }
 }

@@ -18,7 +18,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::time::Duration;
 
 use crate::access::AccessTable;
-use crate::builder;
+use crate::config;
 #[cfg(feature = "control")]
 use crate::control::{self, Audit, Control, Server};
 use crate::engine::{Engine, pairs};
@@ -341,7 +341,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
-        builder::check(&constraints)?;
+        config::check(&constraints)?;
         self.engine().set_constraints(constraints)
     }
 

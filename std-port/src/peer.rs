@@ -18,7 +18,7 @@ use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use core::net::SocketAddr;
 
-use crate::builder;
+use crate::config;
 #[cfg(feature = "control")]
 use crate::control::protocol::{DatagramsInfo, LinkInfo};
 use crate::engine::link::LinkCell;
@@ -200,7 +200,7 @@ impl<T: Send + 'static> Peer<T> {
     /// it leaves and comes back, also when the unit's own are changed later. [`Error::BadConstraint`] where any other
     /// constraint differs from the unit's: nodes share the unit's tables and buffers.
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
-        builder::check(&constraints)?;
+        config::check(&constraints)?;
         self.engine.set_peer_constraints(&self.cell, constraints)
     }
 

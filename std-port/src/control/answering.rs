@@ -15,15 +15,10 @@ use cara_core::time::Duration;
 use super::commands::Followed;
 use super::failure::name_of;
 use super::protocol::{Answer, CallQuestion, Failure, Question, unix_ms};
+use super::sink::{End, LOOK, Lives, Sink, permit, send};
 use super::stop::{self, Which};
 use super::{call, constraint, describe, everybody, hold, select, stream};
 use crate::{CommunicationSystem, Finding, HandOverError, Identity, Manager, NameAndId, Peer};
-
-/// Where answers go; `Break` when the client is gone.
-pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
-
-/// When the client last sent something, its question or a [`BEAT`](super::protocol::BEAT); `None` once it has gone.
-pub(super) type Lives<'l> = &'l dyn Fn() -> Option<Instant>;
 
 /// Events that wait to be written before some are lost.
 const EVENTS: usize = 1024;
@@ -32,30 +27,6 @@ const REFUSED: Duration = Duration::from_secs(300);
 /// Bytes of metrics in one answer.
 #[cfg(feature = "metrics")]
 const PIECE_BYTES: usize = 256 * 1024;
-/// How often a call and a watch check that their client is still there, and a pause that the unit still runs. A call
-/// whose client has gone runs on for at most this long.
-pub(super) const LOOK: std::time::Duration = std::time::Duration::from_millis(20);
-
-/// Why an answer ends early.
-pub(super) enum End {
-    /// The client is gone.
-    Gone,
-    /// It could not be given.
-    Failed(Failure),
-}
-
-impl From<Failure> for End {
-    fn from(failure: Failure) -> Self {
-        Self::Failed(failure)
-    }
-}
-
-impl From<Error> for End {
-    fn from(error: Error) -> Self {
-        Self::Failed(error.into())
-    }
-}
-
 /// Answers one question: any number of answers, of which the last is [`Answer::Done`] or [`Answer::Failed`]. It returns
 /// when all are given, or when `answer` says `Break`. It takes as long as what was asked for: a call until its reply, a
 /// watch until the unit stops.
@@ -157,39 +128,6 @@ fn attempt<T: Send + 'static>(
             call::ping(system, node, times, sink)
         }
     }
-}
-
-pub(super) fn send(sink: Sink<'_>, answer: Answer) -> Result<(), End> {
-    match sink(answer) {
-        ControlFlow::Continue(()) => Ok(()),
-        ControlFlow::Break(()) => Err(End::Gone),
-    }
-}
-
-/// Waits; [`Error::NotRunning`] when the unit has been stopped.
-pub(super) fn pause<T: Send + 'static>(system: &CommunicationSystem<T>, span: Duration) -> Result<(), End> {
-    let mut left: std::time::Duration = span.into();
-    while !system.is_stopped() {
-        let step = left.min(LOOK);
-        if step.is_zero() {
-            return Ok(());
-        }
-        std::thread::sleep(step);
-        left -= step;
-    }
-    Err(Error::NotRunning.into())
-}
-
-/// Whether the operator may do something with a function.
-pub(super) fn permit<T: Send + 'static>(
-    system: &CommunicationSystem<T>,
-    function: &str,
-    verb: Verb,
-) -> Result<(), Failure> {
-    system.operator_may(function, verb).map_err(|error| match error {
-        Error::NotAllowed => Failure::not_allowed(function, verb),
-        error => error.into(),
-    })
 }
 
 fn permit_call<T: Send + 'static>(system: &CommunicationSystem<T>, question: &CallQuestion) -> Result<(), Failure> {

@@ -2,14 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::time::Duration;
 use serde::de::{DeserializeOwned, Error};
 use serde::ser::SerializeMap;
 use serde::{Deserialize, Deserializer, Serializer};
 use serde_json::Value;
-
-use super::describe::priority_of;
 
 pub(super) fn serialize<S: Serializer>(attributes: &Attributes, to: S) -> Result<S::Ok, S::Error> {
     let mut map = to.serialize_map(None)?;
@@ -45,4 +44,9 @@ pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Attribut
 
 fn take<T: DeserializeOwned + Default, E: Error>(said: &mut BTreeMap<String, Value>, key: &str) -> Result<T, E> {
     said.remove(key).map_or(Ok(T::default()), |value| serde_json::from_value(value).map_err(E::custom))
+}
+
+/// The class of a word.
+pub(super) fn priority_of(word: &str) -> Option<Priority> {
+    Priority::ALL.into_iter().find(|class| class.word() == word)
 }

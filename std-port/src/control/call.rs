@@ -10,9 +10,9 @@ use cara_core::services::call::{Caller, OnProgress, Outgoing};
 use cara_core::services::heart::Renew;
 use cara_core::time::Duration;
 
-use super::answering::{End, LOOK, Sink, pause, send};
 use super::protocol::{Answer, Argument, CallQuestion, Failure, Said};
-use super::{describe, select, values};
+use super::sink::{End, LOOK, Sink, pause, send};
+use super::{attributes, select, values};
 use crate::communication_system::thread_waker;
 use crate::engine::{Answered, Pending};
 use crate::error::CallError;
@@ -74,7 +74,7 @@ pub(super) struct Prepared {
 
 pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
     let priority = question.priority.as_deref().map(|word| {
-        describe::priority_of(word).ok_or_else(|| {
+        attributes::priority_of(word).ok_or_else(|| {
             let text = format!("'{word}' is no priority: it is emergency, high, normal or low");
             Failure::configuration("UnknownPriority", text)
         })

@@ -5,7 +5,7 @@ use cara_core::error::Error;
 use cara_core::time::Duration;
 
 use super::protocol::Failure;
-use crate::builder::{LONGEST_MESSAGE, SHORTEST_MESSAGE};
+use crate::config::{LONGEST_MESSAGE, SHORTEST_MESSAGE};
 
 const NAMES: &str = "request_timeout, minimum_interval, maximum_nodes, message_size, chunk_size, keep_alive, calls_per_peer, scheduling";
 /// What may differ from node to node.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::Finding;
-use cara_core::config::{Constraints, Priority, Scheduling, VERSIONS};
+use cara_core::config::{Constraints, Scheduling, VERSIONS};
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::services::lease::{ActuatorState, LastOrder, Latch, LeaseEnd};
 use cara_core::time::Duration;
@@ -218,11 +218,6 @@ pub fn event(event: &UnitEvent, at: Duration) -> Answer {
     };
     let (event, node) = (name.to_owned(), node.map(Identity::to_string));
     Answer::Event { at_ms: at.as_millis(), unix_ms: unix_ms(), event, node, text }
-}
-
-/// The class of a word.
-pub(super) fn priority_of(word: &str) -> Option<Priority> {
-    Priority::ALL.into_iter().find(|class| class.word() == word)
 }
 
 fn epoch(epoch: Epoch) -> String {

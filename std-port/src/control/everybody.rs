@@ -3,9 +3,9 @@
 use std::collections::HashSet;
 use std::ops::ControlFlow;
 
-use super::answering::{End, Sink, send};
 use super::describe;
 use super::protocol::{Answer, Failure};
+use super::sink::{End, Sink, send};
 use crate::{CommunicationSystem, Peer};
 
 /// Makes the call, and then reports each node that it has not reached.

@@ -11,10 +11,10 @@ use cara_core::services::access::Verb;
 use cara_core::services::call::Caller;
 use cara_core::services::lease::LeaseEnd;
 
-use super::answering::{End, LOOK, Lives, Sink, send};
 use super::call::{await_one, called, options};
 use super::protocol::{Answer, BEAT, CallQuestion, Failure};
 use super::select;
+use super::sink::{End, LOOK, Lives, Sink, send};
 use crate::heart::Hold;
 use crate::{CommunicationSystem, Peer, RequestOptions, UnitEvent};
 

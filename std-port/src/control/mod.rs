@@ -28,6 +28,7 @@ pub mod protocol;
 mod role;
 mod select;
 mod server;
+mod sink;
 mod stop;
 mod stream;
 mod values;

@@ -10,11 +10,11 @@ use cara_core::distribution::function::Attributes;
 use cara_core::services::access::Verb;
 use cara_core::services::call::Caller;
 
-use super::answering::{End, Sink, permit, send};
 use super::call::{News, block_all, called, prepare};
 use super::everybody::not_called;
 use super::protocol::{Answer, CallQuestion, Failure};
 use super::select;
+use super::sink::{End, Sink, permit, send};
 use crate::{CommunicationSystem, Delivery, Identity, Peer, RequestOptions};
 
 /// Which functions are called.

@@ -8,8 +8,8 @@ use cara_core::error::Error;
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
-use super::answering::{End, LOOK, Sink, permit, send};
 use super::protocol::{Answer, unix_ms};
+use super::sink::{End, LOOK, Sink, permit, send};
 use super::{select, values};
 use crate::{CommunicationSystem, Identity, Peer, Sample, Subscription};
 

@@ -5,8 +5,8 @@
 use super::Event;
 use super::due::Part;
 use super::obeying::Obedience;
+use super::peer_clock::sent_at_earliest;
 use super::permitting::may;
-use super::timing::sent_at_earliest;
 use super::wire::Wire;
 use crate::config::LEASES;
 use crate::distribution::function_list::{Generation, Slot};

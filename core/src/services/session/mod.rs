@@ -16,6 +16,7 @@
 //! - [`Event::Closed`] is the last event: the port forgets the link and tells the hub's node that it
 //!   [left](crate::distribution::connection_handler::Node::left).
 
+mod advertising;
 mod answering;
 mod details;
 mod due;
@@ -25,12 +26,14 @@ mod holding;
 mod inbound;
 mod obeying;
 mod outbound;
+mod peer_clock;
 mod permitting;
 mod pinging;
 mod proving;
 mod publishing;
 mod renewing;
 mod streaming;
+mod subscription;
 mod timing;
 mod wire;
 
@@ -65,9 +68,9 @@ use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
 use granting::Granting;
 use holding::Calling;
+use peer_clock::PeerClock;
 use permitting::decide;
 use proving::{reply_to_hello, send_hello};
-use timing::PeerClock;
 use wire::{Phase, Wire, close_code, close_reason};
 
 /// Longest frame body that an unauthenticated peer may send; with its header it needs no buffer of the pool.

@@ -5,6 +5,7 @@
 
 use super::permitting::decide;
 use super::publishing::Advertised;
+use super::subscription::{Pace, Subscription};
 use super::wire::Wire;
 use super::{Event, Phase, Results};
 use crate::ability::{Ability, Begins, STREAMS, State, Streams};
@@ -44,33 +45,6 @@ pub struct Granted {
     pub bytes: u32,
 }
 
-/// The peer's subscription to a stream of this unit.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Subscription {
-    /// Least interval between values in milliseconds, or [`NO_SUBSCRIPTION`].
-    interval: u32,
-    /// The version that was sent last; 0 before the first.
-    version: u32,
-    generation: Generation,
-    /// An answer that has yet to be sent to the peer.
-    answer: Option<SubscriptionRefusal>,
-    /// When the next value may follow.
-    due: Instant,
-}
-
-impl Subscription {
-    const NONE: Self =
-        Self { interval: NO_SUBSCRIPTION, version: 0, generation: Generation(0), answer: None, due: Instant::START };
-
-    pub(super) const fn is_active(&self) -> bool {
-        self.interval != NO_SUBSCRIPTION
-    }
-}
-
-impl Begins for Subscription {
-    const BEGIN: &'static Self = &Self::NONE;
-}
-
 /// The streams of one link.
 #[derive(Clone, Copy)]
 pub(super) struct Streaming {
@@ -87,27 +61,6 @@ pub(super) struct Streaming {
 impl Begins for Streaming {
     const BEGIN: &'static Self =
         &Self { active: 0, first: 0, paid: Instant::START, answers_due: false, wishes_due: false };
-}
-
-/// When samples are sent next.
-#[derive(Clone, Copy)]
-pub(super) struct Pace {
-    /// When the next sample is due.
-    due: Instant,
-    /// Since when samples wait for the send queue to drain; in the far future if they do not.
-    blocked: Instant,
-}
-
-impl Begins for Pace {
-    const BEGIN: &'static Self = &Self { due: Instant::FAR_FUTURE, blocked: Instant::FAR_FUTURE };
-}
-
-impl Pace {
-    /// When the next sample can be sent, if `queued` bytes wait on the link.
-    pub(super) fn deadline(&self, queued: usize) -> Instant {
-        // The queue may have drained with another write, without a writable notification: samples are due at once.
-        if queued == 0 && self.blocked != Instant::FAR_FUTURE { self.blocked } else { self.due }
-    }
 }
 
 impl Streaming {

@@ -1,9 +1,9 @@
 //! What a session lends its parts: the link and its encryption, the peer and its liveness, function lists and deadlines.
 
 use super::due::{Due, Part};
+use super::peer_clock::PeerClock;
 use super::publishing::Publishing;
-use super::streaming::Pace;
-use super::timing::PeerClock;
+use super::subscription::Pace;
 use super::{ReplyBlock, Results};
 use crate::ability::{STREAMS, State};
 use crate::bytes::copy;
