@@ -1,6 +1,6 @@
 //! The frames of one link, sealed in place, each with the next number of its direction: none can be lost, repeated or reordered.
 
-use crate::suite::{Key, Suite};
+use crate::suite::{FrameKey, Key, Suite};
 use cara_core::error::CloseReason;
 use cara_core::host::secure::Seal;
 
@@ -18,8 +18,7 @@ pub struct Channel {
 }
 
 struct Direction {
-    suite: Suite,
-    key: Key,
+    key: FrameKey,
     /// Of the next frame.
     number: u64,
     /// A frame could not be opened, which ends the channel: nothing after it can be trusted.
@@ -27,13 +26,13 @@ struct Direction {
 }
 
 impl Channel {
-    pub(crate) const fn new(suite: Suite, sending: Key, receiving: Key) -> Self {
+    pub(crate) fn new(suite: Suite, sending: Key, receiving: Key) -> Self {
         Self { sending: Direction::new(suite, sending), receiving: Direction::new(suite, receiving) }
     }
 
     /// The suite of its frames.
     pub(crate) const fn suite(&self) -> Suite {
-        self.sending.suite
+        self.sending.key.suite()
     }
 
     /// Exchanges the sending keys with another channel.
@@ -57,14 +56,14 @@ impl Channel {
 
     /// The key and number of the next frame to be sealed.
     pub(crate) fn next_seal(&self) -> ([u8; 32], u64) {
-        let Direction { suite, key, number, .. } = &self.sending;
-        (if self.sending.turns() { *suite.next(key) } else { **key }, *number)
+        let Direction { key, number, .. } = &self.sending;
+        (if self.sending.turns() { **key.next().key() } else { **key.key() }, *number)
     }
 }
 
 impl Direction {
-    const fn new(suite: Suite, key: Key) -> Self {
-        Self { suite, key, number: 0, broken: false }
+    fn new(suite: Suite, key: Key) -> Self {
+        Self { key: FrameKey::new(suite, key), number: 0, broken: false }
     }
 
     const fn turns(&self) -> bool {
@@ -76,7 +75,7 @@ impl Direction {
         let number = self.number;
         let next = number.checked_add(1).ok_or(CloseReason::Protocol)?;
         if self.turns() {
-            self.key = self.suite.next(&self.key);
+            self.key = self.key.next();
         }
         self.number = next;
         Ok(number)
@@ -91,7 +90,7 @@ impl Seal for Channel {
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason> {
         let length = frame.len().checked_sub(TAG_BYTES).ok_or(CloseReason::Protocol)?;
         let number = self.sending.turn()?;
-        self.sending.suite.seal(&self.sending.key, number, &[], frame, length);
+        self.sending.key.seal(number, frame, length);
         Ok(())
     }
 
@@ -101,7 +100,7 @@ impl Seal for Channel {
             return Err(CloseReason::Protocol);
         }
         let number = receiving.turn()?;
-        let opened = receiving.suite.open(&receiving.key, number, &[], frame).map_err(|()| CloseReason::Protocol);
+        let opened = receiving.key.open(number, frame).map_err(|()| CloseReason::Protocol);
         receiving.broken = opened.is_err();
         frame.get_mut(..opened?).ok_or(CloseReason::Protocol)
     }

@@ -2,6 +2,8 @@
 //! it for long ones; with instructions for it, AES-256-GCM takes a third of that for long frames, and no longer for short ones.
 
 use core::marker::PhantomData;
+use core::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 use noise_protocol::{Cipher, U8Array};
 use noise_rust_crypto::sensitive::Sensitive;
@@ -101,14 +103,18 @@ impl<C: Kind> Cipher for Ring<C> {
 }
 
 fn seal<C: Kind>(key: &Sensitive<[u8; 32]>, nonce: u64, bound: &[u8], buffer: &mut [u8], length: usize) -> Option<()> {
+    seal_with::<C>(&cipher::<C>(key)?, nonce, bound, buffer, length)
+}
+
+fn seal_with<C: Kind>(key: &LessSafeKey, nonce: u64, bound: &[u8], buffer: &mut [u8], length: usize) -> Option<()> {
     let (body, rest) = buffer.split_at_mut_checked(length)?;
     let to = rest.get_mut(..TAG_BYTES)?;
-    let tag = cipher::<C>(key)?.seal_in_place_separate_tag(nonce_of::<C>(nonce), Aad::from(bound), body).ok()?;
+    let tag = key.seal_in_place_separate_tag(nonce_of::<C>(nonce), Aad::from(bound), body).ok()?;
     to.copy_from_slice(tag.as_ref());
     Some(())
 }
 
-/// Made for each frame: for AES that takes 0.17 µs, and storing it would take 544 bytes for each direction of each link.
+/// Takes 0.17 µs for AES, which derives the round keys.
 fn cipher<C: Kind>(key: &Sensitive<[u8; 32]>) -> Option<LessSafeKey> {
     UnboundKey::new(C::algorithm(), key.as_slice()).ok().map(LessSafeKey::new)
 }
@@ -117,6 +123,77 @@ fn nonce_of<C: Kind>(nonce: u64) -> Nonce {
     let mut bytes = [0; NONCE_LEN];
     bytes.iter_mut().rev().zip(C::number(nonce).iter().rev()).for_each(|(to, from)| *to = *from);
     Nonce::assume_unique_for_key(bytes)
+}
+
+/// Round keys that a process keeps. A direction of a link takes 544 bytes of them, too much to keep for each node of a manager.
+const KEPT: usize = 32;
+
+/// The round keys of the directions that were used last. A direction shares its slot with those whose number differs by a multiple
+/// of [`KEPT`], and replaces what another one left there.
+static ROUNDS: [Mutex<Slot>; KEPT] = [const { Mutex::new(Slot { of: 0, keys: None }) }; KEPT];
+
+struct Slot {
+    /// The number of the direction; 0 for none.
+    of: u64,
+    keys: Option<LessSafeKey>,
+}
+
+impl Slot {
+    fn keys(&mut self, of: u64, key: &Sensitive<[u8; 32]>) -> Option<&LessSafeKey> {
+        if self.of != of {
+            *self = Self { of, keys: cipher::<Aes>(key) };
+        }
+        self.keys.as_ref()
+    }
+
+    fn erase(&mut self, of: u64) {
+        if self.of == of {
+            // `None` would leave the bytes where they are.
+            *self = Self { of: 0, keys: cipher::<Aes>(&Sensitive::new()) };
+        }
+    }
+}
+
+/// The round keys of AES of one direction of a link, made when it is first used and again after another direction has had their slot.
+/// They are overwritten when this is dropped, with its link or its key; *ring* does not erase them.
+pub(crate) struct Rounds(u64);
+
+impl Rounds {
+    pub(crate) fn new() -> Self {
+        static NEXT: AtomicU64 = AtomicU64::new(1);
+        Self(NEXT.fetch_add(1, Ordering::Relaxed))
+    }
+
+    pub(crate) fn seal(&self, key: &Sensitive<[u8; 32]>, nonce: u64, buffer: &mut [u8], length: usize) {
+        if self.with(key, |keys| seal_with::<Aes>(keys, nonce, &[], buffer, length)).is_none() {
+            // As above: never send plain text.
+            buffer.fill(0);
+        }
+    }
+
+    pub(crate) fn open(&self, key: &Sensitive<[u8; 32]>, nonce: u64, sealed: &mut [u8]) -> Result<usize, ()> {
+        let opened = self.with(key, |keys| keys.open_in_place(nonce_of::<Aes>(nonce), Aad::empty(), sealed).ok());
+        opened.map(|body| body.len()).ok_or(())
+    }
+
+    fn slot(&self) -> Option<&'static Mutex<Slot>> {
+        usize::try_from(self.0).ok().and_then(|number| ROUNDS.get(number % KEPT))
+    }
+
+    /// Another link may be at work with the slot: it is not waited for.
+    fn with<R>(&self, key: &Sensitive<[u8; 32]>, act: impl FnOnce(&LessSafeKey) -> Option<R>) -> Option<R> {
+        let Some(mut slot) = self.slot().and_then(|slot| slot.try_lock().ok()) else {
+            return act(&cipher::<Aes>(key)?);
+        };
+        act(slot.keys(self.0, key)?)
+    }
+}
+
+impl Drop for Rounds {
+    fn drop(&mut self) {
+        let Some(slot) = self.slot() else { return };
+        slot.lock().unwrap_or_else(PoisonError::into_inner).erase(self.0);
+    }
 }
 
 #[cfg(test)]
@@ -202,6 +279,46 @@ mod tests {
             let shown: Vec<_> = sealed.iter().map(|byte| std::format!("{byte:02x}")).collect();
             assert_eq!(shown.concat(), answer);
         }
+    }
+
+    fn block(seal: impl FnOnce(&mut [u8])) -> Vec<u8> {
+        let mut block = vec![0; 16 + TAG_BYTES];
+        seal(&mut block);
+        block
+    }
+
+    fn sealed(key: &Key) -> Vec<u8> {
+        block(|block| _ = Aes256Gcm::encrypt_in_place(key, 0, &[], block, 16))
+    }
+
+    fn sealed_by(keys: Option<&LessSafeKey>) -> Vec<u8> {
+        block(|block| seal_with::<Aes>(keys.unwrap(), 0, &[], block, 16).unwrap())
+    }
+
+    #[test]
+    fn a_slot_has_the_keys_of_the_last_direction_and_erases_them() {
+        let (key, other) = (Sensitive::from_slice(&[31; 32]), Sensitive::from_slice(&[32; 32]));
+        let mut slot = Slot { of: 0, keys: None };
+        for (of, key) in [(1, &key), (1, &key), (33, &other), (1, &key)] {
+            assert_eq!(sealed_by(slot.keys(of, key)), sealed(key));
+        }
+        slot.erase(33);
+        assert_eq!(sealed_by(slot.keys.as_ref()), sealed(&key));
+        slot.erase(1);
+        assert_eq!((slot.of, sealed_by(slot.keys.as_ref())), (0, sealed(&Sensitive::new())));
+    }
+
+    #[test]
+    fn round_keys_go_with_their_direction() {
+        let (rounds, key) = (Rounds::new(), Sensitive::from_slice(&[33; 32]));
+        let slot = rounds.slot().unwrap();
+        let mut frame = block(|block| rounds.seal(&key, 0, block, 16));
+        assert_eq!(frame, sealed(&key));
+        assert_eq!(rounds.open(&key, 0, &mut frame), Ok(16));
+        let number = rounds.0;
+        drop(rounds);
+        // Other tests may have taken the slot.
+        assert_ne!(slot.lock().unwrap().of, number);
     }
 
     #[test]

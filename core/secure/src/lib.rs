@@ -30,7 +30,7 @@
 
 #![no_std]
 
-#[cfg(test)]
+#[cfg(any(test, feature = "ring"))]
 extern crate std;
 
 pub mod channel;

@@ -83,6 +83,56 @@ impl Suite {
     }
 }
 
+/// The key of one direction of a link.
+pub(crate) struct FrameKey {
+    suite: Suite,
+    key: Key,
+    #[cfg(feature = "ring")]
+    rounds: crate::fast::Rounds,
+}
+
+impl FrameKey {
+    pub(crate) fn new(suite: Suite, key: Key) -> Self {
+        Self {
+            suite,
+            key,
+            #[cfg(feature = "ring")]
+            rounds: crate::fast::Rounds::new(),
+        }
+    }
+
+    pub(crate) const fn suite(&self) -> Suite {
+        self.suite
+    }
+
+    pub(crate) const fn key(&self) -> &Key {
+        &self.key
+    }
+
+    /// The key after this one.
+    pub(crate) fn next(&self) -> Self {
+        Self::new(self.suite, self.suite.next(&self.key))
+    }
+
+    /// [`Suite::seal`] for a frame.
+    pub(crate) fn seal(&self, number: u64, buffer: &mut [u8], length: usize) {
+        #[cfg(feature = "ring")]
+        if self.suite == Suite::AesGcm {
+            return self.rounds.seal(&self.key, number, buffer, length);
+        }
+        self.suite.seal(&self.key, number, &[], buffer, length);
+    }
+
+    /// [`Suite::open`] for a frame.
+    pub(crate) fn open(&self, number: u64, sealed: &mut [u8]) -> Result<usize, ()> {
+        #[cfg(feature = "ring")]
+        if self.suite == Suite::AesGcm {
+            return self.rounds.open(&self.key, number, sealed);
+        }
+        self.suite.open(&self.key, number, &[], sealed)
+    }
+}
+
 /// The curve's base point.
 const BASE: [u8; 32] = {
     let mut point = [0; 32];
