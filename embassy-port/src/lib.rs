@@ -7,7 +7,7 @@
 //! ```no_run
 //! use cara_core::services::lease::Lease;
 //! use cara_core::time::Duration;
-//! use cara_embassy::{Config, Handle, Handler, Limits, Runner, Security, ServiceOptions, resources};
+//! use cara_embassy::{Config, Handle, Handler, Limits, Network, Runner, Security, ServiceOptions, resources};
 //!
 //! /// The application's state, which services get.
 //! #[derive(Default)]
@@ -16,18 +16,18 @@
 //! /// Read by the motor's interrupt as well: `GO_TO.is_live(cara_embassy::now())`.
 //! static GO_TO: Lease = Lease::new();
 //!
-//! /// `embassy_net::StackResources<{ LIMITS.sockets() }>` has the sockets for it.
+//! /// `embassy_net::StackResources<{ LIMITS.sockets() }>` has the sockets for it, and goes to `cara_embassy::network`.
 //! const LIMITS: Limits = Limits { message_size: 512, ..Limits::S_UNIT };
 //! /// A static of it, `StaticCell<AgvResources>`, is made with `RESOURCES.init_with(Resources::new)`.
 //! type AgvResources = resources!(Agv, LIMITS);
 //!
 //! fn start(
-//!     stack: embassy_net::Stack<'static>,
+//!     network: Network<{ LIMITS.sockets() }>,
 //!     resources: &'static mut AgvResources,
 //!     security: Security,
 //! ) -> Result<(Handle<Agv>, Runner<Agv>), cara_core::error::Error> {
 //!     let config = Config::s_unit("agv-07", 7, "manager", 1, security)?;
-//!     let (unit, runner) = cara_embassy::new(stack, resources, config, Agv::default())?;
+//!     let (unit, runner) = cara_embassy::new(network, resources, config, Agv::default())?;
 //!     let pos_info = Handler::method(&|agv: &mut Agv, _, p| Ok(p.set_value("position", agv.position)?));
 //!     unit.my_function_list().add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), pos_info)?;
 //!     let forget: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
@@ -145,7 +145,11 @@ pub use lease::LeaseWatch;
 pub use limits::Limits;
 #[cfg(feature = "logs")]
 pub use log::{LOG_BYTES, Log, LogCell, LogStream};
+#[doc(hidden)]
+pub use mail::Carrier;
 pub use mail::Transport;
+#[cfg(feature = "net")]
+pub use net::{Network, network};
 pub use peer::{Peer, TheirFunctionList};
 #[cfg(feature = "streams")]
 pub use readings::{SubscriptionCell, SubscriptionInner};

@@ -117,7 +117,7 @@ impl Limits {
     pub const M_UNIT: Self = Self { links: 5, message_buffers: 6, ..Self::S_UNIT };
 
     /// Sockets that embassy-net's `StackResources` needs: for each link, for datagrams and for DHCP. An application with
-    /// sockets of its own, or with DNS, adds those.
+    /// sockets of its own, or with DNS, adds those. With fewer than these [`new`](crate::new) fails the build.
     pub const fn sockets(&self) -> usize {
         self.links + 2
     }
@@ -196,6 +196,15 @@ impl Limits {
     }
 }
 
+/// Fails the build if a stack has too few sockets, with both numbers.
+#[expect(clippy::panic, reason = "when compiling")]
+pub(crate) const fn check_sockets(need: usize, have: usize) {
+    if have < need {
+        let text = Text::EMPTY.text(b"Limits::sockets() = ").number(need as u32);
+        panic!("{}", text.text(b", and StackResources has ").number(have as u32).as_str())
+    }
+}
+
 /// A text that is made when compiling.
 struct Text {
     bytes: [u8; 96],
@@ -227,7 +236,7 @@ impl Text {
 
 #[cfg(test)]
 mod tests {
-    use super::{DATAGRAM_OVERHEAD, Limits};
+    use super::{DATAGRAM_OVERHEAD, Limits, check_sockets};
     use cara_core::distribution::datagram::SESSION_HEADER_BYTES;
     use cara_core::distribution::message::{REQUEST_BYTES, SessionBody};
 
@@ -239,5 +248,16 @@ mod tests {
             let limits = Limits { message_size, ..Limits::S_UNIT };
             assert!(limits.buffer_bytes() >= around + message_size as usize, "{message_size}");
         }
+    }
+
+    #[test]
+    fn as_many_sockets_as_needed_are_enough() {
+        check_sockets(Limits::S_UNIT.sockets(), 3);
+    }
+
+    #[test]
+    #[should_panic(expected = "Limits::sockets() = 12, and StackResources has 10")]
+    fn too_few_sockets_are_told_with_both_numbers() {
+        check_sockets(Limits { links: 10, ..Limits::S_UNIT }.sockets(), 10);
     }
 }

@@ -17,27 +17,41 @@ use crate::net;
 #[cfg(not(any(feature = "line", feature = "net")))]
 compile_error!("cara-embassy needs its feature `net`, for embassy-net, or `line`, for a serial line without IP");
 
-/// What a unit reaches others over.
-pub enum Transport {
-    /// An IP network.
+/// What a unit reaches others over: a `Network`, or a `line::Line`.
+pub trait Transport {
+    /// How many sockets it has.
+    #[doc(hidden)]
+    const SOCKETS: usize;
+
+    #[doc(hidden)]
+    fn carrier(self) -> Carrier;
+}
+
+/// A transport of either kind.
+#[doc(hidden)]
+pub enum Carrier {
     #[cfg(feature = "net")]
     Net(embassy_net::Stack<'static>),
-    /// A serial line without IP.
     #[cfg(feature = "line")]
     Line(line::Line),
 }
 
 #[cfg(feature = "net")]
-impl From<embassy_net::Stack<'static>> for Transport {
-    fn from(stack: embassy_net::Stack<'static>) -> Self {
-        Self::Net(stack)
+impl<const SOCKETS: usize> Transport for net::Network<SOCKETS> {
+    const SOCKETS: usize = SOCKETS;
+
+    fn carrier(self) -> Carrier {
+        Carrier::Net(self.stack())
     }
 }
 
 #[cfg(feature = "line")]
-impl From<line::Line> for Transport {
-    fn from(line: line::Line) -> Self {
-        Self::Line(line)
+impl Transport for line::Line {
+    /// A line needs none.
+    const SOCKETS: usize = usize::MAX;
+
+    fn carrier(self) -> Carrier {
+        Carrier::Line(self)
     }
 }
 
@@ -58,16 +72,16 @@ impl<const LINKS: usize, const STREAM: usize, const DATAGRAM: usize> Memory<LINK
     }
 
     /// Takes datagrams at that port.
-    pub(crate) fn open(&'static mut self, transport: Transport, port: u16) -> Result<Mail, Error> {
-        match transport {
+    pub(crate) fn open(&'static mut self, carrier: Carrier, port: u16) -> Result<Mail, Error> {
+        match carrier {
             #[cfg(feature = "net")]
-            Transport::Net(stack) => {
+            Carrier::Net(stack) => {
                 let (net, sockets) = self.net.open(stack, port)?;
                 let connections = self.connections.write(sockets.map(Connection::Net));
                 Ok(Mail { network: Network::Net(net), connections })
             }
             #[cfg(feature = "line")]
-            Transport::Line(line) => {
+            Carrier::Line(line) => {
                 if LINKS > 1 {
                     return Err(Error::BadConstraint);
                 }

@@ -9,12 +9,45 @@ use core::task::{Context, Poll, Waker};
 
 use cara_core::error::{CloseReason, Error};
 use cara_core::time::{Duration, Instant};
+use embassy_net::driver::Driver;
 use embassy_net::tcp::{State, TcpSocket};
 use embassy_net::udp::{PacketMetadata, UdpSocket};
-use embassy_net::{IpAddress, IpEndpoint, Stack, StaticConfigV4};
+use embassy_net::{Config, IpAddress, IpEndpoint, Runner, Stack, StackResources, StaticConfigV4};
 
 use crate::connection::{Progress, copy};
 use crate::time::now;
+
+/// A network stack, whose type says how many sockets it has room for. [`new`](crate::new) takes it.
+#[derive(Clone, Copy)]
+pub struct Network<const SOCKETS: usize>(Stack<'static>);
+
+/// Makes a network stack, as `embassy_net::new` does, whose number of sockets is checked when compiling. Its runner wants a task
+/// of its own.
+///
+/// Two sockets are too few for one link, datagrams and DHCP: "Limits::sockets() = 3, and StackResources has 2".
+///
+/// ```compile_fail,E0080
+/// # use cara_embassy::{Config, Limits, Network, Resources, resources};
+/// # let start: fn(Network<2>, &'static mut resources!((), Limits::S_UNIT), Config) =
+/// #     |network, resources, config| drop(cara_embassy::new(network, resources, config, ()));
+/// # std::hint::black_box(start);
+/// ```
+pub fn network<D: Driver, const SOCKETS: usize>(
+    driver: D,
+    config: Config,
+    sockets: &'static mut StackResources<SOCKETS>,
+    seed: u64,
+) -> (Network<SOCKETS>, Runner<'static, D>) {
+    let (stack, runner) = embassy_net::new(driver, config, sockets, seed);
+    (Network(stack), runner)
+}
+
+impl<const SOCKETS: usize> Network<SOCKETS> {
+    /// The stack, for the application's own sockets.
+    pub fn stack(&self) -> Stack<'static> {
+        self.0
+    }
+}
 
 /// Datagrams that wait to be read or sent.
 const DATAGRAMS: usize = 8;

@@ -26,11 +26,11 @@ use crate::config::Config;
 use crate::event::{Events, UnitEvent};
 use crate::handle::Handle;
 use crate::handler::Listed;
-use crate::limits::Limits;
+use crate::limits::{Limits, check_sockets};
 use crate::link::Link;
 use crate::link::Waiter;
 use crate::machine::{Machine, Shared, Started, Unwanted, Wakers};
-use crate::mail::{self, Transport};
+use crate::mail::{self, Carrier, Transport};
 use crate::port::Board;
 use crate::replies::ReplyBox;
 use crate::runner::Runner;
@@ -104,9 +104,12 @@ struct SessionMemory<const OWN: usize, const THEIR: usize, const CALLS: usize> {
 
 /// [`Resources`] of any size, for an application whose state is a `T`.
 pub trait Memory<T> {
+    /// How many sockets the unit needs.
     #[doc(hidden)]
-    fn unit(&'static mut self, transport: Transport, config: Config, state: T)
-    -> Result<(Handle<T>, Runner<T>), Error>;
+    const SOCKETS: usize;
+
+    #[doc(hidden)]
+    fn unit(&'static mut self, carrier: Carrier, config: Config, state: T) -> Result<(Handle<T>, Runner<T>), Error>;
 }
 
 /// Makes a unit on a network stack or a serial line, with the application's state. It does nothing until the runner runs.
@@ -117,17 +120,19 @@ pub trait Memory<T> {
 ///
 /// [`Error::DoesNotFit`] when the memory cannot hold the constraints, [`Error::PortInUse`] when the discovery port
 /// is bound already, [`Error::BadConstraint`] for a unit without its manager's address or with an access table where the feature
-/// `discover` or `access` is off, and for more than one link on a serial line.
+/// `discover` or `access` is off, and for more than one link on a serial line. A stack with fewer sockets than
+/// [`Limits::sockets`] does not compile.
 ///
 /// # Panics
-/// In embassy-net, when the stack was made with fewer sockets than [`Limits::sockets`] asks for.
-pub fn new<T>(
-    transport: impl Into<Transport>,
-    resources: &'static mut impl Memory<T>,
+/// In embassy-net, when sockets of the application or of DNS have left too few.
+pub fn new<T, N: Transport, M: Memory<T>>(
+    transport: N,
+    resources: &'static mut M,
     config: Config,
     state: T,
 ) -> Result<(Handle<T>, Runner<T>), Error> {
-    resources.unit(transport.into(), config, state)
+    const { check_sockets(M::SOCKETS, N::SOCKETS) };
+    resources.unit(transport.carrier(), config, state)
 }
 
 // There is no memory of a default size.
@@ -218,10 +223,12 @@ impl<
 > Memory<T>
     for Resources<T, LINKS, SIZE, BUFFER, BUFFERS, STREAM, OWN, THEIR, CALLS, WAIT, TASKS, ARGUMENTS, DATAGRAM, REPLY>
 {
+    const SOCKETS: usize = Self::LIMITS.sockets();
+
     #[inline(never)]
     fn unit(
         &'static mut self,
-        transport: Transport,
+        carrier: Carrier,
         mut config: Config,
         state: T,
     ) -> Result<(Handle<T>, Runner<T>), Error> {
@@ -234,7 +241,7 @@ impl<
         if config.security.0.mode() == Mode::Plain {
             warning!("this unit is INSECURE: anybody on the network can read what it says, and can speak as its peers");
         }
-        let mail = self.mail.open(transport, config.node.udp_port)?;
+        let mail = self.mail.open(carrier, config.node.udp_port)?;
         let scratch = self.scratch.write([0; DATAGRAM]);
         let storage = NodeStorage {
             nodes: self.nodes.write([const { [const { None }; KNOWN] }; LINKS]).as_flattened_mut(),

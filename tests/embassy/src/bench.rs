@@ -7,6 +7,7 @@ use std::rc::Rc;
 
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
+use cara_embassy::Network;
 use cara_ethernet::{FaultCounts, Faults, Mac, Switch};
 use cara_sim::Path;
 use embassy_net::{Config, Ipv4Cidr, Stack, StackResources, StaticConfigV4};
@@ -19,7 +20,7 @@ use crate::tasks::{Job, Task, Tasks};
 /// What a poll costs: without it, a task that wakes itself would hold the clock.
 const POLL: Duration = Duration::from_micros(4);
 /// Sockets of each board.
-const SOCKETS: usize = 132;
+pub const SOCKETS: usize = 132;
 /// Boards are in 10.77.0.0/16.
 const PREFIX: u8 = 16;
 
@@ -55,7 +56,7 @@ pub struct Board {
     plug: Plug,
     address: Ipv4Addr,
     config: fn(Ipv4Addr) -> Config,
-    stack: Stack<'static>,
+    network: Network<SOCKETS>,
 }
 
 impl Bench {
@@ -202,9 +203,9 @@ impl Inner {
 impl Board {
     fn boot(inner: &Rc<Inner>, index: usize, plug: Plug, address: Ipv4Addr, config: fn(Ipv4Addr) -> Config) -> Self {
         let resources = Box::leak(Box::new(StackResources::<SOCKETS>::new()));
-        let (stack, mut runner) =
-            embassy_net::new(Cable(plug.clone()), config(address), resources, inner.random(u64::MAX));
-        let board = Self { inner: Rc::clone(inner), index, plug, address, config, stack };
+        let (network, mut runner) =
+            cara_embassy::network(Cable(plug.clone()), config(address), resources, inner.random(u64::MAX));
+        let board = Self { inner: Rc::clone(inner), index, plug, address, config, network };
         board.spawn(async move { runner.run().await });
         board
     }
@@ -216,9 +217,14 @@ impl Board {
         Self::boot(&self.inner, self.index, self.plug.clone(), self.address, self.config)
     }
 
+    /// Its network, for a unit.
+    pub fn network(&self) -> Network<SOCKETS> {
+        self.network
+    }
+
     /// Its network stack.
     pub fn stack(&self) -> Stack<'static> {
-        self.stack
+        self.network.stack()
     }
 
     /// Its address.
@@ -245,7 +251,7 @@ impl Board {
 
     /// Gives it another address while it runs.
     pub fn move_to(&self, address: Ipv4Addr) {
-        self.stack.set_config_v4(fixed(address).ipv4);
+        self.stack().set_config_v4(fixed(address).ipv4);
     }
 
     /// What happens from now on to the frames that it sends.

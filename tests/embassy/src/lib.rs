@@ -26,7 +26,7 @@ mod security;
 mod tasks;
 mod wire;
 
-pub use bench::{Bench, Board};
+pub use bench::{Bench, Board, SOCKETS};
 pub use cara_ethernet::{Fault, FaultCounts, Faults};
 pub use clock::now;
 pub use security::{keys, security};

@@ -54,7 +54,7 @@ const LIMITS: Limits = Limits { links: 3, message_size: 256, ..Limits::S_UNIT };
 
 fn start(board: &Board, config: Config) -> Handle {
     let memory: &'static mut resources!((), LIMITS) = Box::leak(Box::new(Resources::new()));
-    let (unit, mut runner) = cara_embassy::new(board.stack(), memory, config, ()).unwrap();
+    let (unit, mut runner) = cara_embassy::new(board.network(), memory, config, ()).unwrap();
     board.spawn(async move { runner.run().await });
     unit
 }

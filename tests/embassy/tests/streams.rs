@@ -27,7 +27,7 @@ struct Pose {
 
 fn start(board: &Board, config: Config) -> Unit {
     let memory = Box::leak(Box::new(Memory::new()));
-    let (unit, mut runner) = cara_embassy::new(board.stack(), memory, config, ()).unwrap();
+    let (unit, mut runner) = cara_embassy::new(board.network(), memory, config, ()).unwrap();
     board.spawn(async move { runner.run().await });
     unit
 }

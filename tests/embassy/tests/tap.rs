@@ -206,15 +206,15 @@ fn board(fleet: u32, keys: KeyRing) {
     let config = StaticConfigV4 { address, gateway: None, dns_servers: Default::default() };
     let resources = Box::leak(Box::new(StackResources::<{ Limits::S_UNIT.sockets() }>::new()));
     let config = embassy_net::Config::ipv4_static(config);
-    let (stack, mut network) = embassy_net::new(Tap(tap), config, resources, u64::from(fleet));
+    let (network, mut stack_runner) = cara_embassy::network(Tap(tap), config, resources, u64::from(fleet));
     let memory: &'static mut resources!(Agv, Limits::S_UNIT) = Box::leak(Box::new(Resources::new()));
     let mut random = Random::constant();
     random.stir(&fleet.to_le_bytes());
     let security = Security::keys(Box::leak(Box::new(keys)), random);
     let config = Config::s_unit("agv", 7, "manager", 1, security).unwrap().fleet(fleet);
-    let (unit, mut runner) = cara_embassy::new(stack, memory, config, Agv::new([0, 0])).unwrap();
+    let (unit, mut runner) = cara_embassy::new(network, memory, config, Agv::new([0, 0])).unwrap();
     services(unit);
-    let (network, runner) = (pin!(async { network.run().await }), pin!(async { runner.run().await }));
+    let (network, runner) = (pin!(async { stack_runner.run().await }), pin!(async { runner.run().await }));
     let (driving, asking) = (pin!(drive(unit)), pin!(ask(unit)));
     let mut tasks: [Pin<&mut dyn Future<Output = ()>>; 4] = [network, runner, driving, asking];
     let waker = Waker::from(std::sync::Arc::new(Nobody));

@@ -165,7 +165,7 @@ fn start(bench: &Bench, identity: &Identity, config: impl FnOnce(cara_embassy::S
     let board = bench.board();
     let memory = Box::leak(Box::new(Memory::new()));
     let config = config(keys(0, identity, 0, bench.random(u64::MAX)));
-    let (unit, mut runner) = cara_embassy::new(board.stack(), memory, config, Fork::default()).unwrap();
+    let (unit, mut runner) = cara_embassy::new(board.network(), memory, config, Fork::default()).unwrap();
     board.spawn(async move { runner.run().await });
     (board, unit)
 }

@@ -45,7 +45,7 @@ type Manager = resources!(State, LIMITS);
 
 fn start(board: &Board, config: Config) -> Unit {
     let memory = Box::leak(Box::new(Manager::new()));
-    let (unit, mut runner) = cara_embassy::new(board.stack(), memory, config, State::default()).unwrap();
+    let (unit, mut runner) = cara_embassy::new(board.network(), memory, config, State::default()).unwrap();
     board.spawn(async move { runner.run().await });
     unit
 }
@@ -508,7 +508,7 @@ fn memory_that_cannot_hold_the_constraints_is_refused() {
     let config = Config::m_unit("manager", 1, Security::insecure(1)).unwrap();
     let constraints = Constraints { maximum_nodes: 4, ..Constraints::M_UNIT };
     let memory = Box::leak(Box::new(Manager::new()));
-    let refused = cara_embassy::new(bench.board().stack(), memory, config.constraints(constraints), State::default());
+    let refused = cara_embassy::new(bench.board().network(), memory, config.constraints(constraints), State::default());
     let does_not_fit = |constraint, need, have| Error::DoesNotFit { constraint, need, have };
     assert_eq!(refused.err(), Some(does_not_fit(Constraint::MessageSize, 32 * 1024, 1024)));
     let (_, unit) = manager(&bench);
@@ -579,7 +579,7 @@ fn an_idle_unit_lets_its_controller_sleep() {
     let board = bench.board();
     let config = agv_config(&bench);
     let memory = Box::leak(Box::new(Manager::new()));
-    let (agv, mut runner) = cara_embassy::new(board.stack(), memory, config, State::default()).unwrap();
+    let (agv, mut runner) = cara_embassy::new(board.network(), memory, config, State::default()).unwrap();
     let polls = Rc::new(Cell::new(0));
     let task = Box::pin(async move { runner.run().await });
     board.spawn(Counted { task, polls: Rc::clone(&polls) });

@@ -43,7 +43,7 @@ impl Add for () {
 
 /// Makes the unit, whose one service adds two numbers.
 pub fn unit(
-    transport: impl Into<Transport>,
+    transport: impl Transport,
     resources: &'static mut LeastResources,
     settings: &Settings,
     security: Security,

@@ -98,9 +98,20 @@ pub enum VehicleError {
     Unit(#[from] Error),
 }
 
+/// Makes the network stack of the settings.
+#[cfg(feature = "net")]
+pub fn network<D: embassy_net::driver::Driver, const SOCKETS: usize>(
+    device: D,
+    settings: &Settings,
+    sockets: &'static mut embassy_net::StackResources<SOCKETS>,
+    seed: u64,
+) -> (cara_embassy::Network<SOCKETS>, embassy_net::Runner<'static, D>) {
+    cara_embassy::network(device, network_config(settings), sockets, seed)
+}
+
 /// How the network stack gets its address.
 #[cfg(feature = "net")]
-pub fn network(settings: &Settings) -> embassy_net::Config {
+pub fn network_config(settings: &Settings) -> embassy_net::Config {
     use cara_settings::Network;
     use embassy_net::{Ipv4Cidr, StaticConfigV4};
     match settings.network {
@@ -124,7 +135,7 @@ pub fn hardware_address(chip: &[u8]) -> [u8; 6] {
 
 /// Makes the AGV that the settings describe; `security` proves its identity.
 pub fn vehicle(
-    transport: impl Into<Transport>,
+    transport: impl Transport,
     resources: &'static mut VehicleResources,
     settings: &Settings,
     security: Security,

@@ -14,7 +14,7 @@ pub const NO_ROOM: &str = "no room for a task";
 /// Makes the AGV of the settings and starts its tasks. Once per image: its memory is a static here. On an error the text says why.
 pub fn start(
     spawner: Spawner,
-    transport: impl Into<Transport>,
+    transport: impl Transport,
     settings: &Settings,
     security: Security,
 ) -> Result<Vehicle, &'static str> {

@@ -98,7 +98,7 @@ impl Agv {
 
 /// Makes the vehicle that the settings describe, which stands in a cell; `security` proves its identity.
 pub fn vehicle(
-    transport: impl Into<cara_embassy::Transport>,
+    transport: impl cara_embassy::Transport,
     resources: &'static mut VehicleResources,
     settings: &Settings,
     security: Security,

@@ -9,10 +9,11 @@ pub use line::{Sockets, network};
 
 #[cfg(not(feature = "line"))]
 mod ip {
+    use cara_embassy::Network;
     use cara_settings::Settings;
     use embassy_executor::Spawner;
+    use embassy_net::Runner;
     pub use embassy_net::StackResources as Sockets;
-    use embassy_net::{Runner, Stack};
 
     use super::NO_ROOM;
     #[cfg(not(feature = "slip"))]
@@ -26,10 +27,10 @@ mod ip {
         settings: &Settings,
         sockets: &'static mut Sockets<SOCKETS>,
         noise: u64,
-    ) -> Result<Stack<'static>, &'static str> {
-        let (stack, runner) = embassy_net::new(start(spawner)?, cara_vehicle::network(settings), sockets, noise);
+    ) -> Result<Network<SOCKETS>, &'static str> {
+        let (network, runner) = cara_vehicle::network(start(spawner)?, settings, sockets, noise);
         spawner.spawn(run(runner).map_err(|_| NO_ROOM)?);
-        Ok(stack)
+        Ok(network)
     }
 
     #[embassy_executor::task]

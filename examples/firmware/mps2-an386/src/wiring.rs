@@ -1,9 +1,10 @@
 //! What every image of the board starts with: its network.
 
+use cara_embassy::Network;
 use cara_settings::Settings;
 use cara_vehicle::tasks::NO_ROOM;
 use embassy_executor::Spawner;
-use embassy_net::{Runner, Stack, StackResources};
+use embassy_net::{Runner, StackResources};
 use static_cell::ConstStaticCell;
 
 use crate::ethernet::Ethernet;
@@ -14,13 +15,13 @@ pub fn network<const SOCKETS: usize>(
     settings: &Settings,
     sockets: &'static mut StackResources<SOCKETS>,
     noise: u64,
-) -> Result<Stack<'static>, &'static str> {
+) -> Result<Network<SOCKETS>, &'static str> {
     static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
     let ethernet = ETHERNET.take();
     ethernet.start();
-    let (stack, runner) = embassy_net::new(ethernet, cara_vehicle::network(settings), sockets, noise);
+    let (network, runner) = cara_vehicle::network(ethernet, settings, sockets, noise);
     spawner.spawn(run(runner).map_err(|_| NO_ROOM)?);
-    Ok(stack)
+    Ok(network)
 }
 
 #[embassy_executor::task]

@@ -21,8 +21,8 @@ fn main() -> ! {
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static RESOURCES: ConstStaticCell<StackResources<4>> = ConstStaticCell::new(StackResources::new());
     let given = arguments::read().map_err(ArgumentError::text)?;
-    let stack = wiring::network(spawner, &given.settings, RESOURCES.take(), given.noise)?;
-    spawner.spawn(answer(stack).map_err(|_| NO_ROOM)?);
+    let network = wiring::network(spawner, &given.settings, RESOURCES.take(), given.noise)?;
+    spawner.spawn(answer(network.stack()).map_err(|_| NO_ROOM)?);
     spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     cara_vehicle::info!("started");
     Ok(())

@@ -46,9 +46,9 @@ fn spawn(
 ) -> Result<(), SpawnError> {
     static SOCKETS: StaticCell<StackResources<{ LIMITS.sockets() }>> = StaticCell::new();
     let sockets = SOCKETS.init_with(StackResources::new);
-    let (stack, network_runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
+    let (transport, network_runner) = cara_vehicle::network(device, &settings, sockets, seed);
     spawner.spawn(network(network_runner)?);
-    let vehicle = defmt::unwrap!(tasks::start(spawner, stack, &settings, security));
+    let vehicle = defmt::unwrap!(tasks::start(spawner, transport, &settings, security));
     spawner.spawn(call_mechanic(vehicle, button)?);
     spawner.spawn(shine(vehicle, led)?);
     watchdog.start();

@@ -17,7 +17,8 @@ async fn main(spawner: Spawner) {
     static RESOURCES: StaticCell<StackResources<4>> = StaticCell::new();
     let board = Board::start();
     let [first, second] = board.pages;
-    let config = page::newest(first, second).map_or_else(|_| echo::dhcp(), |settings| cara_vehicle::network(&settings));
+    let config =
+        page::newest(first, second).map_or_else(|_| echo::dhcp(), |settings| cara_vehicle::network_config(&settings));
     let resources = RESOURCES.init_with(StackResources::new);
     let (stack, runner) = embassy_net::new(board.device, config, resources, board.seed);
     spawner.spawn(defmt::unwrap!(network(runner)));

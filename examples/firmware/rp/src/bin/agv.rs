@@ -31,10 +31,10 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     };
     let (device, uplink) = network.start(spawner).await?;
     let sockets = SOCKETS.init_with(StackResources::new);
-    let (stack, runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
-    uplink.keep(spawner, stack, Some(&settings))?;
+    let (network, runner) = cara_vehicle::network(device, &settings, sockets, seed);
+    uplink.keep(spawner, network.stack(), Some(&settings))?;
     spawner.spawn(talk(runner)?);
-    let vehicle = defmt::unwrap!(tasks::start(spawner, stack, &settings, security));
+    let vehicle = defmt::unwrap!(tasks::start(spawner, network, &settings, security));
     spawner.spawn(call_mechanic(vehicle, button)?);
     spawner.spawn(shine(vehicle, led)?);
     watchdog.start();

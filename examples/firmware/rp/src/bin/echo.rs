@@ -22,7 +22,7 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     let Board { pages: [first, second], seed, network, .. } = Board::start(spawner).await;
     let (device, uplink) = network.start(spawner).await?;
     let settings = page::newest(first, second);
-    let config = settings.as_ref().map_or_else(|_| echo::dhcp(), cara_vehicle::network);
+    let config = settings.as_ref().map_or_else(|_| echo::dhcp(), cara_vehicle::network_config);
     let resources = RESOURCES.init_with(StackResources::new);
     let (stack, runner) = embassy_net::new(device, config, resources, seed);
     uplink.keep(spawner, stack, settings.as_ref().ok())?;

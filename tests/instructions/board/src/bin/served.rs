@@ -33,13 +33,13 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let manager = settings.manager.as_ref().ok_or("the arguments name no manager")?;
     // The same numbers in every run, as far as the network lets them be.
     let seed = 1;
-    let stack = wiring::network(spawner, &settings, SOCKETS.take(), seed)?;
+    let network = wiring::network(spawner, &settings, SOCKETS.take(), seed)?;
     let (name, id) = (settings.identity.name(), settings.identity.id());
     let config = Config::s_unit(name, id, &manager.name, manager.id, Security::insecure(seed))
         .map_err(|_| "the settings are of no unit")?;
     let config = config.fleet(settings.fleet.0);
     let (unit, unit_runner) =
-        cara_embassy::new(stack, MEMORY.init_with(Memory::new), config, ()).map_err(|_| "no such unit")?;
+        cara_embassy::new(network, MEMORY.init_with(Memory::new), config, ()).map_err(|_| "no such unit")?;
     for service in SERVICES {
         let nothing = Handler::method(&|(), _, _| Ok(()));
         unit.my_function_list()

@@ -2,8 +2,8 @@
 
 use cara_core::error::Error;
 use cara_embassy::line::Line;
-use cara_embassy::{Config, Handle, Limits, Runner, resources};
-use embassy_net::Stack;
+use cara_embassy::{Config, Handle, Limits, Network, Runner, resources};
+use cara_embassy_host::SOCKETS;
 
 use crate::Spec;
 
@@ -78,8 +78,8 @@ macro_rules! unit {
 type Made = Result<(Handle, Runner<()>), Error>;
 
 /// A unit on a network.
-pub(super) fn on_network(spec: &Spec, stack: Stack<'static>, config: Config) -> Made {
-    unit!(with_its_links, spec => stack, config)
+pub(super) fn on_network(spec: &Spec, network: Network<SOCKETS>, config: Config) -> Made {
+    unit!(with_its_links, spec => network, config)
 }
 
 /// A unit on a line.

@@ -107,7 +107,7 @@ impl BoardNode {
             Some(wire) => {
                 memory::on_line(&self.spec, wire.line(self.number, &board, self.bench.random(u64::MAX)), config)
             }
-            None => memory::on_network(&self.spec, board.stack(), config),
+            None => memory::on_network(&self.spec, board.network(), config),
         });
         let (unit, mut runner) = made.expect("a unit can be made");
         self.unit.replace(Some(unit));
