@@ -13,6 +13,9 @@ use super::{KeyError, file};
 
 /// The first line's word.
 const HEAD: &str = "cara-claims";
+/// Before a line that versions without hand-over have to skip: they skip what begins with `#`, and take a file with a word that they
+/// do not know for damaged.
+const LATER: &str = "#!";
 
 /// What a unit keeps.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -52,7 +55,8 @@ pub(crate) fn read_claims(path: &Path) -> Result<Option<KeptClaims>, KeyError> {
 }
 
 fn parse(text: &str) -> Result<KeptClaims, FormError> {
-    let mut lines = Lines::of(text);
+    let text = text.replace(&format!("\n{LATER}"), "\n");
+    let mut lines = Lines::of(&text);
     lines.head(HEAD, "a file with claims begins with `cara-claims`")?;
     let (own, _) = claim(lines.expect("own", "here `own` is expected")?)?;
     let mut kept = KeptClaims { own, ..KeptClaims::default() };
@@ -109,6 +113,7 @@ pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyErro
     }
     if let Some(KeptHandOver { home, present }) = &kept.handed {
         for (word, manager) in [("home ", home), ("present ", present)] {
+            text.push_str(LATER);
             text.push_str(word);
             push_identity(&mut text, manager);
             text.push('\n');
@@ -125,11 +130,33 @@ pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyErro
 mod tests {
     use super::*;
 
+    fn kept() -> KeptClaims {
+        KeptClaims { own: Claim { term: 3, claimant: 4 }, ..KeptClaims::default() }
+    }
+
     #[test]
     fn what_a_newer_version_adds_is_skipped() {
-        let mut text = format!("{HEAD} {FORM}\nown 3 4\nlater 5 six\n");
+        let mut text = format!("{HEAD} {FORM}\nown 3 4\nlater 5 six\n#!later\n");
         push_sum(&mut text);
-        let own = Claim { term: 3, claimant: 4 };
-        assert_eq!(parse(&text).unwrap(), KeptClaims { own, ..KeptClaims::default() });
+        assert_eq!(parse(&text).unwrap(), kept());
+    }
+
+    #[test]
+    fn a_hand_over_is_a_comment_for_versions_without() {
+        let (home, present) = (Identity::m_unit("depot", 1).unwrap(), Identity::m_unit("the yard", 3).unwrap());
+        let handed = KeptClaims { handed: Some(KeptHandOver { home, present }), ..kept() };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("agv.claims");
+        write_claims(&path, &handed).unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        // What those versions read.
+        let words: Vec<&str> = Lines::of(&text).map(|line| line.word).collect();
+        assert_eq!(words, [HEAD, "own"]);
+        // As versions wrote it before.
+        let mut before = text.replace(LATER, "");
+        before.truncate(before.rfind("sum ").unwrap());
+        push_sum(&mut before);
+        assert!(before.contains("\nhome "));
+        assert_eq!([parse(&text).unwrap(), parse(&before).unwrap()], [handed.clone(), handed]);
     }
 }
