@@ -57,16 +57,21 @@ pub(crate) fn tests() -> Run {
 /// The patches that [`changed`] applies.
 pub(crate) const VARIANTS: &str = "tests/variants";
 
-/// The same build, of a clone of the last commit that a patch of `tests/variants` changes. What it depends on is that of every other
-/// build, so what it makes itself goes to a folder of its own; cargo tells both apart by the path of the wrapper.
+/// The same build, of a clone of the last commit that a patch of `tests/variants` changes.
 pub(crate) fn changed(build: Run, patch: &str) -> Result<Run> {
     let folder = changed_folder(patch);
-    let (tree, wrapper) = (folder.join("tree"), folder.join("rustc"));
-    Tree::at(tree.clone())?.apply(&Path::new(VARIANTS).join(patch).with_extension("patch"))?;
+    Tree::at(folder.join("tree"))?.apply(&Path::new(VARIANTS).join(patch).with_extension("patch"))?;
+    of_another_tree(build, &folder)
+}
+
+/// The same build, of the `tree` in a folder. What it depends on is that of every other build, so what it makes itself goes to that
+/// folder; cargo tells both apart by the path of the wrapper.
+pub(crate) fn of_another_tree(build: Run, folder: &Path) -> Result<Run> {
+    let wrapper = folder.join("rustc");
     fs::write(&wrapper, "#!/bin/sh\nexec \"$@\"\n")?;
     fs::set_permissions(&wrapper, Permissions::from_mode(0o755))?;
     Ok(build
-        .within(&tree)
+        .within(&folder.join("tree"))
         .env("RUSTC_WORKSPACE_WRAPPER", &wrapper.to_string_lossy())
         .env("CARGO_BUILD_BUILD_DIR", &workspace::target().to_string_lossy())
         .env("CARGO_TARGET_DIR", &folder.to_string_lossy()))

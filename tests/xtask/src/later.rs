@@ -3,12 +3,12 @@
 //! A build with the patch `a-later-version` speaks one version more and says what this one does not know wherever the wire format
 //! has room for it: items, capabilities, suites, frames, session bodies, flags, and longer headers and bodies of every kind.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
 
 use crate::command::Run;
-use crate::{binaries, demo, planted, workspace};
+use crate::{binaries, demo, planted, upgrade, workspace};
 
 const LATER: &str = "a-later-version";
 
@@ -29,31 +29,42 @@ pub(crate) fn check() -> Result<()> {
     both_ways(&later, "a later one")
 }
 
-/// The demonstration beside builds of earlier revisions. Each version of the wire format that units in use may speak has a
-/// tag, `wire-N`.
+/// The demonstration and a fleet in motion beside builds of earlier revisions: the tags `wire-N` and `v*`, or else the last commit of
+/// the day before this one's.
 pub(crate) fn versions(revisions: &[String]) -> Result<()> {
-    let tags = Run::new("git").args(["tag", "--list", "wire-*"]).text()?;
-    let revisions: Vec<&str> = match revisions {
-        [] => tags.lines().collect(),
-        revisions => revisions.iter().map(String::as_str).collect(),
+    let tags = Run::new("git").args(["tag", "--list", "wire-*", "v*"]).text()?;
+    let mut revisions: Vec<String> = match revisions {
+        [] => tags.lines().map(str::to_owned).collect(),
+        revisions => revisions.to_vec(),
     };
-    ensure!(!revisions.is_empty(), "there is no tag wire-N here: name a revision");
+    if revisions.is_empty() {
+        let today = Run::new("git").args(["log", "-1", "--format=%cd", "--date=short"]).text()?;
+        let before = format!("--before={}T00:00:00Z", today.trim());
+        revisions.push(Run::new("git").args(["rev-list", "-1", &before, "HEAD"]).text()?.trim().to_owned());
+    }
     binaries::build(&demo::PROGRAMS)?;
-    for revision in revisions {
-        let commit =
-            Run::new("git").args(["rev-parse", "--verify", "--short", &format!("{revision}^{{commit}}")]).text()?;
-        let folder = workspace::target().join("versions").join(commit.trim());
-        let (tree, build) = (folder.join("tree"), folder.join("build"));
-        if !tree.join(".git").exists() {
-            let clone = Run::new("git").args(["clone", "--quiet", "--shared", "--no-checkout", "."]);
-            clone.args([tree.as_os_str()]).text()?;
-        }
-        Run::new("git").within(&tree).args(["checkout", "--quiet", "--detach", commit.trim()]).text()?;
-        let cargo = binaries::debug_build(&demo::PROGRAMS).within(&tree);
-        cargo.env("CARGO_TARGET_DIR", &build.to_string_lossy()).stream()?;
-        both_ways(&build.join("debug"), revision)?;
+    for revision in &revisions {
+        let theirs = build_of(revision)?;
+        both_ways(&theirs, revision)?;
+        println!("== a fleet of {revision} becomes one of this version, and goes back");
+        upgrade::there_and_back(&theirs, &workspace::target().join("debug"))?;
     }
     Ok(())
+}
+
+/// Builds a revision; the folder of its programs.
+fn build_of(revision: &str) -> Result<PathBuf> {
+    let revision = format!("{revision}^{{commit}}");
+    let commit = Run::new("git").args(["rev-parse", "--verify", "--short", &revision]).text()?;
+    let folder = workspace::target().join("versions").join(commit.trim());
+    let tree = folder.join("tree");
+    if !tree.join(".git").exists() {
+        let clone = Run::new("git").args(["clone", "--quiet", "--shared", "--no-checkout", "."]);
+        clone.args([tree.as_os_str()]).text()?;
+    }
+    Run::new("git").within(&tree).args(["checkout", "--quiet", "--detach", commit.trim()]).text()?;
+    binaries::of_another_tree(binaries::debug_build(&demo::PROGRAMS), &folder)?.stream()?;
+    Ok(folder.join("debug"))
 }
 
 fn both_ways(theirs: &Path, name: &str) -> Result<()> {

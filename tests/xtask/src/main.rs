@@ -42,6 +42,7 @@ mod runner;
 mod sanitize;
 mod security;
 mod source;
+mod upgrade;
 mod workspace;
 
 #[derive(Parser)]
@@ -145,9 +146,9 @@ enum Task {
     Security(security::Security),
     /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
     Faults(firmware::Faults),
-    /// Runs the demonstration between this version and builds of earlier ones, either way round.
+    /// Runs the demonstration between this version and builds of earlier ones, either way round, and has a fleet in motion change over.
     Versions {
-        /// Commits or tags; each tag `wire-N` if not given.
+        /// Commits or tags; each tag `wire-N` and `v*` if not given, or else the last commit of the day before.
         #[arg(value_name = "REVISION")]
         revisions: Vec<String>,
     },
