@@ -89,7 +89,13 @@ fn a_manager_that_takes_over_gets_the_vehicle_and_the_other_one_steps_down() {
 fn what_a_vehicle_has_obeyed_outlives_it_and_a_lost_claim_locks_no_manager_out() {
     let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
     let board = folder.path().join("board");
-    let [kept, lost] = ["kept", "lost"].map(|name| folder.path().join(name));
+    let [kept, lost, copy] = ["kept", "lost", "copy"].map(|name| folder.path().join(name));
+    let copied = |from: &Path, to: &Path| {
+        std::fs::create_dir_all(to).unwrap();
+        for file in std::fs::read_dir(from).unwrap().map(Result::unwrap) {
+            std::fs::copy(file.path(), to.join(file.file_name())).unwrap();
+        }
+    };
     let mut obeyed = Claim::NONE;
     for life in 1..4 {
         let manager = manager(fleet, &kept, false);
@@ -98,6 +104,9 @@ fn what_a_vehicle_has_obeyed_outlives_it_and_a_lost_claim_locks_no_manager_out()
         move_it(&manager);
         obeyed = manager.claim();
         assert_eq!((obeyed.term, agv.claim()), (life, obeyed));
+        if life == 1 {
+            copied(&board, &copy);
+        }
     }
     let agv = vehicle(fleet, &board);
     assert_eq!(agv.claim(), obeyed, "stored across its lives");
@@ -108,6 +117,13 @@ fn what_a_vehicle_has_obeyed_outlives_it_and_a_lost_claim_locks_no_manager_out()
     until("it has raised its claim", || manager.claim().term == 4);
     until("it has joined", || manager.number_of_s_units() == 1 && agv.claim() == manager.claim());
     move_it(&manager);
+    // From a copy of its folder it starts with what it obeyed then, and obeys the one that commands.
+    drop(agv);
+    copied(&copy, &board);
+    let agv = vehicle(fleet, &board);
+    assert_eq!(agv.claim().term, 1);
+    move_it(&manager);
+    assert_eq!((agv.claim().term, agv.claim()), (4, manager.claim()));
 }
 
 /// Its manager cannot raise its claim, which cannot be stored, and shows whom the vehicle is under.
