@@ -6,8 +6,8 @@ use anyhow::{Result, bail};
 
 use crate::command::Run;
 use crate::{
-    bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, later, layers,
-    licences, links, manifests, msrv, names, orders, packages, panic_free, paper, planted, release, security,
+    alerts, bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, later,
+    layers, licences, links, manifests, msrv, names, orders, packages, panic_free, paper, planted, release, security,
     workspace,
 };
 
@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 39] = [
+pub(crate) const GROUPS: [Group; 40] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -303,6 +303,15 @@ pub(crate) const GROUPS: [Group; 39] = [
         by_default: false,
         waits: false,
         run: |_| needing(install::program("python3", "python3"), recordings),
+    },
+    Group {
+        name: "alerts",
+        what: "Prometheus reads the alert rules and the dashboard: each rule fires for its cause; a manager is scraped, a vehicle goes",
+        budget: 120,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| needing(install::program("promtool", "prometheus"), alerts::check),
     },
     Group {
         name: "packages",

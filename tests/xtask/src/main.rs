@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 mod again;
+mod alerts;
 mod bad_input;
 mod bench;
 mod binaries;
