@@ -103,6 +103,9 @@ pub(crate) struct Owner<T: Send + 'static> {
 /// A unit that stops waits so long for the last lines of its audit log.
 #[cfg(feature = "control")]
 const LAST_LINES: std::time::Duration = std::time::Duration::from_secs(1);
+/// A standby looks so often whether the control socket of its host is free.
+#[cfg(feature = "control")]
+const BETWEEN_LOOKS: std::time::Duration = std::time::Duration::from_secs(1);
 /// One that takes over waits so long for the control socket of one on this host that steps down.
 #[cfg(feature = "control")]
 const STEPPING_DOWN: std::time::Duration = std::time::Duration::from_secs(3);
@@ -164,6 +167,27 @@ impl<T: Send + 'static> Owner<T> {
             let guest = Self::guest(self.engine.clone());
             *server = control::open(&self.control, self.audit.clone(), Handle::of(guest));
         }
+    }
+
+    /// Opens the socket of a standby once the manager on this host that has it is gone.
+    fn await_control(owner: Weak<Self>) -> Result<(), StartError> {
+        let thread = std::thread::Builder::new().name("cara-socket".into());
+        let wait = move || {
+            while let Some(owner) = owner.upgrade().filter(|owner| !owner.engine.is_stopping()) {
+                let (identity, fleet) = owner.engine.hub.lock().identity();
+                let is_free = || control::held(&owner.control, &identity, fleet).is_none();
+                if is_free() {
+                    owner.open_control();
+                    // Another standby may have been quicker.
+                    if lock(&owner.server).is_some() || is_free() {
+                        return;
+                    }
+                }
+                drop(owner);
+                std::thread::sleep(BETWEEN_LOOKS);
+            }
+        };
+        thread.spawn(wait).map(drop).map_err(|error| crate::error::system_refused(error).into())
     }
 }
 
@@ -232,6 +256,9 @@ impl<T: Send + 'static, R> Handle<T, R> {
                 wait_until(STEPPING_DOWN, || held().is_none());
             }
             self.owner.open_control();
+            if self.engine().claims.stands_by() && lock(&self.owner.server).is_none() && held().is_some() {
+                Owner::await_control(Arc::downgrade(&self.owner))?;
+            }
         }
         Ok(())
     }

@@ -55,7 +55,7 @@ impl HubCell {
         self.hub.node.constraints().message_size as usize
     }
 
-    pub(super) fn identity(&self) -> (Identity, Fleet) {
+    pub(crate) fn identity(&self) -> (Identity, Fleet) {
         (self.hub.node.identity().clone(), self.hub.node.fleet())
     }
 

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use cara_processes::network::Namespace;
-use cara_std::control::Control;
+use cara_std::control::{Client, Control};
 use cara_std::{
     BuildError, Claim, Constraints, Definition, Interfaces, ParametersView, Served, ServiceError, ServiceOptions,
     StartError, Unit, UnitEvent,
@@ -251,7 +251,9 @@ fn a_standby_needs_keys_and_starts_beside_a_manager() {
     let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
     let plain = system(fleet).control(Control::Off).insecure().standby().build();
     assert!(matches!(plain, Err(BuildError::StandbyWithoutKeys)), "{plain:?}");
-    let build = |name: &str| system(fleet).control(Control::Off).state_folder(folder.path().join(name));
+    let socket = folder.path().join("sockets/manager");
+    let build =
+        |name: &str| system(fleet).control(Control::Path(socket.clone())).state_folder(folder.path().join(name));
     let manager = build("manager").build().unwrap();
     manager.start().unwrap();
     let standby = build("standby").standby().build().unwrap();
@@ -268,4 +270,5 @@ fn a_standby_needs_keys_and_starts_beside_a_manager() {
     manager.stop();
     until("it commands", || !standby.is_standby());
     assert!(standby.claim() > claim, "it has heard that one's claim");
+    until("it has the control socket of this host", || Client::connect(&socket).is_ok());
 }
