@@ -16,10 +16,10 @@ const MECHANIC_AGAIN: Duration = Duration::from_secs(10);
 /// A reset that came to nothing is tried again.
 const RESET_AGAIN: Duration = Duration::from_secs(1);
 
-impl Manager {
+impl Manager<'_> {
     /// Stops all vehicles at the same time, whatever else is on its way to them.
     pub(super) fn stop_all(&self) {
-        let system = self.system.clone();
+        let system = self.post.system.clone();
         std::thread::spawn(move || {
             let began = Instant::now();
             let outcomes = system.call_all("stop", &Parameters::new()).wait();
@@ -35,7 +35,7 @@ impl Manager {
     /// Calls the mechanic to those with a fault, and lets those drive again that may.
     pub(super) fn care(&mut self) {
         let now = Instant::now();
-        for name in std::mem::take(&mut *self.desk.mended.lock().unwrap_or_else(PoisonError::into_inner)) {
+        for name in std::mem::take(&mut *self.post.desk.mended.lock().unwrap_or_else(PoisonError::into_inner)) {
             if let Some(vehicle) = self.vehicles.iter_mut().find(|vehicle| vehicle.name == name) {
                 vehicle.reset = Some(true);
             }
@@ -43,7 +43,7 @@ impl Manager {
         for vehicle in self.vehicles.iter_mut().filter(|vehicle| vehicle.is_faulty()) {
             if vehicle.mechanic.is_none_or(|called| now.saturating_duration_since(called) > MECHANIC_AGAIN) {
                 vehicle.mechanic = Some(now);
-                let (system, name) = (self.system.clone(), vehicle.name.clone());
+                let (system, name) = (self.post.system.clone(), vehicle.name.clone());
                 std::thread::spawn(move || call_mechanic(&system, &name));
             }
         }

@@ -6,6 +6,8 @@
 //!
 //! Its loop beats a heart, on which all motions depend: when the loop hangs, all vehicles stop.
 //!
+//! With `--standby` it waits until no other manager commands, and waits again when one with a higher claim is there.
+//!
 //! | line of its input | does |
 //! |---|---|
 //! | `stop-all`, `go-on` | stops all vehicles; lets those drive again that were stopped |
@@ -21,7 +23,7 @@ mod traffic;
 use std::io::BufRead;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -30,8 +32,9 @@ use cara_std::{CallError, CommunicationSystem, Error, Heart, Identity, LinkCount
 
 use crate::book::{Book, BookError};
 use crate::files::{MapFiles, read};
+use crate::map::Map;
 use crate::network::{MANAGER, MOST_VEHICLES, Network, vehicle_id, vehicle_name};
-use crate::orders;
+use crate::orders::{self, Order};
 use cara_apps::warehouse::{FAULT, Floor, FloorServer, refusal};
 use driver::{Answer, Command, Outcome};
 use jobs::Jobs;
@@ -69,6 +72,9 @@ pub struct Options {
     /// Take over from the manager that runs.
     #[arg(long)]
     take_over: bool,
+    /// Wait until no manager commands; two of these are one manager that outlives a host.
+    #[arg(long, conflicts_with = "take_over")]
+    standby: bool,
 }
 
 /// What the manager's services get.
@@ -83,38 +89,65 @@ impl Floor for Desk {
     }
 }
 
-struct Manager {
+/// What outlives a term of a standby.
+struct Post {
     system: CommunicationSystem<Desk>,
     desk: Desk,
+    map: Map,
+    orders: Vec<Order>,
+    began: Instant,
+    commands: Receiver<String>,
+    events: Receiver<UnitEvent>,
+}
+
+/// A manager that commands, for one term.
+struct Manager<'p> {
+    post: &'p Post,
     vehicles: Vec<Known>,
     traffic: Traffic,
     jobs: Jobs,
     book: Book,
     outcomes: Receiver<Outcome>,
-    commands: Receiver<String>,
-    events: Receiver<UnitEvent>,
     heart: Heart,
-    began: Instant,
+    /// It commands since then, or will when it knows where all vehicles are.
+    since: Instant,
     /// All are stopped: none is sent anywhere.
     halted: bool,
     commanding: bool,
     last_reset: Instant,
 }
 
-/// Runs until standard input ends; or, with an exit code of its own, until another manager has taken over.
-pub fn run(options: &Options) -> Result<ExitCode> {
-    let ended = Manager::start(options).and_then(Manager::command_all);
-    match ended {
-        Err(error) if matches!(error.downcast_ref(), Some(BookError::Fenced(_))) => {
-            println!("fenced: {error}");
-            Ok(ExitCode::from(StartError::FENCED_EXIT))
-        }
-        ended => ended.map(|()| ExitCode::SUCCESS),
-    }
+/// Why a term is over.
+enum Over {
+    /// Standard input has ended.
+    Asked,
+    /// This standby stands by again.
+    StandsBy,
 }
 
-impl Manager {
-    fn start(options: &Options) -> Result<Self> {
+/// Runs until standard input ends; or, with an exit code of its own, until another manager has taken over.
+pub fn run(options: &Options) -> Result<ExitCode> {
+    let post = Post::open(options)?;
+    while post.awaits_command() {
+        let ended = Manager::start(&post, options).and_then(Manager::command_all);
+        match ended {
+            Ok(Over::Asked) => break,
+            Ok(Over::StandsBy) => println!("stands-by"),
+            Err(error) if !matches!(error.downcast_ref(), Some(BookError::Fenced(_))) => return Err(error),
+            // The book knew first. The unit hears the other manager soon, or raises its claim above one that is gone.
+            Err(_) if options.standby && post.rests() => {}
+            Err(_) if options.standby => break,
+            Err(error) => {
+                println!("fenced: {error}");
+                return Ok(ExitCode::from(StartError::FENCED_EXIT));
+            }
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+impl Post {
+    fn open(options: &Options) -> Result<Self> {
         let map = options.files.map()?;
         let orders = orders::parse(&options.orders.to_string_lossy(), &read(&options.orders)?, &map)?;
         let began =
@@ -122,12 +155,39 @@ impl Manager {
         let desk = Desk::default();
         let builder = options.network.place(CommunicationSystem::builder(MANAGER.0, MANAGER.1)?);
         let builder = builder.state_folder(&options.state).take_over(options.take_over);
+        let builder = if options.standby { builder.standby() } else { builder };
         let system = builder.state(desk.clone()).build()?;
         system.my_function_list().serve(FloorServer)?;
         system.publish_my_function_list()?;
         let events = system.events();
         system.start()?;
-        let (book, mut written) = Book::open(&options.book, system.claim().term)?;
+        let (lines, commands) = channel();
+        std::thread::spawn(move || hear(&lines));
+        Ok(Self { system, desk, map, orders, began, commands, events })
+    }
+
+    /// Waits until this manager commands, which only a standby does not at once; `false` where standard input has ended.
+    fn awaits_command(&self) -> bool {
+        while self.system.is_standby() {
+            if !self.rests() {
+                return false;
+            }
+            self.events.try_iter().for_each(drop);
+        }
+        true
+    }
+
+    /// For a turn; `false` where standard input has ended. What is said to one that rests is for the one that commands.
+    fn rests(&self) -> bool {
+        !matches!(self.commands.recv_timeout(TURN), Err(RecvTimeoutError::Disconnected))
+    }
+}
+
+impl<'p> Manager<'p> {
+    fn start(post: &'p Post, options: &Options) -> Result<Self> {
+        let system = &post.system;
+        let term = system.claim().term;
+        let (book, mut written) = Book::open(&options.book, term)?;
         let heart = system.heart(HEART);
         let (sender, outcomes) = channel();
         let mut vehicles = Vec::new();
@@ -139,55 +199,42 @@ impl Manager {
             let commands = driver::start(vehicles.len(), peer.clone(), heart.renew(), sender.clone());
             vehicles.push(Known::new(name, peer, cells, commands));
         }
-        let (lines, commands) = channel();
-        std::thread::spawn(move || hear(&lines));
-        println!("up with term {}", system.claim().term);
-        let (traffic, jobs) = (Traffic::new(map), Jobs::new(orders, written));
-        let (halted, commanding, last_reset) = (false, false, began);
-        Ok(Self {
-            system,
-            desk,
-            vehicles,
-            traffic,
-            jobs,
-            book,
-            outcomes,
-            commands,
-            events,
-            heart,
-            began,
-            halted,
-            commanding,
-            last_reset,
-        })
+        println!("up with term {term}");
+        let (traffic, jobs) = (Traffic::new(post.map.clone()), Jobs::new(post.orders.clone(), written));
+        let (halted, commanding, since) = (false, false, Instant::now());
+        let last_reset = since;
+        Ok(Self { post, vehicles, traffic, jobs, book, outcomes, heart, since, halted, commanding, last_reset })
     }
 
-    /// The loop, until standard input ends.
-    fn command_all(mut self) -> Result<()> {
+    /// The loop, until standard input ends or this standby stands by again.
+    fn command_all(mut self) -> Result<Over> {
         let mut reported = Instant::now();
         loop {
             let turn = Instant::now();
-            if !self.turn()? {
-                return Ok(());
+            if let Some(over) = self.turn()? {
+                return Ok(over);
             }
             if reported.elapsed() >= Duration::from_secs(1) {
                 reported = Instant::now();
                 let counters = [LinkCounter::MessagesSent, LinkCounter::DatagramsSent];
-                let [messages, datagrams] = counters.map(|counter| self.system.counted(counter));
+                let [messages, datagrams] = counters.map(|counter| self.post.system.counted(counter));
                 println!("sent {messages} {datagrams}");
             }
             std::thread::sleep(TURN.saturating_sub(turn.elapsed()));
         }
     }
 
-    /// A turn of the loop; `false` at the end.
-    fn turn(&mut self) -> Result<bool> {
+    /// A turn of the loop; at the end, why it is over.
+    fn turn(&mut self) -> Result<Option<Over>> {
+        if self.post.system.is_standby() {
+            return Ok(Some(Over::StandsBy));
+        }
         self.heart.beat();
         loop {
-            match self.commands.try_recv() {
+            match self.post.commands.try_recv() {
                 Ok(line) => self.command(&line),
                 Err(std::sync::mpsc::TryRecvError::Empty) => break,
-                Err(std::sync::mpsc::TryRecvError::Disconnected) => return Ok(false),
+                Err(std::sync::mpsc::TryRecvError::Disconnected) => return Ok(Some(Over::Asked)),
             }
         }
         self.hear_events()?;
@@ -198,11 +245,11 @@ impl Manager {
         self.vehicles.iter_mut().for_each(|vehicle| vehicle.look(now));
         self.care();
         if !self.halted && self.is_commanding() {
-            self.jobs.assign(&mut self.vehicles, &self.traffic.map, self.began.elapsed());
+            self.jobs.assign(&mut self.vehicles, &self.traffic.map, self.post.began.elapsed());
             self.work()?;
             self.send_on()?;
         }
-        Ok(true)
+        Ok(None)
     }
 
     /// Whether the cells of all vehicles are known: each has been heard, or, some time after the start, stands in the book.
@@ -210,7 +257,7 @@ impl Manager {
         if !self.commanding {
             let heard = |vehicle: &Known| !matches!(vehicle.state, State::Lost(_) | State::Asked);
             let all_heard = self.vehicles.iter().all(heard);
-            let is_late = std::time::Duration::from(self.system.uptime()) > GATHERING;
+            let is_late = self.since.elapsed() > GATHERING;
             self.commanding = all_heard || is_late && self.vehicles.iter().all(|vehicle| vehicle.cells.is_some());
             if self.commanding {
                 println!("commands");
@@ -220,7 +267,7 @@ impl Manager {
     }
 
     fn hear_events(&mut self) -> Result<()> {
-        while let Ok(event) = self.events.try_recv() {
+        while let Ok(event) = self.post.events.try_recv() {
             match event {
                 UnitEvent::Fenced { claim } => return Err(BookError::Fenced(claim.term).into()),
                 UnitEvent::Inhibited { peer, latch, .. } => {

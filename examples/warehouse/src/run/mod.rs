@@ -20,7 +20,6 @@ use crate::network::{MOST_VEHICLES, vehicle_name};
 use crate::orders::{self, Order};
 use board::{Board, BoardOptions};
 use report::Tally;
-use rustix::process::Signal;
 use stage::{Heard, Stage};
 use truth::Truth;
 
@@ -62,6 +61,9 @@ pub struct Options {
     /// Starts, charges, drawn orders and faults are the same for a seed; what time does is not.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Two managers stand by for each other: where one is killed the other commands.
+    #[arg(long)]
+    standby: bool,
     /// Breaks nothing.
     #[arg(long)]
     no_faults: bool,
@@ -106,13 +108,14 @@ pub fn run(options: &Options) -> Result<ExitCode> {
     let span = options.minutes.map_or(SHORT, |minutes| Duration::from_secs(60 * u64::from(minutes)));
     let orders = take_orders(options, &files, &map, span)?;
     let mut run = Run {
-        stage: Stage::new(files, &orders, options.vehicles, board, options.seed)?,
+        stage: Stage::new(files, &orders, options.vehicles, board, options.standby, options.seed)?,
         truth: Truth::new(&map, &orders),
         tally: Tally { orders: orders.len(), ..Tally::default() },
         due: Vec::new(),
         rng: fastrand::Rng::with_seed(options.seed),
         commanding: false,
         old_manager: None,
+        killed: None,
         frozen: false,
         looked: Instant::now(),
         progress: Instant::now(),
@@ -127,7 +130,7 @@ pub fn run(options: &Options) -> Result<ExitCode> {
     run.end();
     let Run { tally, mut truth, .. } = run;
     truth.finish();
-    let passed = report::print(&tally, &truth, board_name.as_deref(), !options.no_faults);
+    let passed = report::print(&tally, &truth, board_name.as_deref(), !options.no_faults, options.standby);
     Ok(if passed { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
@@ -169,6 +172,8 @@ struct Run<'m> {
     commanding: bool,
     /// The manager that another one takes over from.
     old_manager: Option<usize>,
+    /// When the manager was killed, until a vehicle drives for its standby.
+    killed: Option<Instant>,
     /// It hangs.
     frozen: bool,
     looked: Instant,
@@ -229,7 +234,16 @@ impl Run<'_> {
 
     fn manager_says(&mut self, number: usize, line: &str) -> Result<()> {
         match line.split(' ').collect::<Vec<_>>()[..] {
-            ["call", word, micros] => self.tally.calls.push((word.to_owned(), Duration::from_micros(micros.parse()?))),
+            ["call", word, micros] => {
+                self.tally.calls.push((word.to_owned(), Duration::from_micros(micros.parse()?)));
+                if word == "advance" && self.commanding && self.stage.has_standby() {
+                    self.tally.standby.extend(self.killed.take().map(|killed| killed.elapsed()));
+                }
+            }
+            ["up", ..] if self.stage.has_standby() && self.stage.commands(number) => {
+                self.commanding = false;
+                self.stage.show("the standby commands");
+            }
             ["failed", ..] => self.tally.failed_calls += 1,
             ["commands"] if self.stage.is_manager(number) => {
                 self.commanding = true;
@@ -257,7 +271,7 @@ impl Run<'_> {
                 self.stage.show("the other manager has taken over; the first one has stepped down");
             }
             ["is", ..] => println!("          {line}"),
-            ["up", ..] | ["commands"] | ["done", _] | ["mechanic", ..] => {}
+            ["up", ..] | ["stands-by"] | ["commands"] | ["done", _] | ["mechanic", ..] => {}
             _ => self.tally.wrong.push(format!("the manager says `{line}`")),
         }
         Ok(())
@@ -296,13 +310,19 @@ impl Run<'_> {
                 None
             }
             Due::ThawManager => {
-                self.stage.signal_manager(Signal::CONT)?;
+                self.stage.thaw_managers()?;
                 self.frozen = false;
                 self.tally.freezes += 1;
                 None
             }
+            // Only once its standby does what it did.
+            Due::StartManager if self.stage.has_standby() && !self.commanding => Some((AGAIN, due)),
             Due::StartManager => {
-                self.stage.start_manager(false)?;
+                if self.stage.has_standby() {
+                    self.stage.start_standby()?;
+                } else {
+                    self.stage.start_manager(false)?;
+                }
                 self.tally.kills += 1;
                 None
             }
@@ -341,21 +361,23 @@ impl Run<'_> {
             }
             Fault::FreezeManager => {
                 self.stage.show("the manager hangs");
-                self.stage.signal_manager(Signal::STOP)?;
+                self.stage.freeze_manager()?;
                 self.frozen = true;
                 Some((FROZEN, Due::ThawManager))
             }
-            Fault::KillManager => {
-                self.stage.show("the manager is killed");
-                self.stage.kill_manager()?;
-                self.commanding = false;
-                Some((AWAY, Due::StartManager))
-            }
-            Fault::TakeOver => {
+            Fault::TakeOver if !self.stage.has_standby() => {
                 self.stage.show("another manager takes over");
                 self.old_manager = Some(self.stage.start_manager(true)?);
                 self.commanding = false;
                 None
+            }
+            // A standby takes nothing over from a live manager.
+            Fault::KillManager | Fault::TakeOver => {
+                self.stage.show("the manager is killed");
+                self.stage.kill_manager()?;
+                self.commanding = false;
+                self.killed = Some(Instant::now());
+                Some((AWAY, Due::StartManager))
             }
         })
     }

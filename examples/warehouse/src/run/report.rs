@@ -14,6 +14,8 @@ pub(super) struct Tally {
     pub(super) freezes: usize,
     pub(super) kills: usize,
     pub(super) take_overs: usize,
+    /// With a standby: after each kill, until a vehicle drove again.
+    pub(super) standby: Vec<Duration>,
     /// Vehicles that were mended by the mechanic.
     pub(super) mended: usize,
     /// Of each stop-all: how many acknowledged it, of how many, and when the last one had.
@@ -34,7 +36,13 @@ const STOPS: usize = 20;
 const RESTARTS: usize = 5;
 
 /// Prints all; whether the run was as it has to be.
-pub(super) fn print(tally: &Tally, truth: &Truth<'_>, board: Option<&str>, with_faults: bool) -> bool {
+pub(super) fn print(
+    tally: &Tally,
+    truth: &Truth<'_>,
+    board: Option<&str>,
+    with_faults: bool,
+    with_standby: bool,
+) -> bool {
     figures(tally, truth);
     let mut passed = true;
     let mut require = |what: &str, is_so: bool| {
@@ -59,7 +67,15 @@ pub(super) fn print(tally: &Tally, truth: &Truth<'_>, board: Option<&str>, with_
         require(&format!("at least {RESTARTS} restarts of vehicles: {}", truth.restarts), truth.restarts >= RESTARTS);
         require(&format!("the manager hung for a while: {}", tally.freezes), tally.freezes > 0);
         require(&format!("the manager was killed and came back: {}", tally.kills), tally.kills > 0);
-        require(&format!("another manager took over: {}", tally.take_overs), tally.take_overs > 0);
+        if with_standby {
+            let (took, kills) = (&tally.standby, tally.kills);
+            require(
+                &format!("after each of {kills} kills vehicles drove for the standby: {took:.1?}"),
+                took.len() == kills,
+            );
+        } else {
+            require(&format!("another manager took over: {}", tally.take_overs), tally.take_overs > 0);
+        }
         require(&format!("the mechanic mended a vehicle: {}", tally.mended), tally.mended > 0);
         let all = tally.stopped_all.iter().all(|(stopped, asked, _)| stopped == asked);
         require(&format!("each stop-all was acknowledged by all that were there: {}", tally.stopped_all.len()), all);

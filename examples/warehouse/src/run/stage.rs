@@ -48,6 +48,8 @@ pub(super) struct Stage {
     vehicles: u32,
     /// The last of them, if it is one.
     board: Option<Board>,
+    /// Two managers stand by for each other.
+    standby: bool,
     seed: u64,
     began: Instant,
     sender: Sender<Said>,
@@ -70,6 +72,7 @@ impl Stage {
         orders: &[Order],
         vehicles: u32,
         board: Option<Board>,
+        standby: bool,
         seed: u64,
     ) -> Result<Self> {
         let folder = tempfile::tempdir()?;
@@ -86,6 +89,7 @@ impl Stage {
             network,
             vehicles,
             board,
+            standby,
             seed,
             began,
             sender,
@@ -122,6 +126,9 @@ impl Stage {
         }
         self.start(Role::Mechanic, &["mechanic".to_owned(), "--fleet".to_owned(), self.network.fleet.to_string()])?;
         self.start_manager(false)?;
+        if self.standby {
+            self.start_standby()?;
+        }
         let (fleet, map) = (self.network.fleet, self.files.map.display());
         self.show(&format!("to watch: cara web --unit {}/{} --fleet {fleet} --background {map}", MANAGER.0, MANAGER.1));
         Ok(())
@@ -138,11 +145,27 @@ impl Stage {
         [role, "--fleet", &fleet, "--map", &map, "--stations", &stations].map(str::to_owned).to_vec()
     }
 
+    /// Whether two managers stand by for each other.
+    pub(super) const fn has_standby(&self) -> bool {
+        self.standby
+    }
+
     /// Starts a manager, which commands from now on; the number of the one before.
     pub(super) fn start_manager(&mut self, take_over: bool) -> Result<usize> {
+        let number = self.start_another(take_over)?;
+        Ok(std::mem::replace(&mut self.manager, number))
+    }
+
+    /// Starts a manager beside the one that commands.
+    pub(super) fn start_standby(&mut self) -> Result<usize> {
+        self.start_another(false)
+    }
+
+    fn start_another(&mut self, take_over: bool) -> Result<usize> {
         let mut arguments = self.arguments("manager");
-        // One that takes over is on another host: what it shares with the first one is the book.
-        let state = if take_over { format!("state-{}", self.children.len()) } else { self.state() };
+        // One that takes over, or stands by, is on another host: what it shares with the first one is the book.
+        let is_elsewhere = take_over || self.standby;
+        let state = if is_elsewhere { format!("state-{}", self.children.len()) } else { self.state() };
         let path = |name: &str| self.folder.path().join(name).to_string_lossy().into_owned();
         let options = [
             ("--orders", path("orders")),
@@ -158,10 +181,17 @@ impl Stage {
         if take_over {
             arguments.push("--take-over".to_owned());
         }
-        let before = self.manager;
-        self.manager = self.start(Role::Manager, &arguments)?;
+        if self.standby {
+            arguments.push("--standby".to_owned());
+        }
+        let number = self.start(Role::Manager, &arguments)?;
         std::fs::write(self.folder.path().join("newest-state"), &state)?;
-        Ok(before)
+        Ok(number)
+    }
+
+    /// A manager that has stood by commands from now on; `false` where it did already.
+    pub(super) const fn commands(&mut self, number: usize) -> bool {
+        std::mem::replace(&mut self.manager, number) != number
     }
 
     /// Where the manager that commanded last keeps its term.
@@ -208,8 +238,15 @@ impl Stage {
         Ok(())
     }
 
-    pub(super) fn signal_manager(&mut self, signal: Signal) -> Result<()> {
-        self.children[self.manager].signal(signal)
+    /// Has the manager that commands hang.
+    pub(super) fn freeze_manager(&mut self) -> Result<()> {
+        self.children[self.manager].signal(Signal::STOP)
+    }
+
+    /// Lets a manager go on that hangs, also where its standby commands by now.
+    pub(super) fn thaw_managers(&self) -> Result<()> {
+        let mut managers = self.running.iter().filter(|number| self.roles[**number] == Role::Manager);
+        managers.try_for_each(|number| self.children[*number].signal(Signal::CONT))
     }
 
     pub(super) fn kill_manager(&mut self) -> Result<()> {

@@ -26,6 +26,9 @@ pub(crate) struct Options {
     /// Starts, charges, orders and faults are the same for a seed.
     #[arg(long, requires = "warehouse")]
     seed: Option<u64>,
+    /// Two managers stand by for each other.
+    #[arg(long, requires = "warehouse")]
+    standby: bool,
     /// The last vehicle is firmware in QEMU.
     #[arg(long, requires = "warehouse")]
     board: bool,
@@ -39,7 +42,8 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
         ("--seed", options.seed),
     ];
     let given = numbers.iter().filter_map(|(name, number)| Some([(*name).to_owned(), (*number)?.to_string()]));
-    let given: Vec<String> = given.flatten().collect();
+    let standby = options.standby.then(|| "--standby".to_owned());
+    let given: Vec<String> = given.flatten().chain(standby).collect();
     let code = if options.board {
         with_board(&given)?
     } else {
