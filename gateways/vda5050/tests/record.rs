@@ -143,6 +143,21 @@ fn killed_at_each_write_the_gateway_goes_on_with_the_same_ids_and_states() {
     }
 }
 
+/// What the vehicle was told after the copy it would not do a second time, so the gateway counts on above it.
+#[test]
+fn with_a_record_from_a_copy_no_number_is_used_again() {
+    let mut vehicle = Fake::at("a");
+    (vehicle.status.drive, vehicle.status.action) = (7, 9);
+    let copy = Record { number: 3, order_id: "o0".into(), ..Record::default() };
+    let mut driver = Driver::new(Machine::new(copy, policy(), Duration::ZERO), &mut vehicle, Store::nowhere());
+    driver.machine.broker(true, Duration::ZERO);
+    driver.turn(Duration::from_secs(1)).unwrap();
+    assert_eq!(driver.machine.record().number, 9);
+    driver.machine.order(order("o1", 0, 0, "a! b!"));
+    (2..4).for_each(|second| driver.turn(Duration::from_secs(second)).unwrap());
+    assert_eq!(driver.machine.record().drive, Some(10));
+}
+
 #[test]
 fn a_damaged_record_is_not_overwritten() {
     let folder = tempfile::tempdir().unwrap();
