@@ -468,3 +468,40 @@ impl Receiver {
         Some(Frame { kind, credit: self.credit, number, sequence, acknowledged: self.expected, payload })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::arithmetic_side_effects)]
+    use super::*;
+
+    /// At each sequence number, with each number of frames on their way and behind them.
+    #[test]
+    fn an_acknowledgement_frees_what_was_sent_before_it_and_nothing_else() {
+        let mut sender = Sender::new();
+        let windows = (0..=LINE_WINDOW).flat_map(|filled| (0..=filled).map(move |fixed| (filled, fixed)));
+        for ((filled, fixed), base) in windows.flat_map(|window| (0..=u8::MAX).map(move |base| (window, base))) {
+            for expected in 0..=u8::MAX {
+                (sender.base, sender.sent, sender.fixed, sender.filled) = (base, fixed, fixed, filled);
+                let frees =
+                    (0..=fixed).find(|count| (u16::from(base) + u16::from(*count)) % 256 == u16::from(expected));
+                assert_eq!(sender.acknowledged(expected, 3), frees.is_some_and(|count| count > 0));
+                let count = frees.unwrap_or(0);
+                let left = (sender.base.wrapping_sub(base), sender.sent, sender.fixed, sender.filled);
+                assert_eq!(left, (count, fixed - count, fixed - count, filled - count), "{base}: {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn only_the_frame_that_is_expected_is_taken_and_only_one_of_the_window_is_missed() {
+        let mut receiver = Receiver::new();
+        for (expected, sequence) in (0..=u8::MAX).flat_map(|a| (0..=u8::MAX).map(move |b| (a, b))) {
+            receiver.bytes.clear();
+            (receiver.expected, receiver.is_missing, receiver.must_ask) = (expected, false, false);
+            receiver.receive(sequence, b"x");
+            let ahead = (256 + u16::from(sequence) - u16::from(expected)) % 256;
+            assert_eq!((receiver.bytes.len(), receiver.expected != expected), (usize::from(ahead == 0), ahead == 0));
+            assert_eq!(receiver.must_ask, ahead > 0 && ahead < u16::from(LINE_WINDOW), "{expected}: {sequence}");
+        }
+    }
+}

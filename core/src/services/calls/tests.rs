@@ -70,6 +70,31 @@ proptest! {
     }
 }
 
+/// All of them over twice the width of a window, at both ends of the range of ids.
+#[test]
+fn any_three_ids_are_new_or_known_or_too_old_as_a_set_says() {
+    let wide = 2 * WINDOW + 2;
+    for base in [0, u32::MAX - wide] {
+        for (a, b) in (1..=wide).flat_map(|a| (1..=wide).map(move |b| (a, b))) {
+            let mut two = Window::default();
+            assert_eq!(two.note(base + a), Seen::Never);
+            let second = two.note(base + b);
+            let newest = a.max(b);
+            let expected = |id: u32, is_known: bool| match id {
+                id if id + WINDOW <= newest => Seen::TooOld,
+                _ if is_known => Seen::Before,
+                _ => Seen::Never,
+            };
+            assert_eq!(second, expected(b, a == b), "{base}: {a}, {b}");
+            for id in 1..=wide {
+                let expected = expected(id, id == a || id == b);
+                assert_eq!(two.knows(base + id), expected != Seen::Never, "{base}: {a}, {b}, {id}");
+                assert_eq!({ two }.note(base + id), expected, "{base}: {a}, {b}, {id}");
+            }
+        }
+    }
+}
+
 #[test]
 fn a_window_knows_what_it_has_noted_and_what_is_too_old() {
     let mut window = Window::default();

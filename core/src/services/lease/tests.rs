@@ -120,6 +120,26 @@ fn a_lease_lives_until_its_end_and_not_longer() {
     assert!(!lease.is_live(START));
 }
 
+/// Each millisecond around the points where 32 bits of milliseconds change their sign or wrap, and microseconds of all kinds.
+#[test]
+fn a_lease_lasts_equally_long_at_every_point_of_its_clock() {
+    let starts = [1 << 31, 1 << 32, 3 << 31, 1 << 40].into_iter().flat_map(|base| base - 10..=base + 10);
+    for (start, length) in starts.flat_map(|start: u64| (2..=12).map(move |length| (start, length))) {
+        for rest in [0, 1, 999] {
+            let (from, end) = (at(start * 1_000), at((start + length) * 1_000 + rest));
+            let seen_end = Lease::seen_end(end);
+            assert!(seen_end <= end && seen_end + Duration::from_millis(2) > end, "{end:?} is seen as {seen_end:?}");
+            let lease = Lease::new();
+            let order = lease.begin(from, end).unwrap();
+            for now in (start * 1_000..=(start + length) * 1_000 + rest).step_by(333).map(at) {
+                assert_eq!(lease.lasts_beyond(now), now < seen_end, "{start} + {length}, at {now:?}");
+                assert_eq!(lease.left(now), Some(seen_end.since(now)), "{start} + {length}, at {now:?}");
+                assert_eq!(lease.is_live_for(order, now), now < seen_end, "{start} + {length}, at {now:?}");
+            }
+        }
+    }
+}
+
 #[test]
 fn a_lease_survives_the_wrap_of_its_clock() {
     let wrap = u64::from(u32::MAX) * 1_000;
