@@ -381,10 +381,7 @@ impl<P: Port> Session<P> {
                 let block = result.map(|block| span.last(block.len()));
                 self.reply_arrived(cx, CallId(id), block)
             }
-            Some(Message::Failure(id, error)) if P::CALLS => {
-                self.calling.release_call(&mut self.wire, cx, CallId(id), None);
-                Some(Event::Failed(CallId(id), error))
-            }
+            Some(Message::Failure(id, error)) if P::CALLS => self.failure_arrived(cx, CallId(id), error),
             Some(Message::Sample(header, block)) if STREAMS && P::CALLS => {
                 let block = span.last(block.len());
                 StreamsPart::sample_arrived(&mut self.wire, cx.now, &header, block, lent)
@@ -418,7 +415,7 @@ impl<P: Port> Session<P> {
 
     fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Span, Error>) -> Option<Event> {
         let Some(pending) = self.calling.requests.close(id) else {
-            // The call has timed out or was cancelled, and its lease was released then. Late results are dropped.
+            // The call has timed out or was cancelled, and its lease was released then, or it was never made. Drop the results.
             self.wire.link.counters.count(LinkCounter::RepliesLate);
             return None;
         };
@@ -434,6 +431,15 @@ impl<P: Port> Session<P> {
                 Some(Event::Reply(id, Ok(Results { slot, generation, block, step: self.wire.step })))
             }
         }
+    }
+
+    /// A failure ends a request without a reply. A peer that sends one for a call that waits has answered it.
+    fn failure_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, error: Error) -> Option<Event> {
+        if self.calling.requests.waiting_for(id).is_some() || id > self.calling.requests.newest() {
+            return self.reply_arrived(cx, id, Err(error));
+        }
+        self.calling.release_call(&mut self.wire, cx, id, None);
+        Some(Event::Failed(id, error))
     }
 
     /// Processes the first item; returns how many bytes of items are left.

@@ -542,10 +542,7 @@ impl Unit {
             }
             Event::Failed(id, _) => {
                 let link = self.links[index].as_mut().expect("it is there");
-                // A peer may say so of a call that waits for its reply, too, which then runs out.
-                if link.asked.get(&id.0) == Some(&false) {
-                    link.asked.remove(&id.0);
-                }
+                assert_ne!(link.asked.remove(&id.0), Some(true), "a call that waits for its reply has another outcome");
             }
             Event::Closed(reason) => self.closed(index, reason),
             _ => {}

@@ -164,10 +164,11 @@ fn details_that_cannot_be_read_leave_the_code() {
     {
         let mut pair = with(GO);
         let error = Error::Service(ServiceError::Failed(7));
-        let message = [&encode_failure(5, error)[..], behind].concat();
+        let id = pair.manager.notify("go", &x(1)).unwrap();
+        let message = [&encode_failure(id.0, error)[..], behind].concat();
         pair.manager.hear_message(&message, Priority::Normal);
         pair.settle();
-        assert!(pair.manager.has(&Event::Failed(CallId(5), error)) && pair.manager.failures.is_empty());
+        assert!(pair.manager.has(&Event::Failed(id, error)) && pair.manager.failures.is_empty());
     }
 }
 

@@ -6,11 +6,12 @@ use super::setup::Setup;
 use super::side::context;
 use super::{none, parameters, text, x};
 use crate::config::{Constraints, EMERGENCY_BYTES, Priority};
-use crate::distribution::message::RequestHeader;
+use crate::distribution::message::{RequestHeader, encode_failure};
 use crate::distribution::parameters::Parameters;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::services::Context;
+use crate::services::requests::CallId;
 use crate::services::session::{Delivery, RequestOptions};
 use crate::time::Duration;
 use std::vec::Vec;
@@ -152,7 +153,7 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
     pair.settle();
     assert!(pair.agv.ran().is_empty());
     assert_eq!(pair.agv.counter(LinkCounter::RequestsRejected), 3);
-    assert_eq!(pair.manager.count(|event| matches!(event, Event::Failed(..))), 3);
+    assert_eq!(pair.manager.counter(LinkCounter::RepliesLate), 3, "its caller never made them");
 }
 
 #[test]
@@ -239,6 +240,29 @@ fn a_failing_service_says_why() {
     let id = pair.manager.notify("fail", &none()).unwrap();
     pair.settle();
     assert!(pair.manager.has(&Event::Failed(id, Error::Service(ServiceError::Failed(7)))));
+}
+
+#[test]
+fn a_failure_ends_the_call_that_it_names_and_no_other() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("wait()");
+    pair.publish();
+    let failed = Error::Service(ServiceError::Failed(3));
+    let fail = |pair: &mut Pair, id: u32| {
+        pair.manager.hear_message(&encode_failure(id, failed), Priority::Normal);
+        pair.settle();
+    };
+    let [first, second] = [(); 2].map(|()| pair.manager.call("wait", &none()).unwrap());
+    let never_made = second.0 + 1;
+    fail(&mut pair, never_made);
+    assert_eq!(pair.manager.session.calls_in_flight(), 2);
+    assert!(!pair.manager.has(&Event::Failed(CallId(never_made), failed)));
+    assert_eq!(pair.manager.counter(LinkCounter::RepliesLate), 1);
+    fail(&mut pair, second.0);
+    assert_eq!(pair.manager.outcome(second), Some(Err(failed)));
+    assert_eq!((pair.manager.outcome(first), pair.manager.session.calls_in_flight()), (None, 1));
+    let event = |event: &Event| matches!(event, Event::Failed(..));
+    assert_eq!(pair.manager.count(event), 0, "a call that waited has one outcome");
 }
 
 #[test]
