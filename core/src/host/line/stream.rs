@@ -476,6 +476,7 @@ mod tests {
 
     /// At each sequence number, with each number of frames on their way and behind them.
     #[test]
+    #[cfg_attr(miri, ignore = "so many cases take the interpreter hours")]
     fn an_acknowledgement_frees_what_was_sent_before_it_and_nothing_else() {
         let mut sender = Sender::new();
         let windows = (0..=LINE_WINDOW).flat_map(|filled| (0..=filled).map(move |fixed| (filled, fixed)));
@@ -493,6 +494,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "so many cases take the interpreter hours")]
     fn only_the_frame_that_is_expected_is_taken_and_only_one_of_the_window_is_missed() {
         let mut receiver = Receiver::new();
         for (expected, sequence) in (0..=u8::MAX).flat_map(|a| (0..=u8::MAX).map(move |b| (a, b))) {

@@ -72,6 +72,7 @@ proptest! {
 
 /// All of them over twice the width of a window, at both ends of the range of ids.
 #[test]
+#[cfg_attr(miri, ignore = "so many cases take the interpreter hours")]
 fn any_three_ids_are_new_or_known_or_too_old_as_a_set_says() {
     let wide = 2 * WINDOW + 2;
     for base in [0, u32::MAX - wide] {
