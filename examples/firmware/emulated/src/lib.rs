@@ -1,14 +1,18 @@
 //! What the boards that QEMU emulates have in common: settings from QEMU's arguments, a file of the host in place of flash, clock,
-//! executor, stack paint, access to registers, and services for tests. A board adds its controller, timers, pins and watchdog.
+//! executor, Ethernet driver, the AGV's image, stack paint, access to registers, and services for tests. A board adds its controller, timers, pins and watchdog.
 
 #![no_std]
 
+#[cfg(feature = "agv")]
+pub mod agv;
 pub mod arguments;
 #[cfg(feature = "secure")]
 mod boots;
 pub mod clock;
 #[cfg(feature = "faults")]
 pub mod creep;
+#[cfg(feature = "net")]
+pub mod ethernet;
 pub mod executor;
 #[cfg(feature = "faults")]
 pub mod faults;

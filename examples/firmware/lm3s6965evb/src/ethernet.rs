@@ -1,15 +1,13 @@
-//! embassy-net's driver for the Stellaris Ethernet controller: interrupt-driven, a frame at a time.
+//! The Stellaris Ethernet controller.
 //!
 //! Data sheet, Ethernet Controller: MAC registers at offset 0, FIFOs behind MACDATA, the PHY behind MACMCTL. The
 //! controller keeps up to 31 frames in 2 KiB of receive FIFO. The first word read of a frame has its length in the lower
 //! half (two bytes for itself and four of the checksum included) and the first two bytes of the frame in the upper one;
 //! the first word written of one has the length without the Ethernet header.
 
-use core::sync::atomic::{AtomicU32, Ordering};
-use core::task::Context;
+use core::ops::Range;
 
-use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
-use embassy_sync::waitqueue::AtomicWaker;
+use cara_emulated::ethernet::{self, Buffer, CHECKSUM_BYTES, Controller, FRAME_BYTES, WAKER};
 use lm3s6965::{Interrupt, interrupt};
 
 use crate::register::{ETHERNET, Register, SYSTEM, unmask};
@@ -54,35 +52,26 @@ const PHY_LINK_UP: u32 = 1 << 2;
 
 /// Most frames in the receive FIFO.
 const FRAMES: usize = 31;
-/// Longest frame without its checksum.
-const FRAME_BYTES: usize = 1514;
-/// Length word and header share the first word; the checksum follows the frame.
+/// The length word shares its first word with the frame's head.
 const LENGTH_BYTES: usize = 2;
-const CHECKSUM_BYTES: usize = 4;
 const HEADER_BYTES: usize = 14;
-const BUFFER_BYTES: usize = (LENGTH_BYTES + FRAME_BYTES + CHECKSUM_BYTES).next_multiple_of(4);
 
-static WAKER: AtomicWaker = AtomicWaker::new();
-static OVERRUNS: AtomicU32 = AtomicU32::new(0);
+/// The driver.
+pub type Ethernet = ethernet::Ethernet<Stellaris>;
 
-/// The controller. There is one.
-pub struct Ethernet {
-    address: [u8; 6],
-    received: [u8; BUFFER_BYTES],
-    sent: [u8; BUFFER_BYTES],
-}
+/// The controller.
+pub struct Stellaris;
 
-impl Ethernet {
-    /// A controller that has not been started.
-    pub const fn new() -> Self {
-        Self { address: [0; 6], received: [0; BUFFER_BYTES], sent: [0; BUFFER_BYTES] }
-    }
+impl Controller for Stellaris {
+    const HEAD: usize = LENGTH_BYTES;
+    const STATUS: Register = MACRIS;
+    const ENABLED: Register = MACIM;
+    const RECEIVED: u32 = RECEIVED;
+    const SENT: u32 = TRANSMIT_EMPTY | TRANSMIT_ERROR;
 
-    /// Starts it, with the MAC address that it holds (QEMU: `-nic …,mac=…`), which is returned.
-    pub fn start(&mut self) -> [u8; 6] {
+    fn start() -> [u8; 6] {
         RCGC2.set(RCGC2_MAC_AND_PHY);
         let ([a, b, c, d], [e, f, ..]) = (MACIA0.read().to_le_bytes(), MACIA1.read().to_le_bytes());
-        self.address = [a, b, c, d, e, f];
         MACIM.write(0);
         MACRIS.write(ALL_INTERRUPTS);
         MACTHR.write(WHEN_ASKED);
@@ -92,105 +81,41 @@ impl Ethernet {
         MACRCTL.write(REJECT_BAD_CHECKSUM | RECEIVE);
         MACIM.write(RECEIVED | OVERRUN);
         unmask(Interrupt::ETHERNET);
-        self.address
+        [a, b, c, d, e, f]
     }
 
-    /// Times that frames came faster than they were read.
-    pub fn overruns() -> u32 {
-        OVERRUNS.load(Ordering::Relaxed)
-    }
-}
-
-impl Default for Ethernet {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
-impl Driver for &mut Ethernet {
-    type RxToken<'a>
-        = Received<'a>
-    where
-        Self: 'a;
-    type TxToken<'a>
-        = Free<'a>
-    where
-        Self: 'a;
-
-    fn receive(&mut self, cx: &mut Context) -> Option<(Received<'_>, Free<'_>)> {
-        let ready = || MACNP.read() != 0 && is_free();
-        ready_or_armed(cx, RECEIVED | TRANSMIT_EMPTY, ready)
-            .then_some((Received { buffer: &mut self.received }, Free { buffer: &mut self.sent }))
-    }
-
-    fn transmit(&mut self, cx: &mut Context) -> Option<Free<'_>> {
-        ready_or_armed(cx, TRANSMIT_EMPTY | TRANSMIT_ERROR, is_free).then_some(Free { buffer: &mut self.sent })
-    }
-
-    fn link_state(&mut self, _: &mut Context) -> LinkState {
+    fn is_up() -> bool {
         // QEMU has no PHY: its registers read as zero, the identifier included.
-        let emulated = phy(PHY_IDENTIFIER) == 0;
-        if emulated || phy(PHY_STATUS) & PHY_LINK_UP != 0 { LinkState::Up } else { LinkState::Down }
+        phy(PHY_IDENTIFIER) == 0 || phy(PHY_STATUS) & PHY_LINK_UP != 0
     }
 
-    fn capabilities(&self) -> Capabilities {
-        let mut capabilities = Capabilities::default();
-        capabilities.max_transmission_unit = FRAME_BYTES;
-        capabilities.max_burst_size = Some(1);
-        capabilities
+    fn has_received() -> bool {
+        MACNP.read() != 0
     }
 
-    fn hardware_address(&self) -> HardwareAddress {
-        HardwareAddress::Ethernet(self.address)
+    fn can_send() -> bool {
+        MACTR.read() & NEW_TRANSMISSION == 0
     }
-}
 
-/// A frame that waits in the receive FIFO.
-pub struct Received<'a> {
-    buffer: &'a mut [u8; BUFFER_BYTES],
-}
-
-impl RxToken for Received<'_> {
-    fn consume<R, F: FnOnce(&mut [u8]) -> R>(self, act: F) -> R {
+    fn take(buffer: &mut Buffer) -> Range<usize> {
         let first = MACDATA.read();
         let length = (first & 0xFFFF) as usize;
-        let words = length.div_ceil(4).saturating_sub(1);
-        let (head, rest) = self.buffer.split_at_mut(4);
+        let (head, rest) = buffer.split_at_mut(4);
         head.copy_from_slice(&first.to_le_bytes());
-        let mut places = rest.chunks_exact_mut(4);
-        for _ in 0..words {
-            // All words are taken, also those of a frame that is too long: they would be the next frame's.
-            let word = MACDATA.read();
-            if let Some(place) = places.next() {
-                place.copy_from_slice(&word.to_le_bytes());
-            }
-        }
-        let end = (length.saturating_sub(CHECKSUM_BYTES)).clamp(LENGTH_BYTES, LENGTH_BYTES + FRAME_BYTES);
-        let frame = &mut self.buffer[LENGTH_BYTES..end];
-        #[cfg(feature = "faults")]
-        cara_emulated::faults::received(frame);
-        act(frame)
+        ethernet::read(MACDATA, words_behind_the_first(length), rest);
+        LENGTH_BYTES..length.saturating_sub(CHECKSUM_BYTES).clamp(LENGTH_BYTES, LENGTH_BYTES + FRAME_BYTES)
     }
-}
 
-/// The transmit FIFO while it is empty.
-pub struct Free<'a> {
-    buffer: &'a mut [u8; BUFFER_BYTES],
-}
-
-impl TxToken for Free<'_> {
-    fn consume<R, F: FnOnce(&mut [u8]) -> R>(self, length: usize, act: F) -> R {
-        let length = length.min(FRAME_BYTES);
-        let result = act(&mut self.buffer[LENGTH_BYTES..LENGTH_BYTES + length]);
+    fn send(buffer: &mut Buffer, length: usize) {
         let reported = length.saturating_sub(HEADER_BYTES) as u16;
-        self.buffer[..LENGTH_BYTES].copy_from_slice(&reported.to_le_bytes());
-        let bytes = (LENGTH_BYTES + length).next_multiple_of(4);
-        for word in self.buffer[..bytes].chunks_exact(4) {
-            MACDATA.write(word.try_into().map(u32::from_le_bytes).unwrap_or(0));
-        }
+        buffer[..LENGTH_BYTES].copy_from_slice(&reported.to_le_bytes());
+        ethernet::write(MACDATA, &buffer[..(LENGTH_BYTES + length).next_multiple_of(4)]);
         MACTR.write(NEW_TRANSMISSION);
-        result
     }
+}
+
+fn words_behind_the_first(length: usize) -> usize {
+    length.div_ceil(4).saturating_sub(1)
 }
 
 /// Takes what an earlier life of the board has left in the receive FIFO. Resetting the receiver would do on the chip;
@@ -200,25 +125,9 @@ fn discard_received() {
         if MACNP.read() == 0 {
             return;
         }
-        let words = ((MACDATA.read() & 0xFFFF) as usize).div_ceil(4).saturating_sub(1);
-        (0..words).for_each(|_| _ = MACDATA.read());
+        let words = words_behind_the_first((MACDATA.read() & 0xFFFF) as usize);
+        ethernet::read(MACDATA, words, &mut []);
     }
-}
-
-fn is_free() -> bool {
-    MACTR.read() & NEW_TRANSMISSION == 0
-}
-
-/// Whether it is ready; if not, the task is woken when one of the interrupts comes.
-fn ready_or_armed(cx: &mut Context, interrupts: u32, ready: impl Fn() -> bool) -> bool {
-    if ready() {
-        return true;
-    }
-    WAKER.register(cx.waker());
-    MACRIS.write(interrupts);
-    critical_section::with(|_| MACIM.set(interrupts));
-    // What came before the acknowledgement raises no interrupt any more.
-    ready()
 }
 
 /// Reads a register of the PHY.
@@ -237,7 +146,6 @@ mod handlers {
     fn ETHERNET() {
         let fired = MACRIS.read() & MACIM.read();
         if fired & OVERRUN != 0 {
-            OVERRUNS.store(OVERRUNS.load(Ordering::Relaxed).wrapping_add(1), Ordering::Relaxed);
             MACRIS.write(OVERRUN);
             if MACNP.read() == 0 {
                 MACRCTL.write(RESET_RECEIVER | REJECT_BAD_CHECKSUM | RECEIVE);
