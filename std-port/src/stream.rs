@@ -227,8 +227,17 @@ impl<T: Send + 'static> TheirStream<T> {
     /// Has the node send values at least `interval` apart, until the subscription is dropped; with zero as often as it grants.
     /// The last value comes at once. After a reconnection the subscription is made again by itself.
     pub fn subscribe(&self, interval: impl Into<Duration>) -> Subscription<T> {
-        let interval = interval.into();
-        let (watched, id) = self.peer.cell.streams.subscribe(self.definition.name(), interval);
+        self.subscription(interval.into(), false)
+    }
+
+    /// As [`subscribe`](Self::subscribe), as often as the node grants; a reader that is late gets the values that came meanwhile one
+    /// after another, up to 64 KiB of them.
+    pub(crate) fn subscribe_to_each(&self) -> Subscription<T> {
+        self.subscription(Duration::ZERO, true)
+    }
+
+    fn subscription(&self, interval: Duration, each: bool) -> Subscription<T> {
+        let (watched, id) = self.peer.cell.streams.subscribe(self.definition.name(), interval, each);
         self.peer.engine.tell_interval(&self.peer.cell, &watched);
         Subscription { peer: self.peer.clone(), watched, id, interval, seen: 0, due: Instant::START }
     }
@@ -344,7 +353,7 @@ impl<T: Send + 'static> Subscription<T> {
                 std::thread::sleep(self.due.since(now).into());
             }
             let left = deadline.since(engine.now()).min(LOOK);
-            match self.watched.wait(self.seen, left.into()) {
+            match self.watched.wait(self.id, self.seen, left.into()) {
                 Ok((received, count)) => {
                     self.seen = count;
                     self.due = self.due.max(now) + self.interval;

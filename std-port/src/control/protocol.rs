@@ -116,13 +116,13 @@ pub enum Question {
         node: String,
         /// The stream.
         name: Option<String>,
-        /// Least time between two values; 0 for as often as the node grants.
+        /// Least time between two values; 0 for each that the node grants, also where they are read late.
         interval_ms: u64,
     },
     /// Values of all streams of all nodes as they come, also of nodes that join later, until the connection is closed: an
     /// [`Answer::Value`] for each. Streams that the operator may not call are left out.
     Streams {
-        /// Least time between two values of a stream; 0 for as often as the node grants.
+        /// Least time between two values of a stream; 0 for each that the node grants, also where they are read late.
         interval_ms: u64,
         /// Streams of these names alone; of all names if empty.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]

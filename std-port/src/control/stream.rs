@@ -11,7 +11,7 @@ use cara_core::time::Duration;
 use super::protocol::{Answer, unix_ms};
 use super::sink::{End, LOOK, Sink, permit, send};
 use super::{select, values};
-use crate::{CommunicationSystem, Identity, Peer, Sample, Subscription};
+use crate::{CommunicationSystem, Identity, Peer, Sample, Subscription, TheirStream};
 
 /// How long a node may take to tell the last value of a stream.
 const LAST_VALUE: Duration = Duration::from_millis(500);
@@ -28,7 +28,7 @@ pub(super) fn values<T: Send + 'static>(
     let Some(name) = name else { return last_values(system, &peer, sink) };
     permit(system, name, Verb::Call)?;
     let stream = peer.stream(name)?;
-    let mut subscription = stream.subscribe(interval);
+    let mut subscription = subscription(&stream, interval);
     loop {
         match subscription.next(LOOK) {
             Ok(sample) => send(sink, answer(&peer, stream.definition(), Ok(&sample)))?,
@@ -45,6 +45,14 @@ pub(super) fn values<T: Send + 'static>(
 
 /// How often is looked for nodes that have joined, and for streams that they have published.
 const JOINED: std::time::Duration = std::time::Duration::from_millis(500);
+
+/// Values of one stream before another has its turn.
+const AT_ONCE: usize = 64;
+
+/// With no interval each value is wanted, such as the pieces of a log: this looks too seldom for all of them to be the newest once.
+fn subscription<T: Send + 'static>(stream: &TheirStream<T>, interval: Duration) -> Subscription<T> {
+    if interval == Duration::ZERO { stream.subscribe_to_each() } else { stream.subscribe(interval) }
+}
 
 /// A stream that is told, with its subscription.
 struct Report<T: Send + 'static> {
@@ -70,7 +78,8 @@ pub(super) fn all<T: Send + 'static>(
         }
         for Report { peer, definition, subscription } in reported.values_mut() {
             // One that the node does not grant has no values; it is told when it is granted.
-            if let Ok(sample) = subscription.next(Duration::ZERO) {
+            for _ in 0..AT_ONCE {
+                let Ok(sample) = subscription.next(Duration::ZERO) else { break };
                 send(sink, answer(peer, definition, Ok(&sample)))?;
             }
         }
@@ -98,7 +107,7 @@ fn subscribe<T: Send + 'static>(
             let key = (peer.identity().clone(), stream.definition().name().to_owned());
             if !reported.contains_key(&key) && permit(system, &key.1, Verb::Call).is_ok() {
                 let (peer, definition) = (peer.clone(), stream.definition().clone());
-                reported.insert(key, Report { peer, definition, subscription: stream.subscribe(interval) });
+                reported.insert(key, Report { peer, definition, subscription: subscription(stream, interval) });
             }
         }
     }

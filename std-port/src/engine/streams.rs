@@ -3,7 +3,7 @@
 //! However many handles of this process read a stream of a node, there is one subscription on the link: at the shortest
 //! interval that any of them wants. It is made again whenever the node tells its list, so also after a reconnection.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::task::Waker;
@@ -48,6 +48,9 @@ impl Source for OwnStream {
     }
 }
 
+/// Bytes of values that wait for the handles that want each; what does not fit is lost, the oldest first.
+const KEPT_BYTES: usize = 64 * 1024;
+
 /// A stream of a node, as the handles of this process share it.
 pub(crate) struct Watched {
     pub(crate) name: String,
@@ -60,6 +63,11 @@ struct WatchedState {
     /// The handles, and the interval that each wants.
     wants: Vec<(u64, Duration)>,
     last_id: u64,
+    /// The handles that want each value.
+    each: Vec<u64>,
+    /// The last values, the newest last, while any handle wants each.
+    kept: VecDeque<Received>,
+    kept_bytes: usize,
     newest: Option<Received>,
     /// Values that have come.
     count: u64,
@@ -82,8 +90,41 @@ pub(crate) struct Received {
 }
 
 impl Received {
+    fn bytes(&self) -> usize {
+        size_of::<Self>() + self.block.len()
+    }
+
     pub(crate) fn age_at(&self, now: Instant) -> Duration {
         self.age + now.since(self.arrived)
+    }
+}
+
+impl WatchedState {
+    fn put(&mut self, received: Received) {
+        if !self.each.is_empty() {
+            self.kept_bytes += received.bytes();
+            self.kept.push_back(received.clone());
+            while self.kept_bytes > KEPT_BYTES
+                && let Some(oldest) = self.kept.pop_front()
+            {
+                self.kept_bytes -= oldest.bytes();
+            }
+        }
+        self.newest = Some(received);
+        self.count += 1;
+    }
+
+    /// The newest value, or for a handle that wants each the oldest that it has not `seen`; and how many values have come up to it.
+    fn after(&self, seen: u64, id: u64) -> Option<(Received, u64)> {
+        let newest = self.newest.as_ref().filter(|_| self.count > seen)?;
+        if self.each.contains(&id) {
+            let before = self.count - self.kept.len() as u64;
+            let index = seen.saturating_sub(before);
+            if let Some(received) = self.kept.get(index as usize) {
+                return Some((received.clone(), before + index + 1));
+            }
+        }
+        Some((newest.clone(), self.count))
     }
 }
 
@@ -99,18 +140,15 @@ impl Watched {
     }
 
     /// Waits until more than `seen` values have come, or for so long; [`Error::TimedOut`], or why there is no subscription.
-    pub(crate) fn wait(&self, seen: u64, at_most: std::time::Duration) -> Result<(Received, u64), Error> {
+    pub(crate) fn wait(&self, id: u64, seen: u64, at_most: std::time::Duration) -> Result<(Received, u64), Error> {
         let mut state = lock(&self.state);
         let waits = |state: &mut WatchedState| state.refused.is_none() && state.count <= seen;
         if waits(&mut state) {
             let waited = self.changed.wait_timeout_while(state, at_most, waits);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
-        match (&state.newest, state.refused) {
-            (_, Some(error)) => Err(error),
-            (Some(newest), None) if state.count > seen => Ok((newest.clone(), state.count)),
-            _ => Err(Error::TimedOut),
-        }
+        state.refused.map_or(Ok(()), Err)?;
+        state.after(seen, id).ok_or(Error::TimedOut)
     }
 
     /// Values go on to this stream of the unit's own.
@@ -153,8 +191,7 @@ impl Watched {
             Some(known) => known.clone(),
             None => signature.as_bytes().into(),
         };
-        state.newest = Some(Received { signature, block: block.bytes().into(), age, arrived: now });
-        state.count += 1;
+        state.put(Received { signature, block: block.bytes().into(), age, arrived: now });
         state.refused = None;
         woken.extend(state.tasks.drain(..).map(|(_, task)| task));
         self.changed.notify_all();
@@ -172,11 +209,12 @@ impl Watched {
         lock(&self.state).wants.iter().map(|(_, interval)| *interval).min()
     }
 
-    fn want(&self, interval: Duration) -> u64 {
+    fn want(&self, interval: Duration, each: bool) -> u64 {
         let mut state = lock(&self.state);
         state.last_id += 1;
         let id = state.last_id;
         state.wants.push((id, interval));
+        state.each.extend(each.then_some(id));
         id
     }
 
@@ -184,6 +222,11 @@ impl Watched {
     fn want_no_more(&self, id: u64) -> bool {
         let mut state = lock(&self.state);
         state.wants.retain(|(known, _)| *known != id);
+        state.each.retain(|known| *known != id);
+        if state.each.is_empty() {
+            state.kept.clear();
+            state.kept_bytes = 0;
+        }
         let (is_last, task) = (state.wants.is_empty(), state.tasks.iter().position(|(known, _)| *known == id));
         let task = task.map(|index| state.tasks.swap_remove(index));
         drop(state);
@@ -229,11 +272,11 @@ impl Streams {
         self.get(name)?.interval()
     }
 
-    /// One more handle reads a stream; its number there. The node is to be told.
-    pub(crate) fn subscribe(&self, name: &str, interval: Duration) -> (Arc<Watched>, u64) {
+    /// One more handle reads a stream, its newest value or `each`; its number there. The node is to be told.
+    pub(crate) fn subscribe(&self, name: &str, interval: Duration, each: bool) -> (Arc<Watched>, u64) {
         let mut streams = lock(&self.0);
         let watched = streams.entry(name.to_owned()).or_insert_with(|| Arc::new(Watched::new(name))).clone();
-        let id = watched.want(interval);
+        let id = watched.want(interval, each);
         (watched, id)
     }
 
@@ -266,5 +309,36 @@ impl Streams {
     #[cfg(feature = "async")]
     pub(super) fn wake_tasks(&self) {
         self.all().iter().for_each(|watched| watched.wake_tasks());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn value(number: u8) -> Received {
+        let block = vec![number; KEPT_BYTES / 8].into();
+        Received { signature: Arc::from([]), block, age: Duration::ZERO, arrived: Instant::START }
+    }
+
+    #[test]
+    fn a_late_reader_of_each_value_gets_them_in_order_and_another_the_newest() {
+        let streams = Streams::default();
+        let (watched, newest) = streams.subscribe("log", Duration::ZERO, false);
+        lock(&watched.state).put(value(0));
+        let (_, each) = streams.subscribe("log", Duration::ZERO, true);
+        let read =
+            |id, seen| watched.wait(id, seen, std::time::Duration::ZERO).map(|(value, seen)| (value.block[0], seen));
+        assert_eq!(read(each, 0), Ok((0, 1)), "the last of before");
+        (1..=3).for_each(|number| lock(&watched.state).put(value(number)));
+        assert_eq!([1, 2, 3].map(|seen| read(each, seen)), [Ok((1, 2)), Ok((2, 3)), Ok((3, 4))]);
+        assert_eq!(read(each, 4), Err(Error::TimedOut));
+        assert_eq!(read(newest, 1), Ok((3, 4)));
+        (4..20).for_each(|number| lock(&watched.state).put(value(number)));
+        assert_eq!(read(each, 4), Ok((13, 14)), "only so much is kept");
+        assert!(lock(&watched.state).kept_bytes <= KEPT_BYTES);
+        streams.unsubscribe(&watched, each);
+        lock(&watched.state).put(value(20));
+        assert!(lock(&watched.state).kept.is_empty());
     }
 }
