@@ -4,7 +4,8 @@
 //! before, where the memory survives a reset. It holds up nobody who writes. What was overwritten before it was sent is lost; each
 //! piece has its position in the log, so that the reader counts the losses.
 //!
-//! The bytes are whatever the board logs, such as frames of `defmt`.
+//! The bytes are whatever the board logs, such as frames of `defmt`, which are read with the firmware's ELF: each piece has the
+//! firmware's build id, by which it is found.
 
 use core::cell::Cell as CoreCell;
 use core::fmt;
@@ -27,14 +28,19 @@ pub const LOG_BYTES: usize = 1024;
 const PIECE: usize = 256;
 /// Between two pieces.
 const PAUSE: Duration = Duration::from_millis(50);
-/// What the board publishes: the position of the first byte, and bytes of the log. Other programs read it: `docs/boards.md`.
-const STREAM: &str = "log(at: int, piece: bytes[256])";
+/// Bytes of the values of a piece.
+const BLOCK: usize = PIECE + 24;
+/// What the board publishes: the position of the first byte, the build id, and bytes of the log. Other programs read it:
+/// `docs/boards.md`.
+const STREAM: &str = "log(at: int, build: int, piece: bytes[256])";
 /// A memory that is not this was never written.
 const MARK: u32 = 0x4C4F_4721;
 
 /// The newest bytes of a log. Any content is valid, so that it can lie in memory that a start does not touch.
 pub struct Log {
     mark: AtomicU32,
+    /// Of the firmware that wrote it, or 0 before it has said so.
+    build: AtomicU32,
     /// Bytes that were ever written; it wraps.
     written: AtomicU32,
     bytes: [AtomicU8; LOG_BYTES],
@@ -56,7 +62,8 @@ impl Log {
     /// An empty one.
     pub const fn new() -> Self {
         const { assert!(LOG_BYTES.is_power_of_two(), "positions wrap at a multiple of it") };
-        Self { mark: AtomicU32::new(0), written: AtomicU32::new(0), bytes: [const { AtomicU8::new(0) }; LOG_BYTES] }
+        let bytes = [const { AtomicU8::new(0) }; LOG_BYTES];
+        Self { mark: AtomicU32::new(0), build: AtomicU32::new(0), written: AtomicU32::new(0), bytes }
     }
 
     /// Writes bytes; never waits. Two writers at a time mix what they write: `defmt`'s loggers have a critical section.
@@ -74,8 +81,18 @@ impl Log {
     fn written(&self) -> u32 {
         if self.mark.swap(MARK, Ordering::Relaxed) != MARK {
             self.written.store(0, Ordering::Relaxed);
+            self.build.store(0, Ordering::Relaxed);
         }
         self.written.load(Ordering::Acquire)
+    }
+
+    /// Forgets what another firmware has written: it is not to be read as this one's.
+    fn belong_to(&self, build: u32) {
+        self.written();
+        let before = self.build.swap(build, Ordering::Relaxed);
+        if before != 0 && before != build {
+            self.written.store(0, Ordering::Release);
+        }
     }
 
     /// The bytes behind `from` as far as there are; from where on.
@@ -102,7 +119,7 @@ impl Log {
 /// The piece that is sent next, in static memory.
 #[derive(Debug)]
 pub struct LogCell {
-    piece: StreamCell<{ PIECE + 16 }>,
+    piece: StreamCell<BLOCK>,
     /// It was published, and not sent.
     waits: CoreCell<bool>,
 }
@@ -141,6 +158,7 @@ impl Cell for LogCell {
 /// The log as a stream of this unit.
 pub struct LogStream<T: 'static> {
     log: &'static Log,
+    build: i64,
     stream: Stream<T>,
     cell: &'static LogCell,
 }
@@ -153,12 +171,15 @@ impl<T> fmt::Debug for LogStream<T> {
 
 impl<T> MyFunctionList<T> {
     /// Adds the stream `log`. The board publishes its list, and [runs](LogStream::run) what this returns in a task of its own.
+    /// `build` has the first eight bytes of the build id in the firmware's ELF, the first the highest, or is 0 if it has none. What
+    /// a firmware of another build has left in `log` is forgotten.
     ///
     /// [`Error::NameTaken`], [`Error::Full`].
-    pub fn add_log(&self, log: &'static Log, cell: &'static LogCell) -> Result<LogStream<T>, Error> {
+    pub fn add_log(&self, log: &'static Log, cell: &'static LogCell, build: i64) -> Result<LogStream<T>, Error> {
         let definition = Definition::stream(STREAM).map_err(|_| Error::BadName)?;
-        let stream = self.add_defined(&definition, PAUSE, PIECE + 16, cell)?;
-        Ok(LogStream { log, stream, cell })
+        let stream = self.add_defined(&definition, PAUSE, BLOCK, cell)?;
+        log.belong_to(build as u32);
+        Ok(LogStream { log, build, stream, cell })
     }
 }
 
@@ -180,16 +201,18 @@ impl<T> LogStream<T> {
         let (at, piece) = self.log.read(from, &mut bytes);
         if !piece.is_empty() {
             // Fails only when the stream has been removed.
-            let _ = values(at, piece).and_then(|values| self.stream.publish(&values));
+            let _ = values(at, self.build, piece).and_then(|values| self.stream.publish(&values));
         }
         at.wrapping_add(piece.len() as u32)
     }
 }
 
-fn values(at: u32, piece: &[u8]) -> Result<Parameters, Error> {
+fn values(at: u32, build: i64, piece: &[u8]) -> Result<Parameters, Error> {
     let mut values = Parameters::new();
     values.add_int("at", 1)?;
     values.set_value("at", i64::from(at))?;
+    values.add_int("build", 1)?;
+    values.set_value("build", build)?;
     values.add_bytes("piece", PIECE as u32)?;
     values.set_value("piece", piece)?;
     Ok(values)
@@ -250,11 +273,23 @@ mod tests {
     }
 
     #[test]
+    fn what_another_firmware_has_left_is_forgotten() {
+        let log = Log::new();
+        log.write(b"before it joins");
+        log.belong_to(7);
+        has(&log, 0, 0, b"before it joins");
+        log.belong_to(7);
+        has(&log, 0, 0, b"before it joins");
+        log.belong_to(8);
+        has(&log, 0, 0, b"");
+    }
+
+    #[test]
     fn a_piece_fits_what_the_stream_declares() {
-        let fits = |length: usize| length > PIECE && length <= PIECE + 16;
+        let fits = |length: usize| length > PIECE && length <= BLOCK;
         assert!(Definition::stream(STREAM).is_ok_and(|definition| {
             let results = || definition.signature().results();
-            let length = values(u32::MAX, &[7; PIECE]).and_then(|values| block::measure(results(), &values));
+            let length = values(u32::MAX, i64::MIN, &[7; PIECE]).and_then(|values| block::measure(results(), &values));
             block::longest(results()).is_some_and(fits) && length.is_ok_and(fits)
         }));
     }

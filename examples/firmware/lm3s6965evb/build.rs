@@ -21,6 +21,13 @@ fn main() {
     if has("DEFMT") {
         println!("cargo::rustc-link-arg-bins=-Tdefmt.x");
     }
+    if has("LOGS") {
+        fs::copy("build-id.x", place.join("build-id.x")).expect("the script is copied");
+        // Eight bytes, which is what a log tells.
+        println!("cargo::rustc-link-arg-bins=--build-id=fast");
+        println!("cargo::rustc-link-arg-bins=-Tbuild-id.x");
+    }
+    println!("cargo::rerun-if-changed=build-id.x");
     println!("cargo::rerun-if-changed={map}");
     println!("cargo::rerun-if-changed=build.rs");
 }

@@ -55,11 +55,6 @@ impl Bench {
         Ok(Self { image, table, shows_logs, constant: None, counts: false, machine, cables, keys })
     }
 
-    /// How the lines of its log are read.
-    pub(crate) fn table(&self) -> Arc<Table> {
-        self.table.clone()
-    }
-
     /// Times on its boards are counted in instructions, and do not depend on how busy this machine is.
     pub(crate) fn counting(self) -> Self {
         Self { counts: true, ..self }

@@ -113,7 +113,8 @@ enum Part {
         #[arg(long, default_value_t = 300)]
         times: u32,
     },
-    /// Calls a board that logs a hundred lines a second over its link; for an image with the features `faults` and `logs`.
+    /// Calls a board whose hundred lines a second `cara logs` shows; for an image with the features `faults` and `logs`, and a
+    /// `cara` with the feature `defmt`.
     Logs,
     /// Calls a board that publishes values meanwhile; for an image with streams.
     Streams(streams::Streams),

@@ -18,7 +18,7 @@ static LOG: Log = Log::new();
 #[embassy_executor::task]
 pub async fn send(vehicle: Vehicle) -> ! {
     static CELL: ConstStaticCell<LogCell> = ConstStaticCell::new(LogCell::new());
-    let added = vehicle.my_function_list().add_log(&LOG, CELL.take());
+    let added = vehicle.my_function_list().add_log(&LOG, CELL.take(), build());
     match added.and_then(|log| vehicle.publish_my_function_list().map(|()| log)) {
         Ok(log) => log.run().await,
         Err(_) => {
@@ -26,6 +26,16 @@ pub async fn send(vehicle: Vehicle) -> ! {
             core::future::pending().await
         }
     }
+}
+
+/// By which `cara logs` finds the image's ELF.
+#[allow(unsafe_code)]
+fn build() -> i64 {
+    unsafe extern "C" {
+        static cara_build_id: [u8; 8];
+    }
+    // SAFETY: the linker has put the eight bytes of the build id there (build-id.x of the board), and nothing writes to flash.
+    i64::from_be_bytes(unsafe { cara_build_id })
 }
 
 #[defmt::global_logger]

@@ -1,4 +1,4 @@
-//! `cara logs`: the logs of boards, as they come over their links.
+//! `cara logs`: the logs of nodes, as they come over their links.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use cara_std::Shown;
-use cara_std::control::protocol::{Answer, ArgumentValue, Question};
+use cara_std::control::protocol::{Answer, Argument, ArgumentValue, Question};
 use serde_json::json;
 
 use crate::nodes;
@@ -24,22 +24,24 @@ const LONGEST: usize = 64 * 1024;
 /// Shows the logs of boards that are built with the feature `logs`, as they come; first what each has kept for this, also of its
 /// life before. Ctrl-C ends it.
 ///
-/// A log of defmt takes the firmware's ELF. One without is lines of text.
+/// A log of defmt takes the firmware's ELF. Others are lines of text.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The node: NAME, NAME/ID or #ID; all if absent.
     node: Option<String>,
-    /// The ELF of the nodes' firmware, whose log is defmt's; needs a `cara` that is built with the feature `defmt`.
-    #[arg(long, value_name = "ELF")]
-    firmware: Option<PathBuf>,
+    /// The ELF of the boards' firmware, whose log is defmt's, or a folder of ELFs, in which each node's is found by its build id;
+    /// needs a `cara` that is built with the feature `defmt`.
+    #[arg(long, value_name = "ELF|FOLDER")]
+    elf: Option<PathBuf>,
     /// End after this time.
     #[arg(long = "for", value_name = "TIME", value_parser = parse_time)]
     span: Option<Duration>,
 }
 
-pub(crate) fn run(Arguments { node, firmware, span }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let decoding = Decoding::of(firmware.as_deref())?;
+pub(crate) fn run(Arguments { node, elf, span }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let decoding = Decoding::of(elf.as_deref())?;
     let mut operator = Operator::open(global, &node.as_deref().map_or(Need::Everybody, Need::Node))?;
+    let is_one = node.is_some();
     let question = match node {
         Some(node) => {
             let node = nodes::connected(&mut operator, &node)?.selector;
@@ -58,19 +60,48 @@ pub(crate) fn run(Arguments { node, firmware, span }: Arguments, global: &Global
         if let Some(error) = error {
             output::warning(format_args!("{node}: {}: {}", error.error, Shown(&error.text)));
         }
-        let ints =
-            values.iter().find_map(|value| if let ArgumentValue::Int(ints) = &value.value { Some(ints) } else { None });
-        let bytes = values
-            .iter()
-            .find_map(|value| if let ArgumentValue::Bytes(hex) = &value.value { unhex(hex) } else { None });
-        let Some((at, piece)) = ints.and_then(|ints| ints.first()).zip(bytes) else { return Ok(true) };
-        let log = logs.entry(node.clone()).or_insert_with(|| Log::new(decoding.reader()));
-        for line in log.take(*at as u32, &piece) {
+        let Some(Piece { at, build, bytes }) = Piece::of(&values) else { return Ok(true) };
+        let known = logs.remove(&node).filter(|log| log.build == build);
+        let log = match known {
+            Some(log) => logs.entry(node.clone()).or_insert(log),
+            None => {
+                let reader = match decoding.reader(build) {
+                    Err(why) if is_one => return Err(Ended::failed("NoFirmware", format!("{node}: {why}"))),
+                    Err(why) => {
+                        output::warning(format_args!("{node}: {why}"));
+                        None
+                    }
+                    Ok(reader) => Some(reader),
+                };
+                logs.entry(node.clone()).or_insert(Log { build, next: None, reader })
+            }
+        };
+        for line in log.take(at, &bytes) {
             show(&node, unix_ms, line, global)?;
         }
         Ok(true)
     })?;
     Ok(Exit::Done.into())
+}
+
+/// What a board's log has at one position.
+struct Piece {
+    at: u32,
+    /// The build id of a board's firmware, 0 if it has none.
+    build: Option<u64>,
+    bytes: Vec<u8>,
+}
+
+impl Piece {
+    fn of(values: &[Argument]) -> Option<Self> {
+        let value = |name| values.iter().find(|value| value.name == name).map(|value| &value.value);
+        let int = |name| match value(name) {
+            Some(ArgumentValue::Int(ints)) => ints.first().copied(),
+            _ => None,
+        };
+        let Some(ArgumentValue::Bytes(hex)) = value("piece") else { return None };
+        Some(Self { at: int("at")? as u32, build: int("build").map(|build| build as u64), bytes: unhex(hex)? })
+    }
 }
 
 fn show(node: &str, unix_ms: u64, line: Line, global: &Global) -> std::io::Result<()> {
@@ -104,11 +135,13 @@ enum Line {
     Lost(u32),
 }
 
-/// The log of one board, put together from its pieces.
+/// The log of one node, put together from its pieces.
 struct Log {
+    build: Option<u64>,
     /// Where the next piece begins.
     next: Option<u32>,
-    reader: Box<dyn Read>,
+    /// None if its firmware is not there: nothing is shown.
+    reader: Option<Box<dyn Read>>,
 }
 
 /// Makes lines of bytes.
@@ -120,22 +153,19 @@ trait Read {
 }
 
 impl Log {
-    fn new(reader: Box<dyn Read>) -> Self {
-        Self { next: None, reader }
-    }
-
     fn take(&mut self, at: u32, piece: &[u8]) -> Vec<Line> {
         let (next, mut found) = (self.next.unwrap_or(at), Vec::new());
+        let Some(reader) = &mut self.reader else { return found };
         self.next = Some(at.wrapping_add(piece.len() as u32));
         let (ahead, known) = (at.wrapping_sub(next), next.wrapping_sub(at) as usize);
         match piece.get(known..) {
             // After it was away, a board sends its last piece again.
-            Some(fresh) => self.reader.read(fresh, &mut found),
+            Some(fresh) => reader.read(fresh, &mut found),
             None => {
-                self.reader.cut();
+                reader.cut();
                 // One that begins anew, after its power was off, is behind, and has lost nothing that is known of.
                 found.extend((ahead <= u32::MAX / 2).then_some(Line::Lost(ahead)));
-                self.reader.read(piece, &mut found);
+                reader.read(piece, &mut found);
             }
         }
         found
@@ -166,33 +196,123 @@ impl Read for Lines {
 enum Decoding {
     Text,
     #[cfg(feature = "defmt")]
-    Frames(&'static defmt_decoder::Table),
+    Frames(firmware::Firmware),
 }
 
 impl Decoding {
     #[cfg(not(feature = "defmt"))]
-    fn of(firmware: Option<&Path>) -> anyhow::Result<Self> {
+    fn of(elf: Option<&Path>) -> anyhow::Result<Self> {
         let refused = "this `cara` is built without the feature `defmt`: it reads no firmware";
-        firmware.map_or(Ok(Self::Text), |_| Err(Ended::usage(refused)))
+        elf.map_or(Ok(Self::Text), |_| Err(Ended::usage(refused)))
     }
 
     #[cfg(feature = "defmt")]
-    fn of(firmware: Option<&Path>) -> anyhow::Result<Self> {
-        let Some(path) = firmware else { return Ok(Self::Text) };
-        let wrong = |why: &dyn std::fmt::Display| Ended::usage(format!("{}: {why}", path.display()));
-        let elf = std::fs::read(path).map_err(|error| wrong(&error))?;
-        let table = defmt_decoder::Table::parse(&elf).map_err(|error| wrong(&error))?;
-        let table = table.ok_or_else(|| wrong(&"it has no table of defmt"))?;
-        // One for as long as the program runs.
-        Ok(Self::Frames(Box::leak(Box::new(table))))
+    fn of(elf: Option<&Path>) -> anyhow::Result<Self> {
+        let Some(path) = elf else { return Ok(Self::Text) };
+        let found = firmware::Firmware::of(path);
+        found.map(Self::Frames).map_err(|why| Ended::usage(format!("{}: {why}", path.display())))
     }
 
-    fn reader(&self) -> Box<dyn Read> {
-        match self {
-            Self::Text => Box::new(Lines::default()),
+    /// Of a board whose firmware has this build id; a log without any is text.
+    #[cfg_attr(not(feature = "defmt"), allow(clippy::unnecessary_wraps, reason = "text needs no firmware"))]
+    fn reader(&self, build: Option<u64>) -> Result<Box<dyn Read>, String> {
+        match (self, build) {
             #[cfg(feature = "defmt")]
-            Self::Frames(table) => Box::new(frames::Frames::new(table)),
+            (Self::Frames(firmware), Some(build)) => Ok(Box::new(frames::Frames::new(firmware.table(build)?))),
+            _ => Ok(Box::new(Lines::default())),
         }
+    }
+}
+
+#[cfg(feature = "defmt")]
+mod firmware {
+    use std::cell::RefCell;
+    use std::collections::HashMap;
+    use std::path::{Path, PathBuf};
+
+    use defmt_decoder::Table;
+    use object::Object as _;
+
+    /// How an ELF begins.
+    const MAGIC: &[u8] = b"\x7fELF";
+
+    /// Where the ELFs are.
+    pub(super) enum Firmware {
+        File {
+            path: PathBuf,
+            build: Option<u64>,
+            table: &'static Table,
+        },
+        /// With what was found there.
+        Folder(PathBuf, RefCell<HashMap<u64, &'static Table>>),
+    }
+
+    impl Firmware {
+        pub(super) fn of(path: &Path) -> Result<Self, String> {
+            if path.is_dir() {
+                return Ok(Self::Folder(path.to_owned(), RefCell::default()));
+            }
+            let elf = std::fs::read(path).map_err(|error| error.to_string())?;
+            Ok(Self::File { path: path.to_owned(), build: build_id(&elf), table: table(&elf)? })
+        }
+
+        /// Of the board's firmware, whose build id is 0 if it tells none.
+        pub(super) fn table(&self, build: u64) -> Result<&'static Table, String> {
+            match self {
+                Self::File { table, .. } if build == 0 => Ok(table),
+                Self::File { table, build: found, .. } if *found == Some(build) => Ok(table),
+                Self::File { path, build: found, .. } => Err(format!(
+                    "its firmware has the build id {build:016x}, and {} {}: name the ELF that the board was flashed with, or a \
+                     folder that has it",
+                    path.display(),
+                    found.map_or_else(|| "none".to_owned(), |found| format!("{found:016x}")),
+                )),
+                Self::Folder(folder, _) if build == 0 => {
+                    let folder = folder.display();
+                    Err(format!("it tells no build id, by which its ELF could be found in {folder}: name the ELF"))
+                }
+                Self::Folder(folder, found) => {
+                    if let Some(table) = found.borrow().get(&build) {
+                        return Ok(table);
+                    }
+                    let table = table(&elf_of(folder, build)?)?;
+                    found.borrow_mut().insert(build, table);
+                    Ok(table)
+                }
+            }
+        }
+    }
+
+    fn elf_of(folder: &Path, build: u64) -> Result<Vec<u8>, String> {
+        let entries = std::fs::read_dir(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        let paths = entries.filter_map(|entry| Some(entry.ok()?.path())).filter(|path| path.is_file());
+        let found = paths.filter_map(|path| elf(&path)).find(|elf| build_id(elf) == Some(build));
+        found.ok_or_else(|| {
+            let folder = folder.display();
+            format!("{folder} has no ELF with its build id {build:016x}: put the one there that it was flashed with")
+        })
+    }
+
+    /// A file, if it is one.
+    fn elf(path: &Path) -> Option<Vec<u8>> {
+        use std::io::Read as _;
+        let mut file = std::fs::File::open(path).ok()?;
+        let mut bytes = vec![0; MAGIC.len()];
+        file.read_exact(&mut bytes).ok().filter(|()| bytes == MAGIC)?;
+        file.read_to_end(&mut bytes).ok()?;
+        Some(bytes)
+    }
+
+    /// The first eight bytes of its build id, as boards tell them.
+    fn build_id(elf: &[u8]) -> Option<u64> {
+        let file = object::File::parse(elf).ok()?;
+        Some(u64::from_be_bytes(*file.build_id().ok()??.first_chunk()?))
+    }
+
+    fn table(elf: &[u8]) -> Result<&'static Table, String> {
+        let table = Table::parse(elf).map_err(|error| error.to_string())?;
+        // One for each firmware, as long as the program runs.
+        table.map(|table| &*Box::leak(Box::new(table))).ok_or_else(|| "it has no table of defmt".to_owned())
     }
 }
 
@@ -255,16 +375,20 @@ mod tests {
         Line::Text(text.to_owned())
     }
 
+    fn empty() -> Log {
+        Log { build: None, next: None, reader: Some(Box::<Lines>::default()) }
+    }
+
     #[test]
     fn pieces_make_lines_and_what_is_lost_is_counted() {
-        let mut log = Log::new(Box::<Lines>::default());
+        let mut log = empty();
         assert_eq!(log.take(7, b"one\ntw"), [text("one")]);
         assert_eq!(log.take(13, b"o\n"), [text("two")]);
         assert_eq!(log.take(13, b"o\n"), [], "sent again");
         assert_eq!(log.take(13, b"o\nthree\n"), [text("three")]);
         assert_eq!(log.take(121, b"rest\nfour\n"), [Line::Lost(100), text("rest"), text("four")]);
         assert_eq!(log.take(0, b"anew\n"), [text("anew")], "power was off");
-        let mut wrapping = Log::new(Box::<Lines>::default());
+        let mut wrapping = empty();
         assert_eq!(wrapping.take(u32::MAX, b"ab"), []);
         assert_eq!(wrapping.take(1, b"c\n"), [text("abc")]);
         assert_eq!(wrapping.take(4, b"d\n"), [Line::Lost(1), text("d")]);
