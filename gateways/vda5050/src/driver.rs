@@ -20,6 +20,8 @@ pub trait Vehicle {
     fn status(&mut self) -> Result<Option<Status>, Failure>;
     /// Tells it something, and waits for its answer.
     fn tell(&mut self, command: &Command) -> Result<(), Failure>;
+    /// The loop waits for a disk, and lives.
+    fn beat(&mut self) {}
 }
 
 /// A machine with its record and its vehicle.
@@ -92,7 +94,7 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
     pub fn keep(&mut self) -> io::Result<()> {
         self.is_kept &= !self.machine.take_changed();
         if !self.is_kept {
-            self.record.keep(self.machine.record())?;
+            self.record.keep(self.machine.record(), &mut || self.vehicle.beat())?;
             self.is_kept = true;
         }
         Ok(())

@@ -178,7 +178,7 @@ impl Gateway {
     }
 
     fn turn(&mut self) {
-        self.driver.vehicle_mut().beat();
+        self.driver.vehicle_mut().turn();
         // However many come, the vehicle has its turn.
         for _ in 0..HEARD {
             let Ok(heard) = self.link.heard.try_recv() else { break };

@@ -4,7 +4,11 @@
 //! and stops by itself when the gateway, its host or the link fails. The gateway renews orders as its loop beats, and that loop asks
 //! for nothing beyond the released base.
 
-use std::time::Instant;
+use std::pin::pin;
+use std::sync::Arc;
+use std::task::{Context, Poll, Wake, Waker};
+use std::thread::Thread;
+use std::time::{Duration, Instant};
 
 use cara_std::{AnyCall, CallError, Error, Heart, Peer, RequestOptions, ServiceError, Variables, interface};
 
@@ -16,12 +20,16 @@ use crate::stretch::{LEGS, NAMES_BYTES, Stretch, of_order};
 
 /// How long the vehicle moves on after the gateway's last sign that it wants it, in milliseconds.
 pub const LEASE_MS: u64 = 600;
-/// How long the vehicle may take to say how it is; the loop's heart waits meanwhile.
-const PATIENCE: std::time::Duration = std::time::Duration::from_millis(250);
+/// How long the vehicle may take to say how it is.
+const PATIENCE: Duration = Duration::from_millis(250);
 /// What it carries is asked so often, if no action ends.
-const EQUIPMENT_ASKED: std::time::Duration = std::time::Duration::from_secs(2);
+const EQUIPMENT_ASKED: Duration = Duration::from_secs(2);
 /// How long it may take to begin something.
-const PATIENCE_TO_BEGIN: std::time::Duration = std::time::Duration::from_millis(500);
+const PATIENCE_TO_BEGIN: Duration = Duration::from_millis(500);
+/// The loop beats so often while it waits for an answer or for the disk.
+pub(crate) const BEAT: Duration = Duration::from_millis(20);
+/// And for so long in one turn: what stops the vehicle is heard between two turns.
+const LONGEST_TURN: Duration = Duration::from_secs(1);
 
 /// Codes with which a vehicle refuses a call.
 pub mod refusal {
@@ -238,12 +246,14 @@ pub struct Linked {
     asked: Option<(Instant, u64, ActionStatus)>,
     /// Nothing is renewed any more.
     is_given_up: bool,
+    /// When the loop came round.
+    turned: Instant,
 }
 
 impl Linked {
     /// What moves is renewed as the heart beats.
     pub fn new(peer: Peer, heart: Heart) -> Self {
-        Self { peer, heart, equipment: Equipment::default(), asked: None, is_given_up: false }
+        Self { peer, heart, equipment: Equipment::default(), asked: None, is_given_up: false, turned: Instant::now() }
     }
 
     /// Asks what it carries: now and then, and when an action has changed that, so that a state never shows the one without the other.
@@ -256,8 +266,8 @@ impl Linked {
         });
         if is_news {
             let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() };
-            let answer = EquippedClient::at(&self.peer).with(options).vda_equipment().wait();
-            self.beat();
+            let peer = self.peer.clone();
+            let answer = answered(EquippedClient::at(&peer).with(options).vda_equipment(), || self.beat());
             // Without an answer it is what it was: a vehicle is not lost for that.
             self.equipment = answer.unwrap_or_else(|_| self.equipment.clone());
             self.asked = Some((Instant::now(), status.action, status.action_status));
@@ -266,10 +276,9 @@ impl Linked {
     }
 
     /// The gateway's loop has come round.
-    pub fn beat(&mut self) {
-        if !self.is_given_up {
-            self.heart.beat();
-        }
+    pub fn turn(&mut self) {
+        self.turned = Instant::now();
+        self.beat();
     }
 
     /// While the record cannot be written, no stop may wait for it: the vehicle stops by its lease.
@@ -279,13 +288,19 @@ impl Linked {
 }
 
 impl Vehicle for Linked {
+    fn beat(&mut self) {
+        if !self.is_given_up && self.turned.elapsed() < LONGEST_TURN {
+            self.heart.beat();
+        }
+    }
+
     fn status(&mut self) -> Result<Option<Status>, Failure> {
         if !self.peer.is_connected() || self.peer.function("vda_condition").is_none() {
             return Ok(None);
         }
         let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::new() };
-        let condition = GuidedClient::at(&self.peer).with(options).vda_condition().wait();
-        self.beat();
+        let peer = self.peer.clone();
+        let condition = answered(GuidedClient::at(&peer).with(options).vda_condition(), || self.beat());
         let condition = condition.map_err(|error| failure(&error))?;
         let latch = self.peer.actuator_state("vda_drive").and_then(|state| state.latch);
         let boot = self.peer.epoch().map_or(0, |epoch| epoch.0);
@@ -297,28 +312,51 @@ impl Vehicle for Linked {
 
     fn tell(&mut self, command: &Command) -> Result<(), Failure> {
         let options = RequestOptions { timeout: Some(PATIENCE_TO_BEGIN.into()), ..RequestOptions::new() };
-        let asked = GuidedClient::at(&self.peer).with(options);
+        let peer = self.peer.clone();
+        let asked = GuidedClient::at(&peer).with(options);
         let answer = match command {
             Command::Drive { number, legs } => {
                 let (stretch, [edges, nodes], map) = of_order(signed(*number), legs);
                 let Stretch { number, count, positions, given, deviations, max_speeds, .. } = stretch;
                 let client = asked.renewing(self.heart.renew());
-                client.vda_drive(number, count, &edges, &nodes, map, positions, given, deviations, max_speeds).wait()
+                let call =
+                    client.vda_drive(number, count, &edges, &nodes, map, positions, given, deviations, max_speeds);
+                answered(call, || self.beat())
             }
             Command::Act { number, action } => {
                 let client = asked.renewing(self.heart.renew());
                 let Action { action_id, action_type, .. } = action;
-                client.vda_act(signed(*number), action_id, action_type, &parameters(action)).wait()
+                let details = parameters(action);
+                answered(client.vda_act(signed(*number), action_id, action_type, &details), || self.beat())
             }
             Command::InitPosition { action } => {
                 let (position, map) = initial(action)?;
-                asked.vda_init(position, map).wait()
+                answered(asked.vda_init(position, map), || self.beat())
             }
             Command::Halt => return released(self.peer.release("vda_drive")),
             Command::EndAction { .. } => return released(self.peer.release("vda_act")),
         };
-        self.beat();
         answer.map_err(|error| failure(&error))
+    }
+}
+
+/// Waits for an answer, and beats meanwhile: a slow one must not end a lease.
+fn answered<C: IntoFuture>(call: C, mut beat: impl FnMut()) -> C::Output {
+    struct Unpark(Thread);
+    impl Wake for Unpark {
+        fn wake(self: Arc<Self>) {
+            self.0.unpark();
+        }
+    }
+    let mut reply = pin!(call.into_future());
+    let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
+    loop {
+        let answer = reply.as_mut().poll(&mut Context::from_waker(&waker));
+        beat();
+        if let Poll::Ready(answer) = answer {
+            return answer;
+        }
+        std::thread::park_timeout(BEAT);
     }
 }
 
@@ -392,8 +430,21 @@ fn status(condition: Condition) -> Status {
 
 #[cfg(test)]
 mod tests {
-    use super::{Condition, Equipment, status};
+    use std::cell::Cell;
+    use std::future::poll_fn;
+    use std::task::Poll;
+
+    use super::{Condition, Equipment, answered, status};
     use crate::message::Load;
+
+    /// The answer comes once the loop has beaten a few times, and nothing else wakes it.
+    #[test]
+    fn the_loop_beats_while_it_waits_for_an_answer() {
+        let beats = Cell::new(0);
+        let answer = poll_fn(|_| if beats.get() < 5 { Poll::Pending } else { Poll::Ready("answer") });
+        assert_eq!(answered(answer, || beats.set(beats.get() + 1)), "answer");
+        assert_eq!(beats.get(), 6);
+    }
 
     /// A sensor that has nothing to say makes no state that a master cannot read.
     #[test]
