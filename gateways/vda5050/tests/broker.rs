@@ -13,11 +13,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use cara_processes::network;
 use cara_vda5050::config::Config;
 use cara_vda5050::message::{ActionParameter, Connection, ConnectionState};
 use cara_vda5050::vehicle::LEASE_MS;
 use fake::{instant, order};
-use plant::{Plant, check_messages, vehicle};
+use plant::{Messages, Plant, check_messages, master_named, until, vehicle};
 use rumqttc::QoS;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -133,6 +134,74 @@ fn a_gateway_that_hangs_stops_the_vehicle() {
     assert!(took < Duration::from_millis(LEASE_MS + 150), "{took:?}");
     gateway.signal(Signal::CONT);
     plant.wait_for_end("o1", "k");
+    plant.order_is_never_empty("o1", "k");
+}
+
+/// The network between the gateway and the vehicle loses everything; the broker and both processes live.
+#[test]
+fn a_vehicles_link_that_is_cut_stops_the_vehicle_alone() {
+    if !network::test("a_vehicles_link_that_is_cut_stops_the_vehicle_alone", &["nft"], false) {
+        return;
+    }
+    network::ip("link set lo up");
+    let plant = Plant::start("{ do = \"stop\" }");
+    plant.order("o1", 0, 0, "a! k!");
+    plant.vehicle.wait_for("drive 1 k");
+    sleep(Duration::from_millis(300));
+    let port = plant.port;
+    let others = format!("tcp dport {port} accept\ntcp sport {port} accept\ndrop");
+    network::filter("inet cut", "input", &others).unwrap();
+    let cut = Instant::now();
+    plant.vehicle.wait_for("stood");
+    let took = plant.vehicle.at("stood").unwrap().duration_since(cut);
+    println!("link to the vehicle cut: stood after {took:?}");
+    assert!(took < Duration::from_millis(LEASE_MS + 150), "{took:?}");
+    plant.wait_for("broken", |plant| plant.connection() == "CONNECTIONBROKEN");
+    println!("CONNECTIONBROKEN after {:?}", cut.elapsed());
+    network::run("nft flush ruleset").unwrap();
+    plant.wait_for_end("o1", "k");
+    assert_eq!((plant.connection().as_str(), plant.count("drive ")), ("ONLINE", 1), "{:?}", plant.vehicle.lines());
+    plant.order_is_never_empty("o1", "k");
+}
+
+/// Killed at any moment and started again, 10 times or as often as `CARA_TEST_FAIL_OVERS` says: what is retained ends with ONLINE, and
+/// the vehicle drives each edge once.
+#[test]
+fn connection_ends_online_after_each_fail_over() {
+    let count = std::env::var("CARA_TEST_FAIL_OVERS").ok().and_then(|text| text.parse().ok()).unwrap_or(10);
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    let seed = fastrand::u64(..);
+    let mut rng = fastrand::Rng::with_seed(seed);
+    for round in 0..count {
+        let (id, to) = (format!("o{round}"), if round % 2 == 0 { "a! b!" } else { "b! a!" });
+        plant.order(&id, 0, 0, to);
+        sleep(Duration::from_millis(rng.u64(..1_000)));
+        plant.kill_gateway();
+        plant.start_gateway();
+        // Until it is taken, the master sends it again.
+        plant.wait_for("its state", |plant| {
+            let is_taken = plant.state()["orderId"] == id.as_str();
+            if !is_taken && plant.connection() == "ONLINE" {
+                plant.order(&id, 0, 0, to);
+                sleep(Duration::from_millis(100));
+            }
+            is_taken
+        });
+        plant.wait_for_end(&id, &to[3..4]);
+        let (said, messages) = (Messages::default(), |said: &Messages| said.lock().unwrap().get("connection").cloned());
+        let reader = master_named("reader", plant.port, said.clone());
+        until("what is retained", || messages(&said).is_some());
+        let first = messages(&said).unwrap()[0].clone();
+        assert_eq!(
+            (&first.0["connectionState"], first.1),
+            (&Value::from("ONLINE"), true),
+            "round {round}, seed {seed}"
+        );
+        reader.disconnect().unwrap();
+    }
+    // A drive that goes on with its edge has its number, so no number comes for two nodes, nor is a node reached twice.
+    assert_eq!(plant.count("arrived "), count, "seed {seed}: {:?}", plant.vehicle.lines());
+    println!("{count} fail-overs: ONLINE, and no order driven twice");
 }
 
 /// No stop waits for a disk.

@@ -287,6 +287,16 @@ impl Plant {
         });
     }
 
+    /// Until the order has ended at its last node, each state had some of its nodes: a master frees those that are gone.
+    pub fn order_is_never_empty(&self, id: &str, last: &str) {
+        let heard = self.heard.lock().unwrap();
+        let states = heard["state"].iter().filter(|(state, _)| state["orderId"] == id);
+        for (state, _) in states {
+            let left = state["nodeStates"].as_array().map_or(0, Vec::len);
+            assert!(left > 0 || state["lastNodeId"] == last, "{state}");
+        }
+    }
+
     pub fn action(&self, id: &str) -> String {
         let state = self.state();
         let states = state["actionStates"].as_array().cloned().unwrap_or_default();
@@ -349,7 +359,11 @@ pub fn broker(folder: &Path, port: u16, more: &str) -> Process {
 
 /// A client that hears all topics, and connects again.
 pub fn master(port: u16, heard: Messages) -> Client {
-    let mut options = MqttOptions::new("master", "127.0.0.1", port);
+    master_named("master", port, heard)
+}
+
+pub fn master_named(name: &str, port: u16, heard: Messages) -> Client {
+    let mut options = MqttOptions::new(name, "127.0.0.1", port);
     options.set_keep_alive(Duration::from_secs(5)).set_max_packet_size(1 << 20, 1 << 20);
     let (client, mut connection) = Client::new(options, 100);
     let subscriber = client.clone();
