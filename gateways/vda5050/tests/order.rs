@@ -135,6 +135,25 @@ fn each_box_of_the_order_handling() {
         // Boxes 2, 3 and 4: a new order.
         ("a new order", nothing, order("o1", 7, 0, "a! b!"), ""),
         ("while one is executed", half_way, order("o2", 0, 0, "b! c!"), "orderError"),
+        (
+            "while an action runs, with no node left",
+            |pair| {
+                pair.machine.order(order("o1", 0, 0, "a!:pick"));
+                pair.tell();
+            },
+            order("o2", 0, 0, "a! b!"),
+            "orderError",
+        ),
+        (
+            "in another mode",
+            |pair| {
+                pair.vehicle.status.mode = OperatingMode::Manual;
+                pair.machine.status(pair.vehicle.status.clone());
+            },
+            order("o1", 0, 0, "a! b!"),
+            "orderError",
+        ),
+        ("of a vehicle without a link", |pair| pair.machine.vehicle_lost(), order("o1", 0, 0, "a! b!"), "orderError"),
         ("behind one", done, order("o2", 0, 0, "b! c!"), ""),
         ("far away", nothing, order("o1", 0, 0, "c! b!"), "orderError"),
         (
@@ -164,6 +183,16 @@ fn each_box_of_the_order_handling() {
         ("a lower update", done, order("o1", 2, 2, "b! c!"), "orderUpdateError"),
         ("the same again", done, order("o1", 3, 0, "a! b!"), ""),
         ("the same update with other content", done, order("o1", 3, 2, "b! c!"), ""),
+        ("the same while it drives", half_way, order("o1", 0, 0, "a! b! c"), ""),
+        (
+            "a lower update while it drives",
+            |pair| {
+                half_way(pair);
+                pair.machine.order(order("o1", 2, 2, "b! c! d"));
+            },
+            order("o1", 1, 2, "b! c!"),
+            "orderUpdateError",
+        ),
         // Box 7.
         ("from the decision point", half_way, order("o1", 1, 2, "b! c!"), ""),
         ("with another horizon", half_way, order("o1", 1, 2, "b! d e"), ""),
