@@ -7,18 +7,24 @@ ip link set lo up 2>/dev/null || true
 
 dpkg --install /cara.deb
 cara --version
-man --where cara cara-node > /dev/null
+cara-vda5050 --version
+man --where cara cara-node cara-vda5050 > /dev/null
 [ "$(stat --format=%U:%G:%a /etc/cara)" = root:cara:750 ]
-systemd-analyze verify --man=no cara@plant.service cara-standby@plant.service
+systemd-analyze verify --man=no cara@plant.service cara-standby@plant.service cara-vda5050.service
 
 mkdir /etc/cara/keys /run/cara /var/lib/cara
 cara keys --dir /etc/cara/keys new-fleet --fleet 7 plant/1@m_unit agv/7 > /dev/null
 printf 'name = "plant"\nid = 1\nfleet = 7\ninterfaces = "lo"\n' > /etc/cara/plant.toml
-chmod 700 /run/cara /var/lib/cara
-chown --recursive cara:cara /etc/cara/keys /run/cara /var/lib/cara
+cp /usr/share/doc/cara/vda5050.toml /usr/share/doc/cara/example-factsheet.json /etc/cara
+sed -i 's#^state_folder = .*#state_folder = "/var/lib/cara-vda5050"#' /etc/cara/vda5050.toml
+mkdir /var/lib/cara-vda5050
+cara keys --dir /etc/cara/keys new-fleet --fleet 42 vda5050/1@m_unit agv-1/101 > /dev/null
+chmod 700 /run/cara /var/lib/cara /var/lib/cara-vda5050
+chown --recursive cara:cara /etc/cara/keys /run/cara /var/lib/cara /var/lib/cara-vda5050
 
 as_unit="setpriv --reuid=cara --regid=cara --init-groups --no-new-privs env CARA_CONTROL_DIR=/run/cara STATE_DIRECTORY=/var/lib/cara"
 $as_unit cara node --check /etc/cara/plant.toml
+$as_unit env CARA_KEYS=/etc/cara/keys cara-vda5050 --check /etc/cara/vda5050.toml
 $as_unit cara node /etc/cara/plant.toml > /node.log 2>&1 &
 node=$!
 for _ in $(seq 300); do

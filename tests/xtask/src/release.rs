@@ -1,4 +1,4 @@
-//! What a release consists of beside the crates: a static `cara`, Debian packages, checksums and lists of components.
+//! What a release consists of beside the crates: static programs, Debian packages, checksums and lists of components.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -11,6 +11,9 @@ use crate::install;
 use crate::workspace;
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// What is installed in `bin`, and of which manifest it is.
+const PROGRAMS: [(&str, &str); 2] =
+    [("cara", "std-port/cli/Cargo.toml"), ("cara-vda5050", "gateways/vda5050/Cargo.toml")];
 /// Where it is put together.
 const FOLDER: &str = "release-files";
 const SHELLS: [(&str, &str); 3] = [
@@ -53,9 +56,9 @@ pub(crate) fn make() -> Result<PathBuf> {
     let native = PROCESSORS.iter().find(|processor| processor.target.starts_with(std::env::consts::ARCH));
     let native = build(*native.context("releases are made on amd64 or arm64")?)?;
     for processor in PROCESSORS {
-        let program = build(processor)?;
+        let programs = build(processor)?;
         let tree = folder.join(processor.debian);
-        stage(&tree.join("usr"), &program, &native)?;
+        stage(&tree.join("usr"), &programs, &native.join("cara"))?;
         archive(&folder, &tree, processor)?;
         package(&folder, &tree, processor)?;
         fs::remove_dir_all(&tree)?;
@@ -73,28 +76,34 @@ fn empty(folder: &Path) -> Result<()> {
     }
 }
 
-/// One static program, which runs on every distribution, is in the archive and in the Debian package.
+/// Static programs, which run on every distribution, are in the archive and in the Debian package. Their folder.
 fn build(processor: Processor) -> Result<PathBuf> {
     let Processor { target, compiler, package, linker, .. } = processor;
     install::rust_target(target).and_then(|()| install::program(compiler, package)).map_err(anyhow::Error::msg)?;
     let folder = workspace::target().join("packages");
     let name = target.replace('-', "_");
-    Run::cargo()
-        .args(["build", "--release", "--locked", "--package", "cara-cli", "--target", target, "--target-dir"])
-        .args([&folder])
-        .env("CARGO_PROFILE_RELEASE_STRIP", "symbols")
-        .env(&format!("CC_{name}"), compiler)
-        .env(&format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), linker)
-        .stream()?;
-    Ok(folder.join(target).join("release/cara"))
+    for (program, manifest) in PROGRAMS {
+        Run::cargo()
+            .args(["build", "--release", "--locked", "--manifest-path", manifest, "--bin", program])
+            .args(["--target", target, "--target-dir"])
+            .args([&folder])
+            .env("CARGO_PROFILE_RELEASE_STRIP", "symbols")
+            .env(&format!("CC_{name}"), compiler)
+            .env(&format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), linker)
+            .stream()?;
+    }
+    Ok(folder.join(target).join("release"))
 }
 
 /// Puts what is installed under `usr`. The program of this host prints the texts.
-fn stage(usr: &Path, program: &Path, native: &Path) -> Result<()> {
-    place(&fs::read(program)?, &usr.join("bin/cara"), 0o755)?;
+fn stage(usr: &Path, programs: &Path, native: &Path) -> Result<()> {
+    for (program, _) in PROGRAMS {
+        place(&fs::read(programs.join(program))?, &usr.join("bin").join(program), 0o755)?;
+    }
     let native = native.to_string_lossy();
     let manuals = usr.join("share/man/man1");
     Run::new(&native).args(["man", "--dir"]).args([&manuals]).text()?;
+    copy("packaging/cara-vda5050.1", &manuals.join("cara-vda5050.1"))?;
     for page in fs::read_dir(&manuals)? {
         Run::new("gzip").args(["-9n"]).args([page?.path()]).stream()?;
     }
@@ -103,10 +112,17 @@ fn stage(usr: &Path, program: &Path, native: &Path) -> Result<()> {
     }
     let documents = usr.join("share/doc/cara");
     for file in ["README.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"] {
-        place(workspace::read(Path::new(file))?.as_bytes(), &documents.join(file), 0o644)?;
+        copy(file, &documents.join(file))?;
     }
+    copy("gateways/vda5050/example.toml", &documents.join("vda5050.toml"))?;
+    copy("gateways/vda5050/example-factsheet.json", &documents.join("example-factsheet.json"))?;
     let example = Run::new(&native).args(["node", "--example"]).text()?;
     place(example.as_bytes(), &documents.join("node.toml"), 0o644)
+}
+
+/// A file of the project, which only root changes there.
+fn copy(file: &str, path: &Path) -> Result<()> {
+    place(workspace::read(Path::new(file))?.as_bytes(), path, 0o644)
 }
 
 fn place(content: &[u8], path: &Path, mode: u32) -> Result<()> {
@@ -128,21 +144,20 @@ fn archive(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
 }
 
 fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
-    let unit = workspace::read(Path::new("packaging/systemd/cara@.service"))?;
-    let sysusers = workspace::read(Path::new("packaging/systemd/sysusers.conf"))?;
-    place(unit.as_bytes(), &tree.join("usr/lib/systemd/system/cara@.service"), 0o644)?;
+    let units = tree.join("usr/lib/systemd/system");
+    copy("packaging/systemd/cara@.service", &units.join("cara@.service"))?;
     // A standby is the same node, started otherwise.
-    place(unit.as_bytes(), &tree.join("usr/lib/systemd/system/cara-standby@.service"), 0o644)?;
-    let standby = workspace::read(Path::new("packaging/systemd/standby.conf"))?;
-    place(standby.as_bytes(), &tree.join("usr/lib/systemd/system/cara-standby@.service.d/standby.conf"), 0o644)?;
-    place(sysusers.as_bytes(), &tree.join("usr/lib/sysusers.d/cara.conf"), 0o644)?;
+    copy("packaging/systemd/cara@.service", &units.join("cara-standby@.service"))?;
+    copy("packaging/systemd/standby.conf", &units.join("cara-standby@.service.d/standby.conf"))?;
+    copy("gateways/vda5050/cara-vda5050.service", &units.join("cara-vda5050.service"))?;
+    copy("packaging/systemd/sysusers.conf", &tree.join("usr/lib/sysusers.d/cara.conf"))?;
     fs::create_dir_all(tree.join("etc/cara"))?;
     let size = Run::new("du").args(["--summarize", "--block-size=1024"]).args([tree]).text()?;
     let size = size.split_whitespace().next().unwrap_or_default().to_owned();
     let control = format!(
         "Package: cara\nVersion: {VERSION}\nArchitecture: {}\nMaintainer: {}\nInstalled-Size: {size}\nDepends: procps, systemd\n\
-         Section: net\nPriority: optional\nDescription: {}\n Managers of automated guided vehicles, and the command that asks, starts and\n \
-         diagnoses them.\n",
+         Section: net\nPriority: optional\nDescription: {}\n Managers of automated guided vehicles, the command that asks, starts and\n \
+         diagnoses them, and a gateway to VDA 5050.\n",
         processor.debian,
         env!("CARGO_PKG_AUTHORS"),
         "nodes of the Communication Architecture for Robotic Applications",
@@ -156,7 +171,7 @@ fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
     Run::new("dpkg-deb").args(["--root-owner-group", "--build"]).args([tree, &file]).stream()
 }
 
-/// CycloneDX lists of what is in `cara` and in the firmware.
+/// CycloneDX lists of what is in the programs and in the firmware.
 fn components(folder: &Path) -> Result<()> {
     let tools = workspace::target().join("tools");
     if !tools.join("bin/cargo-cyclonedx").is_file() {
@@ -169,7 +184,8 @@ fn components(folder: &Path) -> Result<()> {
     let images = fs::read_dir(workspace::root().join("examples/firmware"))?.collect::<Result<Vec<_>, _>>()?;
     let images = images.into_iter().map(|image| image.path().join("Cargo.toml")).filter(|path| path.is_file());
     let images = images.filter(|path| path.with_file_name("Cargo.lock").is_file());
-    for manifest in images.chain([workspace::root().join("std-port/cli/Cargo.toml")]) {
+    let programs = PROGRAMS.map(|(_, manifest)| workspace::root().join(manifest));
+    for manifest in images.chain(programs) {
         let name = format!("cara-components-{}", folder_name(&manifest));
         Run::new(&tool.to_string_lossy())
             .args(["cyclonedx", "--format", "json", "--spec-version", "1.5", "--override-filename", &name])
