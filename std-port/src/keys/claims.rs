@@ -13,8 +13,8 @@ use super::{KeyError, file};
 
 /// The first line's word.
 const HEAD: &str = "cara-claims";
-/// Before a line that versions without hand-over have to skip: they skip what begins with `#`, and take a file with a word that they
-/// do not know for damaged.
+/// Before a line that versions without hand-over have to skip: they skip what begins with `#`, and take a file with a word that
+/// they do not know for damaged.
 const LATER: &str = "#!";
 
 /// What a unit keeps.

@@ -23,7 +23,7 @@ const CHOSEN: &str = "$unit";
 /// Each rule fires by what it is for; a Prometheus scrapes a manager, finds all that the dashboard shows, and sees a vehicle go.
 pub(crate) fn check() -> Result<()> {
     Run::new("promtool").args(["check", "rules", RULES]).stream()?;
-    Run::new("promtool").args(["test", "rules", "tests/prometheus/alerts.yml"]).stream()?;
+    Run::new("promtool").args(["test", "rules", "tests/packages/alerts.yml"]).stream()?;
     all_are_tested()?;
     binaries::build(&["agv", "cara"])?;
     scrape(&panels()?)
@@ -36,7 +36,7 @@ fn all_are_tested() -> Result<()> {
         let after = text.lines().filter_map(|line| line.split_once(word)).map(|(_, rest)| rest);
         Ok(after.filter_map(|rest| rest.split([',', ' ']).next().map(str::to_owned)).collect())
     };
-    let (rules, tested) = (names(RULES, "- alert: ")?, names("tests/prometheus/alerts.yml", "alertname: ")?);
+    let (rules, tested) = (names(RULES, "- alert: ")?, names("tests/packages/alerts.yml", "alertname: ")?);
     ensure!(!rules.is_empty() && rules == tested, "{RULES} has {rules:?}, and tested are {tested:?}");
     Ok(())
 }

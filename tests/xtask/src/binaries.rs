@@ -64,8 +64,8 @@ pub(crate) fn changed(build: Run, patch: &str) -> Result<Run> {
     of_another_tree(build, &folder)
 }
 
-/// The same build, of the `tree` in a folder. What it depends on is that of every other build, so what it makes itself goes to that
-/// folder; cargo tells both apart by the path of the wrapper.
+/// The same build, of the `tree` in a folder. What it depends on is that of every other build, so what it makes itself goes to
+/// that folder; cargo tells both apart by the path of the wrapper.
 pub(crate) fn of_another_tree(build: Run, folder: &Path) -> Result<Run> {
     let wrapper = folder.join("rustc");
     fs::write(&wrapper, "#!/bin/sh\nexec \"$@\"\n")?;

@@ -29,8 +29,8 @@ pub(crate) fn check() -> Result<()> {
     both_ways(&later, "a later one")
 }
 
-/// The demonstration and a fleet in motion beside builds of earlier revisions: the tags `wire-N` and `v*`, or else the last commit of
-/// the day before this one's.
+/// The demonstration and a fleet in motion beside builds of earlier revisions: the tags `wire-N` and `v*`, or else the last commit
+/// of the day before this one's.
 pub(crate) fn versions(revisions: &[String]) -> Result<()> {
     let tags = Run::new("git").args(["tag", "--list", "wire-*", "v*"]).text()?;
     let mut revisions: Vec<String> = match revisions {
