@@ -270,8 +270,8 @@ impl Noise {
         self
     }
 
-    #[cfg(test)]
-    fn suite(&self) -> Option<Suite> {
+    /// The suite of the link, once its ends have proven themselves.
+    pub fn suite(&self) -> Option<Suite> {
         self.sealed().map(|sealing| sealing.channel.suite())
     }
 
@@ -454,6 +454,11 @@ impl Cipher {
             Self::Plain(plain) => Self::Plain(plain),
             Self::Noise(noise) => Self::Noise(noise.offering_aes()),
         }
+    }
+
+    /// The suite of a secured link, once its ends have proven themselves.
+    pub fn suite(&self) -> Option<Suite> {
+        if let Self::Noise(noise) = self { noise.suite() } else { None }
     }
 
     /// For tests that no key and number seal twice: a hash of the key, and the number, of the next frame and the next datagram.

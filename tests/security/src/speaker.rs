@@ -3,7 +3,7 @@
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream, UdpSocket};
-use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::time::Duration;
 
 use cara_core::config::{Mode, Priority};
@@ -17,6 +17,7 @@ use cara_core::host::frame::{self, Frame};
 use cara_core::host::secure::{Seal, Secure};
 use cara_secure::keys::PairKey;
 use cara_secure::link::{Cipher, Credentials};
+use cara_secure::suite::Suite;
 
 /// Longest wait for the other end.
 pub const PATIENCE: Duration = Duration::from_secs(30);
@@ -108,20 +109,24 @@ pub fn fresh_mark() -> i64 {
 }
 
 impl Speaker {
-    /// At one end of a connection, with a key.
+    /// At one end of a connection, with a key. Every other one offers AES-256-GCM.
     pub fn new(stream: TcpStream, dials: bool, mode: Mode, claim: Claim, key: PairKey) -> io::Result<Self> {
         stream.set_nodelay(true)?;
         stream.set_read_timeout(Some(PATIENCE))?;
         stream.set_write_timeout(Some(PATIENCE))?;
         let datagrams = UdpSocket::bind((stream.local_addr()?.ip(), 0))?;
-        let own = hello(&claim, mode, datagrams.local_addr()?.port());
+        let mut own = hello(&claim, mode, datagrams.local_addr()?.port());
+        static AES: AtomicBool = AtomicBool::new(false);
+        let cipher = Cipher::new(mode);
+        let cipher = if AES.fetch_not(Ordering::Relaxed) { cipher } else { cipher.offering_aes() };
+        cipher.offer(&mut own);
         Ok(Self {
             stream,
             datagrams,
             claim,
             dials,
             key,
-            cipher: Cipher::new(mode),
+            cipher,
             own,
             theirs: None,
             came: Vec::new(),
@@ -172,6 +177,11 @@ impl Speaker {
             }
         }
         Ok(self.at)
+    }
+
+    /// The suite of the link, once it has proven itself.
+    pub fn suite(&self) -> Option<Suite> {
+        self.cipher.suite()
     }
 
     /// Sends a message.

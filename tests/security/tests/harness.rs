@@ -2,10 +2,11 @@
 //! with the key.
 
 use cara_core::config::Mode;
+use cara_secure::suite::Suite;
 use cara_security::between::Middle;
 use cara_security::links::{self, Extent};
 use cara_security::linux::{Linux, LinuxVehicles, Weakness};
-use cara_security::speaker::End;
+use cara_security::speaker::{End, HANDSHAKE};
 use cara_security::tally::{Report, Row};
 use cara_security::target::Target;
 use cara_security::{discovery, permission};
@@ -110,4 +111,22 @@ fn who_has_the_key_gets_in() {
         assert_eq!(report.faults(), [""; 0]);
         assert!(report.rows.iter().all(|row| row.control && row.successes > 0));
     }
+}
+
+/// Attackers speak both suites.
+#[test]
+fn speakers_have_both_suites() {
+    let linux = Linux::new(64, Weakness::None).unwrap();
+    let manager = linux.manager().unwrap();
+    // Other tests' speakers take turns with these.
+    let suites = [(); 16].map(|()| {
+        let visit = manager.visit().unwrap();
+        let mut speaker = visit.speaker(&visit.keys.genuine).unwrap();
+        speaker.converse(HANDSHAKE + 1).unwrap();
+        speaker.suite().unwrap()
+    });
+    assert!(suites.contains(&Suite::ChaChaPoly), "{suites:?}");
+    // A host without instructions for AES does not offer it.
+    #[cfg(target_arch = "x86_64")]
+    assert_eq!(suites.contains(&Suite::AesGcm), is_x86_feature_detected!("aes"), "{suites:?}");
 }
