@@ -20,7 +20,7 @@ use core::net::SocketAddr;
 
 use crate::config;
 #[cfg(feature = "control")]
-use crate::control::protocol::{DatagramsInfo, LinkInfo};
+use crate::control::protocol::{CipherInfo, DatagramsInfo, LinkInfo};
 use crate::engine::link::LinkCell;
 use crate::engine::peer_cell::PeerCell;
 use crate::engine::{Engine, pairs};
@@ -229,7 +229,7 @@ impl<T: Send + 'static> Peer<T> {
     #[cfg(feature = "control")]
     pub(crate) fn link_info(&self) -> Option<LinkInfo> {
         let link = self.link().ok()?;
-        let state = link.lock();
+        let mut state = link.lock();
         Some(LinkInfo {
             silent_ms: state.session.silent_for(self.engine.now()).as_millis(),
             calls: state.session.calls_in_flight(),
@@ -243,6 +243,7 @@ impl<T: Send + 'static> Peer<T> {
                 (false, false) => DatagramsInfo::None,
             }),
             segment: link.stream.segment(),
+            cipher: state.session.cipher().suite().map(CipherInfo::of),
         })
     }
 

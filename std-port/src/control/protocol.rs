@@ -4,6 +4,7 @@
 
 use cara_core::config::SHORT_SEGMENT;
 use cara_core::distribution::function::Attributes;
+use cara_secure::suite::Suite;
 use std::collections::BTreeMap;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -625,6 +626,9 @@ pub struct LinkInfo {
     /// Longest segment that the unit sends in the stream, in bytes.
     #[serde(default)]
     pub segment: Option<u32>,
+    /// What seals it; absent in plain mode.
+    #[serde(default)]
+    pub cipher: Option<CipherInfo>,
 }
 
 impl LinkInfo {
@@ -661,6 +665,35 @@ pub enum DatagramsInfo {
     ToNode,
     /// In neither.
     None,
+}
+
+/// What seals a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum CipherInfo {
+    /// ChaCha20-Poly1305.
+    #[serde(rename = "ChaCha20-Poly1305")]
+    ChaChaPoly,
+    /// AES-256-GCM.
+    #[serde(rename = "AES-256-GCM")]
+    AesGcm,
+}
+
+impl CipherInfo {
+    pub(crate) const fn of(suite: Suite) -> Self {
+        match suite {
+            Suite::ChaChaPoly => Self::ChaChaPoly,
+            #[cfg(feature = "ring")]
+            Suite::AesGcm => Self::AesGcm,
+        }
+    }
+
+    /// Its name.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::ChaChaPoly => "ChaCha20-Poly1305",
+            Self::AesGcm => "AES-256-GCM",
+        }
+    }
 }
 
 /// Milliseconds since 1970 now.

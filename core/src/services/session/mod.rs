@@ -295,6 +295,11 @@ impl<P: Port> Session<P> {
         self.wire.hello()
     }
 
+    /// The link's cipher.
+    pub const fn cipher(&mut self) -> &P::Cipher {
+        self.wire.link.cipher()
+    }
+
     /// The protocol version of the link, once the peer's hello has come.
     pub fn version(&self) -> Option<u8> {
         self.wire.remote.as_ref().map(|remote| remote.version)

@@ -186,6 +186,7 @@ mod tests {
             stream_ms: 3_000,
             datagrams: None,
             segment: Some(1_448),
+            cipher: None,
         };
         let mut reported = |link: LinkInfo, died| {
             seen.running[0].nodes[0].link = Some(link);

@@ -141,6 +141,7 @@ fn node() -> Value {
         "limits": { "message_size": 0, "chunk_size": 0, "calls": 0, "minimum_interval_us": 0 },
         "link": {
             "silent_ms": 0, "calls": 0, "calls_here": 0, "queued_bytes": 0, "stream_ms": 0, "datagrams": "", "segment": 0,
+            "cipher": "",
         },
     })
 }

@@ -24,6 +24,7 @@ fn a_scan_shows_who_is_there() {
     let link = &reported["nodes"][0]["link"];
     let numbers = ["silent_ms", "calls", "calls_here", "queued_bytes"].map(|number| link[number].as_u64());
     assert!(numbers.iter().all(Option::is_some) && numbers[0] < Some(30_000), "{link}");
+    assert!(["AES-256-GCM", "ChaCha20-Poly1305"].iter().any(|cipher| link["cipher"] == *cipher), "{link}");
     assert_eq!(stage.ends(0, &["scan", "--offering", "go_to", "--json"]).json()["nodes"].as_array().unwrap().len(), 2);
     stage.ends(0, &["scan", "--offering", "fly"]).says("no such node");
     stage.ends(0, &["scan", "--search", "--listen", "10ms"]).says("agv-2");

@@ -414,6 +414,9 @@ fn node(app: &App, now: Now) -> Vec<Row> {
         said.push(("last sign of it".into(), cell(format!("{} ago", span(ms(link.silent_ms) + age)))));
         said.push(("calls".into(), cell(format!("{} to it are open, {} of it here", link.calls, link.calls_here))));
         said.push(("queue".into(), cell(format!("{} not sent yet", show_bytes(link.queued_bytes as u64)))));
+        if let Some(cipher) = link.cipher {
+            said.push(("cipher".into(), cell(cipher.name())));
+        }
     }
     if let Some(limits) = node.limits {
         let text = format!("{} a message, {} calls", show_bytes(limits.message_size.into()), limits.calls);

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use cara_std::control::protocol::{
-    ConstraintsInfo, DatagramsInfo, InhibitedInfo, LimitsInfo, LinkInfo, NodeInfo, OrderInfo, RefusedInfo, UnitInfo,
+    CipherInfo, ConstraintsInfo, DatagramsInfo, InhibitedInfo, LimitsInfo, LinkInfo, NodeInfo, OrderInfo, RefusedInfo,
+    UnitInfo,
 };
 use cara_std::is_hidden;
 use ratatui::Terminal;
@@ -44,6 +45,7 @@ fn node(name: &str, id: u32) -> NodeInfo {
             stream_ms: 120,
             datagrams: Some(DatagramsInfo::Pass),
             segment: None,
+            cipher: Some(CipherInfo::AesGcm),
         }),
         functions: 2,
     }
@@ -319,6 +321,7 @@ cara top  depot/1  fleet 7  secured  up 3 min
   last sign of it        320 ms ago
   calls                  1 to it are open, 0 of it here
   queue                  2 KiB not sent yet
+  cipher                 AES-256-GCM
   it takes               32 KiB a message, 8 calls
   order go_to            runs, of unit 1, left 1.3 s, inhibited -
   stream                 pose(x: 7)  500 ms old
