@@ -77,6 +77,22 @@ fn a_manager_that_starts_beside_one_that_hangs_raises_its_claim() {
     }
 }
 
+/// Its other vehicle hears of the raised claim on the link that it has.
+#[test]
+fn a_raised_claim_is_announced_on_live_links() {
+    for seed in 0..5 {
+        let (mut world, dead, agv) = fifth(seed);
+        world.block_request(&dead, "agv", "go_to", &mut position()).unwrap();
+        world.crash(&dead, Crash::PowerCut);
+        let newer = world.m_unit("manager", 1).start();
+        let other = start_agv(&world, "other", 8);
+        assert!(world.run_until(|_| other.is_connected("manager") && other.claim() == newer.claim(), secs(10)));
+        assert!(world.run_until(|_| newer.claim() > dead.claim(), secs(40)), "{seed}: {:?}", newer.log());
+        assert!(world.run_until(|_| other.claim() == newer.claim(), secs(1)), "{seed}: {:?}", other.log());
+        assert!(world.run_until(|_| agv.claim() == newer.claim(), secs(10)), "{seed}: {:?}", agv.log());
+    }
+}
+
 /// The vehicles hear both. They stay together, under one of the two.
 #[test]
 fn two_managers_that_cannot_hear_each_other_do_not_split_the_fleet() {
