@@ -72,7 +72,7 @@ impl Program {
     /// Whether the test passes; an error unless it ran to its end.
     pub(crate) fn passes(&self, test: &str) -> Result<bool> {
         let run = Run::new("timeout").within(&self.package).args(["--kill-after=5", LIMIT, &self.executable]);
-        let (_, output, errors) = run.args([test, "--exact"]).captured()?;
+        let (_, output, errors) = run.env("RUST_MIN_STACK", STACK).args([test, "--exact"]).captured()?;
         let line = format!("test {test} ");
         let ended = output.lines().filter(|found| found.starts_with(&line));
         let verdict = ended.filter_map(|line| line.split_once(" ... ")?.1.split_whitespace().next()).next();
@@ -86,6 +86,8 @@ impl Program {
 
 /// Seconds that a test may take.
 const LIMIT: &str = "150";
+/// Bytes of a test's stack: without optimisation the boards of a scenario need more than the usual 2 MiB.
+const STACK: &str = "33554432";
 
 /// What to tell cargo, so that it builds the program of a test that documents call `reference`, and not much else.
 pub(crate) fn selection(root: &Path, reference: &str) -> Result<Vec<String>> {
