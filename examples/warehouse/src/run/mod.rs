@@ -192,6 +192,10 @@ impl Run<'_> {
             self.hear()?;
         }
         self.stage.show(&format!("all vehicles have joined after {:.1} s", began.elapsed().as_secs_f64()));
+        // On one host the first has the control socket, for the page.
+        if options.standby {
+            self.stage.start_standby()?;
+        }
         let start = Instant::now();
         if !options.no_faults {
             self.due = schedule(options.seed, span).into_iter().map(|(at, fault)| (at, Due::Break(fault))).collect();

@@ -126,9 +126,6 @@ impl Stage {
         }
         self.start(Role::Mechanic, &["mechanic".to_owned(), "--fleet".to_owned(), self.network.fleet.to_string()])?;
         self.start_manager(false)?;
-        if self.standby {
-            self.start_standby()?;
-        }
         let (fleet, map) = (self.network.fleet, self.files.map.display());
         self.show(&format!("to watch: cara web --unit {}/{} --fleet {fleet} --background {map}", MANAGER.0, MANAGER.1));
         Ok(())
