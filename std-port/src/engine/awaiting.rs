@@ -79,15 +79,16 @@ impl<T: Send + 'static> Pending<T> {
         callee: Callee<'_>,
         options: &RequestOptions,
     ) -> Self {
-        let (usual, made) = {
-            let session = &mut link.lock().session;
-            (session.constraints().request_timeout, session.make())
+        let now = engine.now();
+        let (timeout, made) = {
+            let mut state = link.lock();
+            (engine.timeout(now, &state, &callee, options), state.session.make())
         };
         Self {
             engine: engine.clone(),
             stage: Stage::Unsent,
             given_up: None,
-            deadline: engine.now() + options.timeout.unwrap_or(usual),
+            deadline: now + timeout,
             made,
             alarm: Alarm::new(engine.driver.clone()),
             mark: None,

@@ -88,6 +88,21 @@ impl<T: Send + 'static> Engine<T> {
         result
     }
 
+    /// What a handler asks for its caller is of no use once that waits no longer; a stop is sent all the same.
+    pub(super) fn timeout(
+        &self,
+        now: Instant,
+        state: &LinkState,
+        callee: &Callee<'_>,
+        options: &RequestOptions,
+    ) -> Duration {
+        let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
+        match nested::left(self.driver.clock(), now) {
+            Some(left) if !is_urgent(state, callee, options) => timeout.min(left),
+            _ => timeout,
+        }
+    }
+
     /// Sends the request as soon as the interval and the room allow, within the deadline, unless it is given up before.
     fn begin_call<'l>(
         &self,
@@ -97,13 +112,7 @@ impl<T: Send + 'static> Engine<T> {
         let Outgoing { callee, parameters, options, canceller, .. } = outgoing;
         let mut now = self.now();
         let mut state = link.lock();
-        let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
-        // What a handler asks for its caller is of no use once that waits no longer; a stop is sent all the same.
-        let timeout = match nested::left(self.driver.clock(), now) {
-            Some(left) if !is_urgent(&state, callee, options) => timeout.min(left),
-            _ => timeout,
-        };
-        let deadline = now + timeout;
+        let deadline = now + self.timeout(now, &state, callee, options);
         // It keeps its place among the calls that move the same thing, however long it waits for room.
         let made = Some(state.session.make());
         loop {

@@ -12,9 +12,11 @@ use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::session::Incoming;
+use cara_core::time::Duration;
 
 use super::driving::{Alarm, Driver};
 use super::link::LinkCell;
+use super::nested;
 use super::served::{GivenUp, PAUSE, Reports};
 use crate::executor::Executor;
 use crate::handler::{self, Begin, Work};
@@ -79,6 +81,8 @@ pub(super) struct Task {
     driver: Arc<Driver>,
     link: Arc<LinkCell>,
     call: Incoming,
+    /// Until when its caller waits for an answer, on the system's boot clock.
+    end: Option<Duration>,
     /// The handler, while it runs.
     work: Option<Work>,
     /// What is answered once it does not.
@@ -106,7 +110,9 @@ impl Task {
     ) -> Self {
         let (lease, given_up) = (reported.lease_ended(), reported.given_up.clone());
         let caller = reported.caller.clone();
-        let work = catch_unwind(AssertUnwindSafe(|| begin(reported, arguments)));
+        let waited_for = call.wants_reply && call.order.is_none();
+        let end = waited_for.then(|| driver.clock().boot_time_of(call.deadline));
+        let work = nested::until(end, || catch_unwind(AssertUnwindSafe(|| begin(reported, arguments))));
         if work.is_err() {
             tracing::error!(%caller, "a handler panicked");
         }
@@ -117,7 +123,7 @@ impl Task {
         let alarm = Alarm::new(driver.clone());
         let link = link.clone();
         let (failure, answered) = (None, false);
-        Self { unit, driver, link, call, work, result, given_up, to_its_end, lease, alarm, failure, answered }
+        Self { unit, driver, link, call, end, work, result, given_up, to_its_end, lease, alarm, failure, answered }
     }
 
     /// Whether nothing wants the call any more: its caller's time is over, its link or its order has ended. Otherwise the
@@ -149,7 +155,9 @@ impl Task {
         let ended = if is_given_up && !self.to_its_end {
             Ok(Err(Error::Expired))
         } else {
-            match catch_unwind(AssertUnwindSafe(|| work.as_mut().poll(cx))) {
+            // What it asks once it is notified is no longer for its caller.
+            let end = self.end.filter(|_| !is_given_up);
+            match nested::until(end, || catch_unwind(AssertUnwindSafe(|| work.as_mut().poll(cx)))) {
                 Ok(Poll::Pending) => return Poll::Pending,
                 Ok(Poll::Ready(result)) => Ok(result.map_err(Error::Service)),
                 Err(panic) => Err(panic),

@@ -1,6 +1,7 @@
 //! Services whose handlers are futures.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::channel;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -10,7 +11,7 @@ use cara_std::{
 };
 
 use super::{once, patient, runtime, within_millis};
-use crate::support::{ask, counter, fleet, meet, number, pair, system, unit, until, value};
+use crate::support::{Gate, PATIENCE, ask, counter, fleet, held, meet, number, pair, system, unit, until, value};
 
 /// How many handlers are inside, and how many have been dropped before their end.
 #[derive(Default)]
@@ -158,6 +159,37 @@ fn waiting(agv: &Unit, reported: bool) -> Arc<Seen> {
     let leased = options().lease(Duration::from_secs(5), || {});
     list.add_service(&definition("drive"), leased, handler(&seen)).unwrap();
     seen
+}
+
+/// The callback is let go by nobody, and has an hour by itself. What is asked after the caller's time has a time of its own.
+#[test]
+fn a_call_that_a_future_makes_ends_with_its_callers_deadline() {
+    let (manager, agv) = pair();
+    let runtime = runtime();
+    run_on(&agv, &runtime);
+    let (gate, back): (Arc<Gate>, Arc<OnceLock<Peer<()>>>) = Default::default();
+    let (there, (told, outcomes)) = (back.clone(), channel());
+    let asks_back = move |call: Served, parameters: Parameters| {
+        let (there, told) = (there.clone(), told.clone());
+        async move {
+            let manager = there.get().unwrap();
+            let hour = Duration::from_secs(3_600);
+            let ended = manager.call("mine", &mut number(1)).timeout(hour).await;
+            call.given_up().await;
+            let later = manager.call("echo", &mut number(1)).with(patient()).await;
+            let _ = told.send((ended.map_err(Error::from), later.map_err(Error::from)));
+            Ok(parameters)
+        }
+    };
+    let options = ServiceOptions::new().runs_to_its_end();
+    agv.my_function_list().add_service(&definition("asks_back"), options, asks_back).unwrap();
+    manager.my_function_list().add_function("mine", &number(0), held(&gate)).unwrap();
+    manager.my_function_list().add_function("echo", &number(0), |parameters: Parameters| parameters).unwrap();
+    let (peer, to_manager) = meet(&manager, &agv);
+    assert!(back.set(to_manager).is_ok());
+    let _ = peer.call("asks_back", &mut number(1)).with(within_millis(500)).wait();
+    assert_eq!(outcomes.recv_timeout(PATIENCE / 2), Ok((Err(Error::TimedOut), Ok(()))));
+    gate.open();
 }
 
 #[test]
