@@ -332,7 +332,6 @@ cara top  depot/1  fleet 7  secured  up 3 min
 
 
 
-
 S STOP ALL  s stop  c call  r reset  Enter watch  / filter  ? help  q quit
 ",
     );
