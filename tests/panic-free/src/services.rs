@@ -129,6 +129,7 @@ entry!(session_asked, {
     keep((session.dialed(), session.is_live(), session.is_proven(), session.is_ended(), session.hello()));
     keep(session.version());
     keep(self::session().make());
+    keep(session.cipher());
     keep((session.identity(), session.peer(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((
         session.their_function_list(),

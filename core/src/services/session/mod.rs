@@ -49,8 +49,7 @@ use crate::distribution::connection_handler::{Admission, Directive};
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::{Hello, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity};
-use crate::distribution::message::HandOverRefusal;
-use crate::distribution::message::{LONGEST_HEADER_BYTES, SessionBody};
+use crate::distribution::message::{HandOverRefusal, LONGEST_HEADER_BYTES, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Link, LinkCounter, Liveness};
@@ -68,7 +67,6 @@ use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
 use granting::Granting;
 use holding::Calling;
-use peer_clock::PeerClock;
 use permitting::decide;
 use proving::{reply_to_hello, send_hello};
 use wire::{Phase, Wire, close_code, close_reason};
@@ -230,7 +228,7 @@ impl<P: Port> Session<P> {
             holds: false,
             joined: false,
             challenged: false,
-            clock: PeerClock::new(),
+            clock: peer_clock::PeerClock::new(),
             due: due::Due::new(),
             pace: State::NEW,
             last_write: Instant::START,
