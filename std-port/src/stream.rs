@@ -232,6 +232,7 @@ impl<T: Send + 'static> TheirStream<T> {
 
     /// As [`subscribe`](Self::subscribe), as often as the node grants; a reader that is late gets the values that came meanwhile one
     /// after another, up to 64 KiB of them.
+    #[cfg(feature = "control")]
     pub(crate) fn subscribe_to_each(&self) -> Subscription<T> {
         self.subscription(Duration::ZERO, true)
     }
