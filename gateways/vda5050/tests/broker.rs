@@ -368,7 +368,7 @@ fn without_a_broker_the_vehicle_stops_within_its_bound() {
             plant.broker.as_ref().unwrap().signal(Signal::CONT);
         }
         plant.wait_for("it is paused", |plant| plant.state()["paused"] == true && plant.has_error("brokerLost"));
-        plant.instant("stopPause", "p1");
+        plant.go_on();
         plant.wait_for_end("o1", "k");
     }
 }
@@ -433,7 +433,7 @@ fn a_network_that_loses_everything_stops_the_vehicle() {
         holds.store(false, Ordering::SeqCst);
         plant.wait_for("it is paused", |plant| plant.state()["paused"] == true && plant.has_error("brokerLost"));
         plant.wait_for("what is late is refused", |plant| plant.has_error("validationError"));
-        plant.instant("stopPause", "p1");
+        plant.go_on();
         plant.wait_for_end("o1", "k");
         assert_eq!([plant.count("drive "), plant.count("act ")], [1, 0], "{:?}", plant.vehicle.lines());
     }

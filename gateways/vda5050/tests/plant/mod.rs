@@ -1,6 +1,7 @@
 //! A plant of processes: mosquitto, a master, the gateway and a vehicle.
 #![allow(dead_code, unreachable_pub)]
 
+use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -276,6 +277,19 @@ impl Plant {
         let message = instant(kind, id);
         self.publish("instantActions", false, &message);
         message
+    }
+
+    /// Ends a pause. What arrives before the gateway hears the broker again is refused as late: a master says it again.
+    pub fn go_on(&self) {
+        let said = Cell::new(0);
+        let begun = Instant::now();
+        self.wait_for("it goes on", |plant| {
+            if begun.elapsed() >= Duration::from_secs(1) * said.get() {
+                said.set(said.get() + 1);
+                plant.instant("stopPause", &format!("go-on-{}", said.get()));
+            }
+            plant.state()["paused"] == false
+        });
     }
 
     /// The order's end has come, at a node.
