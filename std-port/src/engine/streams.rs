@@ -51,6 +51,15 @@ impl Source for OwnStream {
 /// Bytes of values that wait for the handles that want each; what does not fit is lost, the oldest first.
 const KEPT_BYTES: usize = 64 * 1024;
 
+/// What a handle wants of a stream.
+struct Want {
+    /// The handle's number.
+    id: u64,
+    interval: Duration,
+    /// Each value, also those that a newer one has replaced.
+    each: bool,
+}
+
 /// A stream of a node, as the handles of this process share it.
 pub(crate) struct Watched {
     pub(crate) name: String,
@@ -60,12 +69,9 @@ pub(crate) struct Watched {
 
 #[derive(Default)]
 struct WatchedState {
-    /// The handles, and the interval that each wants.
-    wants: Vec<(u64, Duration)>,
+    wants: Vec<Want>,
     last_id: u64,
-    /// The handles that want each value.
-    each: Vec<u64>,
-    /// The last values, the newest last, while any handle wants each.
+    /// The last values, the newest last, while a handle wants each.
     kept: VecDeque<Received>,
     kept_bytes: usize,
     newest: Option<Received>,
@@ -100,8 +106,12 @@ impl Received {
 }
 
 impl WatchedState {
+    fn is_kept(&self) -> bool {
+        self.wants.iter().any(|want| want.each)
+    }
+
     fn put(&mut self, received: Received) {
-        if !self.each.is_empty() {
+        if self.is_kept() {
             self.kept_bytes += received.bytes();
             self.kept.push_back(received.clone());
             while self.kept_bytes > KEPT_BYTES
@@ -117,7 +127,7 @@ impl WatchedState {
     /// The newest value, or for a handle that wants each the oldest that it has not `seen`; and how many values have come up to it.
     fn after(&self, seen: u64, id: u64) -> Option<(Received, u64)> {
         let newest = self.newest.as_ref().filter(|_| self.count > seen)?;
-        if self.each.contains(&id) {
+        if self.wants.iter().any(|want| want.id == id && want.each) {
             let before = self.count - self.kept.len() as u64;
             let index = seen.saturating_sub(before);
             if let Some(received) = self.kept.get(index as usize) {
@@ -206,24 +216,22 @@ impl Watched {
     }
 
     fn interval(&self) -> Option<Duration> {
-        lock(&self.state).wants.iter().map(|(_, interval)| *interval).min()
+        lock(&self.state).wants.iter().map(|want| want.interval).min()
     }
 
     fn want(&self, interval: Duration, each: bool) -> u64 {
         let mut state = lock(&self.state);
         state.last_id += 1;
         let id = state.last_id;
-        state.wants.push((id, interval));
-        state.each.extend(each.then_some(id));
+        state.wants.push(Want { id, interval, each });
         id
     }
 
     /// Whether no handle is left.
     fn want_no_more(&self, id: u64) -> bool {
         let mut state = lock(&self.state);
-        state.wants.retain(|(known, _)| *known != id);
-        state.each.retain(|known| *known != id);
-        if state.each.is_empty() {
+        state.wants.retain(|want| want.id != id);
+        if !state.is_kept() {
             state.kept.clear();
             state.kept_bytes = 0;
         }

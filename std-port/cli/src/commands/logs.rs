@@ -1,4 +1,4 @@
-//! `cara logs`: the logs of nodes, as they come over their links.
+//! `cara logs`: the logs of boards, as they come over their links.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -61,22 +61,18 @@ pub(crate) fn run(Arguments { node, elf, span }: Arguments, global: &Global) -> 
             output::warning(format_args!("{node}: {}: {}", error.error, Shown(&error.text)));
         }
         let Some(Piece { at, build, bytes }) = Piece::of(&values) else { return Ok(true) };
-        let known = logs.remove(&node).filter(|log| log.build == build);
-        let log = match known {
-            Some(log) => logs.entry(node.clone()).or_insert(log),
-            None => {
-                let reader = match decoding.reader(build) {
-                    Err(why) if is_one => return Err(Ended::failed("NoFirmware", format!("{node}: {why}"))),
-                    Err(why) => {
-                        output::warning(format_args!("{node}: {why}"));
-                        None
-                    }
-                    Ok(reader) => Some(reader),
-                };
-                logs.entry(node.clone()).or_insert(Log { build, next: None, reader })
-            }
-        };
-        for line in log.take(at, &bytes) {
+        if logs.get(&node).is_none_or(|log| log.build != build) {
+            let reader = match decoding.reader(build) {
+                Err(why) if is_one => return Err(Ended::failed("NoFirmware", format!("{node}: {why}"))),
+                Err(why) => {
+                    output::warning(format_args!("{node}: {why}"));
+                    None
+                }
+                Ok(reader) => Some(reader),
+            };
+            logs.insert(node.clone(), Log { build, next: None, reader });
+        }
+        for line in logs.get_mut(&node).map(|log| log.take(at, &bytes)).unwrap_or_default() {
             show(&node, unix_ms, line, global)?;
         }
         Ok(true)
@@ -135,7 +131,7 @@ enum Line {
     Lost(u32),
 }
 
-/// The log of one node, put together from its pieces.
+/// The log of one board, put together from its pieces.
 struct Log {
     build: Option<u64>,
     /// Where the next piece begins.
