@@ -30,8 +30,9 @@ impl Surroundings {
         Ok(Self { root: root.to_owned(), home: tempfile::tempdir()? })
     }
 
-    /// Differences from the environment of this program: no other units are met, nothing is left behind, and what the
-    /// guide's programs have in common is built once and quickly.
+    /// Differences from the environment of this program: no units of other hosts are met, nothing is left behind, and what
+    /// the guide's programs have in common is built once and quickly. Tests beside this one are heard: their managers have
+    /// other names than the guide's.
     fn environment(&self) -> Vec<(&'static str, PathBuf)> {
         let before = PathBuf::from(std::env::var_os("HOME").unwrap_or_default());
         let kept = |name: &str, below: &str| std::env::var_os(name).map_or_else(|| before.join(below), PathBuf::from);
