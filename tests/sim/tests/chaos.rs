@@ -29,6 +29,8 @@ const PULSE: Duration = Duration::from_millis(10);
 const STEP: Duration = Duration::from_millis(50);
 /// All are back this long after the last fault: a link that leads nowhere is noticed, and searches come seldom by then.
 const RECOVERS: Duration = Duration::from_secs(60);
+/// The longest until a link that leads nowhere is noticed.
+const NOTICED: Duration = Duration::from_secs(10);
 /// Broadcasts of one unit within ten seconds.
 const BROADCASTS: u64 = 25;
 
@@ -382,12 +384,15 @@ impl Run {
     fn recovers(&mut self) {
         let start = self.world.now();
         let all = |run: &Self| run.manager.nodes_offering("double").len() == run.vehicles.len();
-        while !all(self) {
+        // A link that leads nowhere counts until that is noticed. A full table leaves calls for the time that they have.
+        let mut back = start;
+        while self.world.now() < back + NOTICED {
             assert!(self.world.now() < start + RECOVERS, "not all are back: {:?}", self.manager.s_units());
             self.step();
+            if !all(self) {
+                back = self.world.now();
+            }
         }
-        // A full table may leave calls for the time that they have.
-        (0..60).for_each(|_| self.step());
         let number = |unit: &UnitHandle, counter| unit.counted(counter);
         let sum = |counter| self.units().map(|unit| number(unit, counter)).sum::<u64>();
         let ran = self.judge.borrow().reached.get("run").copied().unwrap_or_default();
