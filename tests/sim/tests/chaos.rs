@@ -31,6 +31,8 @@ const STEP: Duration = Duration::from_millis(50);
 const RECOVERS: Duration = Duration::from_secs(60);
 /// The longest until a link that leads nowhere is noticed.
 const NOTICED: Duration = Duration::from_secs(10);
+/// What is sent on a link that nothing disturbs has arrived by then.
+const ARRIVES: Duration = Duration::from_millis(100);
 /// Broadcasts of one unit within ten seconds.
 const BROADCASTS: u64 = 25;
 
@@ -63,8 +65,12 @@ struct Judge {
     started: BTreeMap<Identity, usize>,
     /// What each call is, by its number.
     calls: Vec<Call>,
-    /// When all that a vehicle moves was stopped last, by the number of the vehicle.
-    stopped: BTreeMap<u32, bool>,
+    /// The call that stopped all that a vehicle moves, by the number of the vehicle.
+    stopped: BTreeMap<u32, usize>,
+    /// The last call that moved an actuator, by the number of the vehicle and the function.
+    ordered: BTreeMap<(u32, &'static str), usize>,
+    /// Since when all links have been live, with nothing that disturbs them.
+    calm: Option<Instant>,
     reached: BTreeMap<&'static str, u64>,
     /// Callers make no more calls.
     is_over: bool,
@@ -78,6 +84,8 @@ struct Call {
     outcomes: u32,
     /// From when on its caller does not want it.
     ended: Option<Instant>,
+    /// When its caller said so, in time of calm.
+    released: Option<Instant>,
 }
 
 impl Judge {
@@ -91,7 +99,7 @@ impl Judge {
 
     fn make(&mut self, now: Instant, timeout: Duration) -> usize {
         let life = self.lives.len() - 1;
-        self.calls.push(Call { life, times: (now, now + timeout), runs: 0, outcomes: 0, ended: None });
+        self.calls.push(Call { life, times: (now, now + timeout), runs: 0, outcomes: 0, ended: None, released: None });
         self.calls.len() - 1
     }
 
@@ -115,14 +123,12 @@ impl Judge {
         let call = &self.calls[number];
         let pulse = self.lives[call.life];
         let wanted = call.ended.map_or(pulse, |ended| ended.min(pulse)) + LEASE + PULSE;
+        let wanted = call.released.map_or(wanted, |released| released + ARRIVES);
         assert!(
             now <= wanted,
             "vehicle {vehicle} moves at {now:?} for call {number}, which was wanted until {wanted:?}"
         );
-        assert!(
-            !self.stopped.get(&vehicle).is_some_and(|stopped| *stopped),
-            "vehicle {vehicle} moves while it is stopped"
-        );
+        assert!(!self.stopped.contains_key(&vehicle), "vehicle {vehicle} moves while it is stopped");
         self.reach("moved");
     }
 
@@ -146,7 +152,7 @@ fn number_of(parameters: &ParametersView) -> usize {
 
 fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
     judge.borrow_mut().starts_living(unit);
-    judge.borrow_mut().stopped.insert(number, false);
+    judge.borrow_mut().stopped.remove(&number);
     let of = |judge: &Shared| Rc::clone(judge);
     let double = of(judge);
     let double = Service::new(move |_, parameters| {
@@ -155,35 +161,53 @@ fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
         parameters.set_value("n", 2 * n as i64).expect("it is an int");
         Ok(())
     });
-    let actuator = Actuator::new(|_| ());
-    let drive = of(judge);
-    let drive = Service::new(move |call, parameters| {
-        let (n, judge, watch, unit) = (number_of(parameters), of(&drive), call.lease.clone(), call.unit.clone());
-        judge.borrow_mut().starts(n);
-        let Some(watch) = watch else { return Ok(()) };
-        call.unit.spawn(async move {
-            while watch.is_live() {
-                judge.borrow_mut().moves(number, n, unit.now());
-                unit.sleep(PULSE).await;
-            }
+    let moves = |function| {
+        let (judge, actuator) = (of(judge), Actuator::new(|_| ()));
+        let service = Service::new(move |call, parameters| {
+            let (n, judge, watch, unit) = (number_of(parameters), of(&judge), call.lease.clone(), call.unit.clone());
+            judge.borrow_mut().starts(n);
+            let earlier = judge.borrow_mut().ordered.insert((number, function), n);
+            assert!(earlier < Some(n), "{function} {n} begins after {earlier:?}, which was made later");
+            let Some(watch) = watch else { return Ok(()) };
+            call.unit.spawn(async move {
+                while watch.is_live() {
+                    judge.borrow_mut().moves(number, n, unit.now());
+                    unit.sleep(PULSE).await;
+                }
+                for _ in 0..100 {
+                    unit.sleep(PULSE).await;
+                    assert!(!watch.is_live(), "the order of call {n} lives again");
+                }
+            });
+            Ok(())
         });
+        service.moves(&actuator, LEASE)
+    };
+    let halt = of(judge);
+    let halt = Service::new(move |_, parameters| {
+        let (mut judge, n) = (halt.borrow_mut(), number_of(parameters));
+        judge.starts(n);
+        judge.stopped.insert(number, n);
+        judge.reach("stopped");
         Ok(())
     });
-    let stops = |judge: &Shared, stopped| {
-        let judge = of(judge);
-        Service::new(move |_, parameters| {
-            let mut judge = judge.borrow_mut();
-            judge.starts(number_of(parameters));
-            judge.stopped.insert(number, stopped);
-            judge.reach(if stopped { "stopped" } else { "reset" });
-            Ok(())
-        })
-    };
+    let go_on = of(judge);
+    let go_on = Service::new(move |_, parameters| {
+        let (mut judge, n) = (go_on.borrow_mut(), number_of(parameters));
+        judge.starts(n);
+        // One that was made before a stop does not undo it.
+        if judge.stopped.get(&number).is_some_and(|stop| *stop < n) {
+            judge.stopped.remove(&number);
+        }
+        judge.reach("reset");
+        Ok(())
+    });
     let services = [
         ("double(n: int) -> (n: int)", double),
-        ("drive(n: int)", drive.moves(&actuator, LEASE)),
-        ("halt(n: int)", stops(judge, true).stops_all().priority(Priority::Emergency)),
-        ("go_on(n: int)", stops(judge, false).resets_all()),
+        ("drive(n: int)", moves("drive")),
+        ("lift(n: int)", moves("lift")),
+        ("halt(n: int)", halt.stops_all().priority(Priority::Emergency)),
+        ("go_on(n: int)", go_on.resets_all()),
     ];
     for (signature, service) in services {
         unit.my_function_list().add_service(signature, service).expect("there is room");
@@ -229,41 +253,54 @@ impl Caller {
                 return;
             }
             match self.random.below(12) {
-                0 => self.call("halt").await,
+                0 => {
+                    // Together with what the stop overtakes.
+                    let earlier = ["go_on", "drive", "lift", "double"][self.random.below(4) as usize];
+                    self.spawn_call(earlier);
+                    self.call("halt").await;
+                }
                 1 | 2 => self.call("go_on").await,
-                3..6 => self.drive().await,
+                3..6 => self.moves().await,
                 // More at a time than anybody has room for.
-                6 if self.random.below(8) == 0 => (0..80).for_each(|_| self.spawn_call()),
+                6 if self.random.below(8) == 0 => (0..80).for_each(|_| self.spawn_call("double")),
                 _ => self.call("double").await,
             }
         }
     }
 
     fn options(&mut self) -> RequestOptions {
-        RequestOptions { timeout: Some(millis(20 + self.random.below(1_500))), ..RequestOptions::default() }
+        let priority = [None, Some(Priority::Low), Some(Priority::High)][self.random.below(3) as usize];
+        let timeout = Some(millis(20 + self.random.below(1_500)));
+        RequestOptions { timeout, priority, ..RequestOptions::default() }
     }
 
-    fn spawn_call(&mut self) {
+    fn spawn_call(&mut self, function: &'static str) {
         let options = self.options();
         let (unit, judge, peer) = (self.unit.clone(), Rc::clone(&self.judge), self.peer.clone());
         self.unit.spawn(async move {
-            call(&unit, &judge, &peer, "double", options).await;
+            call(&unit, &judge, &peer, function, options).await;
         });
     }
 
     async fn call(&mut self, function: &str) {
-        let options = self.options();
+        // Each has the class of its function, which for a stop is the highest.
+        let options = RequestOptions { priority: None, ..self.options() };
         call(&self.unit, &self.judge, &self.peer, function, options).await;
     }
 
-    async fn drive(&mut self) {
+    async fn moves(&mut self) {
+        let function = if self.random.below(2) == 0 { "drive" } else { "lift" };
+        if self.random.below(4) == 0 {
+            self.spawn_call(function);
+        }
         let options = RequestOptions { renew: Renew::Process, ..self.options() };
-        let n = call(&self.unit, &self.judge, &self.peer, "drive", options).await;
+        let n = call(&self.unit, &self.judge, &self.peer, function, options).await;
         let span = millis(self.random.below(2_000));
         self.unit.sleep(span).await;
-        let released = self.unit.release(&self.peer, "drive");
-        let mut judge = self.judge.borrow_mut();
-        judge.calls[n].ended = Some(self.unit.now());
+        let released = self.unit.release(&self.peer, function);
+        let (mut judge, now) = (self.judge.borrow_mut(), self.unit.now());
+        judge.calls[n].ended.get_or_insert(now);
+        judge.calls[n].released = judge.calm.filter(|_| released.is_ok()).map(|_| now);
         judge.reach(if released.is_ok() { "released" } else { "not released" });
     }
 }
@@ -361,6 +398,7 @@ impl Run {
             assert!(unit.free_buffers() <= self.buffers, "{} has more buffers than it was given", unit.identity());
             let stored = unit.stored_claim().map_or(Claim::NONE, |tagged| tagged.claim);
             assert!(stored >= before.stored, "{} stores {stored} after {}", unit.identity(), before.stored);
+            assert!(unit.claim() >= stored, "{} obeys {} and has stored {stored}", unit.identity(), unit.claim());
             before.stored = stored;
             let lives = self.judge.borrow().started.get(&unit.identity()).copied();
             if before.started == lives {
@@ -384,7 +422,7 @@ impl Run {
     fn recovers(&mut self) {
         let start = self.world.now();
         let all = |run: &Self| run.manager.nodes_offering("double").len() == run.vehicles.len();
-        // A link that leads nowhere counts until that is noticed. A full table leaves calls for the time that they have.
+        // A link that leads nowhere counts until that is noticed.
         let mut back = start;
         while self.world.now() < back + NOTICED {
             assert!(self.world.now() < start + RECOVERS, "not all are back: {:?}", self.manager.s_units());
@@ -393,6 +431,9 @@ impl Run {
                 back = self.world.now();
             }
         }
+        // A full table leaves calls for the time that they have.
+        self.judge.borrow_mut().calm = Some(self.world.now());
+        (0..60).for_each(|_| self.step());
         let number = |unit: &UnitHandle, counter| unit.counted(counter);
         let sum = |counter| self.units().map(|unit| number(unit, counter)).sum::<u64>();
         let ran = self.judge.borrow().reached.get("run").copied().unwrap_or_default();

@@ -38,7 +38,7 @@ const PLANTED: [&str; 12] = [
     "tests/sim/planted/a-reset-undoes-a-later-stop.patch",
     "tests/sim/planted/a-stop-does-not-latch.patch",
     "tests/sim/planted/a-stop-of-all-stops-one-actuator.patch",
-    "tests/sim/planted/a-lower-claim-is-obeyed.patch",
+    "tests/sim/planted/a-claim-is-forgotten-at-a-restart.patch",
     "tests/planted/a-call-made-earlier-replaces-a-later-one.patch",
     "tests/planted/a-renewal-behind-the-end-revives-its-order.patch",
     "tests/variants/double-execution.patch",
