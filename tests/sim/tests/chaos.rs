@@ -4,7 +4,7 @@
 //!
 //! `cargo xtask chaos` runs many seeds, and plants bugs.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -162,13 +162,18 @@ fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
         Ok(())
     });
     let moves = |function| {
-        let (judge, actuator) = (of(judge), Actuator::new(|_| ()));
+        // The call whose order the safe hook has not ended.
+        let (judge, moving) = (of(judge), Rc::new(Cell::new(None)));
+        let hook = Rc::clone(&moving);
+        let actuator = Actuator::new(move |_| hook.set(None));
         let service = Service::new(move |call, parameters| {
             let (n, judge, watch, unit) = (number_of(parameters), of(&judge), call.lease.clone(), call.unit.clone());
             judge.borrow_mut().starts(n);
             let earlier = judge.borrow_mut().ordered.insert((number, function), n);
             assert!(earlier < Some(n), "{function} {n} begins after {earlier:?}, which was made later");
             let Some(watch) = watch else { return Ok(()) };
+            let moving = Rc::clone(&moving);
+            moving.set(Some(n));
             call.unit.spawn(async move {
                 while watch.is_live() {
                     judge.borrow_mut().moves(number, n, unit.now());
@@ -177,6 +182,7 @@ fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
                 for _ in 0..100 {
                     unit.sleep(PULSE).await;
                     assert!(!watch.is_live(), "the order of call {n} lives again");
+                    assert_ne!(moving.get(), Some(n), "no hook has run for call {n}");
                 }
             });
             Ok(())

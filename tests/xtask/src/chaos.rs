@@ -40,7 +40,7 @@ const PLANTED: [&str; 12] = [
     "tests/sim/planted/a-stop-of-all-stops-one-actuator.patch",
     "tests/sim/planted/a-claim-is-forgotten-at-a-restart.patch",
     "tests/planted/a-call-made-earlier-replaces-a-later-one.patch",
-    "tests/planted/a-renewal-behind-the-end-revives-its-order.patch",
+    "tests/sim/planted/no-hook-runs-when-time-is-over.patch",
     "tests/variants/double-execution.patch",
     "tests/variants/leaked-slot.patch",
 ];
