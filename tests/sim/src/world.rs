@@ -59,6 +59,8 @@ use tasks::{Job, Owner, Tasks};
 const SEED: &str = "CARA_SIM_SEED";
 /// The environment variable that says how many seeds a run takes.
 const SEEDS: &str = "CARA_SIM_SEEDS";
+/// The environment variable that says which of them is the first.
+const FIRST: &str = "CARA_SIM_FIRST";
 /// Longest virtual time that a blocking call of the world may take.
 const PATIENCE: Duration = Duration::from_secs(3_600);
 /// Steps at one instant after which a run counts as stuck.
@@ -97,7 +99,7 @@ struct Inner {
 }
 
 /// The seeds of a run over many: 0 to `count`, or the one in `CARA_SIM_SEED`. `CARA_SIM_SEEDS` replaces the count, for
-/// quick and for long runs.
+/// quick and for long runs, and `CARA_SIM_FIRST` the 0, for parts of a long one.
 ///
 /// ```
 /// for seed in cara_sim::seeds(3) {
@@ -108,7 +110,10 @@ struct Inner {
 pub fn seeds(count: u64) -> impl Iterator<Item = u64> {
     match number_in_environment(SEED) {
         Some(seed) => seed..seed.saturating_add(1),
-        None => 0..number_in_environment(SEEDS).unwrap_or(count),
+        None => {
+            let first = number_in_environment(FIRST).unwrap_or_default();
+            first..first.saturating_add(number_in_environment(SEEDS).unwrap_or(count))
+        }
     }
 }
 

@@ -18,6 +18,9 @@ pub(crate) struct Chaos {
     /// Fleets, each of another seed.
     #[arg(long, value_name = "N", default_value_t = 1_000, value_parser = clap::value_parser!(u32).range(1..))]
     seeds: u32,
+    /// The first seed: a run that was stopped goes on from there, and several machines share one.
+    #[arg(long, value_name = "SEED", default_value_t = 0, conflicts_with = "planted")]
+    first: u32,
     /// Units of each fleet, the manager among them.
     #[arg(long, value_name = "M", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=1_000))]
     nodes: u32,
@@ -28,6 +31,9 @@ pub(crate) struct Chaos {
     #[arg(long, conflicts_with = "hours")]
     planted: bool,
 }
+
+/// Fleets of a part of a run, which says where it is after each.
+const PART: u32 = 5_000;
 
 /// Bugs that break what chaos judges.
 const PLANTED: [&str; 12] = [
@@ -50,14 +56,19 @@ pub(crate) fn run(chaos: &Chaos) -> Result<ExitCode> {
         return planted(chaos);
     }
     let start = Instant::now();
-    test(chaos, workspace::root(), &workspace::target()).stream()?;
-    let hours = f64::from(chaos.seeds) * f64::from(chaos.nodes) * seconds(chaos) as f64 / 3_600.0;
-    println!(
-        "{} fleets of {} units, {hours:.0} node-hours in {:.0} s",
-        chaos.seeds,
-        chaos.nodes,
-        start.elapsed().as_secs_f64()
-    );
+    let end = chaos.first.saturating_add(chaos.seeds);
+    for first in (chaos.first..end).step_by(PART as usize) {
+        let seeds = PART.min(end - first);
+        test(chaos, first, seeds, workspace::root(), &workspace::target()).stream()?;
+        let done = first + seeds - chaos.first;
+        let hours = f64::from(done) * f64::from(chaos.nodes) * seconds(chaos) as f64 / 3_600.0;
+        let took = start.elapsed().as_secs_f64();
+        println!(
+            "{done} fleets of {} units, {hours:.0} node-hours in {took:.0} s; next --first {}",
+            chaos.nodes,
+            first + seeds
+        );
+    }
     Ok(ExitCode::SUCCESS)
 }
 
@@ -67,11 +78,12 @@ fn seconds(chaos: &Chaos) -> u64 {
     chaos.hours.map_or(20, each).max(5)
 }
 
-fn test(chaos: &Chaos, root: &Path, target: &Path) -> Run {
+fn test(chaos: &Chaos, first: u32, seeds: u32, root: &Path, target: &Path) -> Run {
     let cargo =
         Run::cargo().within(root).args(["test", "--quiet", "--release", "--package", "cara-sim", "--test", "chaos"]);
     let cargo = cargo.args([Path::new("--target-dir"), target]).args(["whatever", "--", "--nocapture"]);
-    let cargo = cargo.env("CARA_SIM_SEEDS", &chaos.seeds.to_string()).env("RUST_BACKTRACE", "0");
+    let cargo = cargo.env("CARA_SIM_SEEDS", &seeds.to_string()).env("RUST_BACKTRACE", "0");
+    let cargo = cargo.env("CARA_SIM_FIRST", &first.to_string());
     cargo.env("CARA_CHAOS_NODES", &chaos.nodes.to_string()).env("CARA_CHAOS_SECONDS", &seconds(chaos).to_string())
 }
 
@@ -83,7 +95,7 @@ fn planted(chaos: &Chaos) -> Result<ExitCode> {
         let name = patch.file_stem().unwrap_or_default().to_string_lossy();
         tree.apply(&patch)?;
         let start = Instant::now();
-        let ran = test(chaos, &tree.root, &place.join("build")).captured();
+        let ran = test(chaos, 0, chaos.seeds, &tree.root, &place.join("build")).captured();
         tree.reset()?;
         let (passed, output, errors) = ran?;
         let why = errors.lines().skip_while(|line| !line.contains(" panicked at tests/sim/")).nth(1);
