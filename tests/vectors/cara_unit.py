@@ -383,7 +383,7 @@ class Unit:
             self.send_frame("ping")
 
     def report(self):
-        return {"received": self.received & 0xFFFFFFFF, "hears": self.hears, "holds": False}
+        return {"received": self.received & 0xFFFFFFFF, "hears": self.hears, "holds": False, "misses": self.missed > 0}
 
     def reported(self, report):
         """What the peer tells of the stream and the datagrams of this unit."""

@@ -844,11 +844,12 @@ def decode_session_body(data):
 
 def decode_report(reader):
     received, flags = reader.fixed("IB")
-    return {"received": received, "hears": bool(flags & 1), "holds": bool(flags & 2)}
+    return {"received": received, "hears": bool(flags & 1), "holds": bool(flags & 2), "misses": bool(flags & 4)}
 
 
 def encode_report(value):
-    return struct.pack("<IB", value["received"], value["hears"] | value["holds"] << 1)
+    flags = value["hears"] | value["holds"] << 1 | value["misses"] << 2
+    return struct.pack("<IB", value["received"], flags)
 
 
 def encode_session_body(body):

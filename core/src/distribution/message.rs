@@ -466,6 +466,7 @@ const CLOSE: u8 = 10;
 /// Flags of a report.
 const HEARS: u8 = 1;
 const HOLDS: u8 = 2;
+const MISSES: u8 = 4;
 
 impl<'b> SessionBody<'b> {
     /// Decodes a session body; `None` if unknown. All but a message may be longer than this version's.
@@ -554,7 +555,8 @@ impl<'b> SessionBody<'b> {
     /// The encoded pong.
     pub fn pong(report: Report) -> [u8; 6] {
         let [r0, r1, r2, r3] = report.received.to_le_bytes();
-        let flags = if report.hears { HEARS } else { 0 } | if report.holds { HOLDS } else { 0 };
+        let flag = |is_set, flag| if is_set { flag } else { 0 };
+        let flags = flag(report.hears, HEARS) | flag(report.holds, HOLDS) | flag(report.misses, MISSES);
         [PONG, r0, r1, r2, r3, flags]
     }
 
@@ -573,7 +575,8 @@ fn report_of(bytes: &[u8]) -> Option<Report> {
     let (received, rest) = bytes.split_first_chunk()?;
     let flags = rest.first()?;
     let is_set = |flag: u8| flags & flag != 0;
-    Some(Report { received: u32::from_le_bytes(*received), hears: is_set(HEARS), holds: is_set(HOLDS) })
+    let received = u32::from_le_bytes(*received);
+    Some(Report { received, hears: is_set(HEARS), holds: is_set(HOLDS), misses: is_set(MISSES) })
 }
 
 #[cfg(test)]

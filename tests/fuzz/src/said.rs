@@ -212,7 +212,9 @@ pub(crate) fn next(script: &mut Script<'_>, peer: &mut Peer, link: &mut Link, no
             Said::Release(Some(slot), call, SessionBody::release_all(slot, call).to_vec())
         }
         8 => {
-            let report = Report { received: script.number() as u32, hears: script.flag(), holds: script.flag() };
+            let (received, hears, holds) = (script.number() as u32, script.flag(), script.flag());
+            // No flag of its own: the inputs of the corpus keep their meaning.
+            let report = Report { received, hears, holds, misses: received % 2 == 1 };
             Said::Body(match script.below(4) {
                 0 => SessionBody::PING.to_vec(),
                 1 => SessionBody::pong(report).to_vec(),

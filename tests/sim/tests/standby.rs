@@ -14,7 +14,7 @@ use cara_core::distribution::claim::Claim;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::random::Random;
 use cara_core::time::Duration;
-use cara_sim::{Direction, LogEvent, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
+use cara_sim::{Direction, HostId, LogEvent, Path, Service, Storing, UnitEvent, UnitHandle, World, for_each_seed};
 use faults::{Fallible, Fault, between, is_awake, millis};
 
 /// So long everything fails, and so long a manager may take to command alone afterwards, with the highest claim: one that vehicles
@@ -187,24 +187,58 @@ fn two_hundred_vehicles_have_a_manager_soon_whatever_fails() {
     runs(2, 200);
 }
 
-/// Its vehicles miss three keep-alives, and then say when they heard it last: the standby does not wait for three more.
-#[test]
-fn a_manager_that_freezes_is_replaced_within_five_seconds() {
+/// How long it takes until the other manager of a fleet has all vehicles once something has befallen the one that commands.
+fn replaced(seed: u64, befalls: impl Fn(&mut World, &UnitHandle, &[HostId])) -> Duration {
     let has_leader = |fleet: &Fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader));
-    let took = for_each_seed(8, |seed| {
-        let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 5, disks_fail: false });
-        assert!(fleet.until(STARTS, has_leader).is_some());
-        fleet.run(between(&mut Random::new(seed), 3_000, 4_000));
-        let frozen = fleet.leader().expect("it has all").clone();
-        fleet.world.suspend(&frozen, Duration::from_secs(60));
-        let is_obeyed = |fleet: &Fleet| {
-            let other = fleet.managers.iter().find(|manager| manager.host() != frozen.host());
-            other.is_some_and(|other| !other.is_standby() && fleet.has_all(other))
-        };
-        fleet.until(STARTS, is_obeyed).unwrap_or(STARTS)
+    let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 5, disks_fail: false });
+    assert!(fleet.until(STARTS, has_leader).is_some());
+    fleet.run(between(&mut Random::new(seed), 3_000, 4_000));
+    let active = fleet.leader().expect("it has all").clone();
+    let others: Vec<_> = fleet.units().map(UnitHandle::host).filter(|host| *host != active.host()).collect();
+    befalls(&mut fleet.world, &active, &others);
+    let is_obeyed = |fleet: &Fleet| {
+        let other = fleet.managers.iter().find(|manager| manager.host() != active.host());
+        other.is_some_and(|other| !other.is_standby() && fleet.has_all(other))
+    };
+    fleet.until(STARTS, is_obeyed).unwrap_or(STARTS)
+}
+
+/// Its vehicles miss three keep-alives, and then say when they heard it last: the standby does not wait for three more. If they
+/// hear it and it does not hear them, its keep-alives say so.
+#[test]
+fn a_manager_that_freezes_or_is_cut_off_one_way_is_replaced_within_five_seconds() {
+    let took = for_each_seed(12, |seed| {
+        replaced(seed, |world, active, others| match seed % 3 {
+            0 => world.suspend(active, Duration::from_secs(60)),
+            1 => drop(world.network(|network| network.partition(&[active.host()], others, Direction::FirstToSecond))),
+            _ => drop(world.network(|network| network.partition(others, &[active.host()], Direction::FirstToSecond))),
+        })
     });
     println!("replaced after {took:?}");
     assert!(took.iter().all(|took| *took <= Duration::from_secs(5)), "{took:?}");
+}
+
+/// It loses a vehicle that it does not hear, and no other: its standby goes on waiting. Nor does it command where datagrams get lost.
+#[test]
+fn a_manager_that_does_not_hear_one_vehicle_or_each_datagram_stays() {
+    let has_leader = |fleet: &Fleet| fleet.leader().is_some_and(|leader| fleet.has_all(leader));
+    for_each_seed(4, |seed| {
+        let mut fleet = Fleet::new(seed, Size { managers: 2, vehicles: 3, disks_fail: false });
+        assert!(fleet.until(STARTS, has_leader).is_some());
+        let active = fleet.leader().expect("it has all").clone();
+        let (claim, mute) = (active.claim(), fleet.vehicles[0].host());
+        if seed % 2 == 0 {
+            fleet.world.network(|network| network.partition(&[mute], &[active.host()], Direction::FirstToSecond));
+            assert!(fleet.until(STARTS, |fleet| !has_leader(fleet)).is_some());
+        } else {
+            fleet.world.network(|network| network.set_calm(Path::LAN.loss_percent(10.0)));
+        }
+        fleet.run(Duration::from_secs(20));
+        assert!(fleet.leader().is_some_and(|leader| leader.claim() == claim), "{seed}: {}", fleet.logs());
+        assert!(fleet.vehicles.iter().skip(1).all(|agv| agv.claim() == claim && active.knows(agv, "drive")), "{seed}");
+        fleet.world.network(|network| network.heal_all());
+        assert!(fleet.until(STARTS, has_leader).is_some(), "{seed}");
+    });
 }
 
 /// It has as many keys as vehicles, and all were there. By the time that the network is whole again, a vehicle that was cut off

@@ -279,12 +279,12 @@ fn variable(value: Variable<'_>) -> Value {
 
 pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
     Some(match SessionBody::decode(bytes)? {
-        SessionBody::KeepAlive { stamp, report: Report { received, hears, holds } } => json!({ "keep_alive": {
-            "stamp": stamp, "received": received, "hears": hears, "holds": holds,
+        SessionBody::KeepAlive { stamp, report: Report { received, hears, holds, misses } } => json!({ "keep_alive": {
+            "stamp": stamp, "received": received, "hears": hears, "holds": holds, "misses": misses,
         }}),
         SessionBody::Ping => json!({ "ping": {} }),
-        SessionBody::Pong(Report { received, hears, holds }) => {
-            json!({ "pong": { "received": received, "hears": hears, "holds": holds } })
+        SessionBody::Pong(Report { received, hears, holds, misses }) => {
+            json!({ "pong": { "received": received, "hears": hears, "holds": holds, "misses": misses } })
         }
         SessionBody::Close(code) => json!({ "close": { "code": code } }),
         SessionBody::Renew(renewal) => json!({ "renew": {

@@ -235,7 +235,7 @@ fn datagrams() -> Vec<Vector> {
     let answer = answer.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let header = session_header(Mode::Plain, VERSIONS.last, Fleet(7), 300, 0xA1A2_A3A4_A5A6_A7A8);
     let session =
-        [&header[..], &SessionBody::keep_alive(1_000_000, Report { received: 300, hears: true, holds: false })]
+        [&header[..], &SessionBody::keep_alive(1_000_000, Report { received: 300, hears: true, ..Report::default() })]
             .concat();
     let with = |bytes: &[u8], kind| [bytes, &item(kind, b"later")].concat();
     let of_versions = |bytes: &[u8], first, last| {
@@ -315,7 +315,7 @@ fn datagrams() -> Vec<Vector> {
             7,
             &session,
             &json!({ "session": {
-                "link": 300, "nonce": 0xA1A2_A3A4_A5A6_A7A8_u64, "body": { "keep_alive": { "stamp": 1_000_000, "received": 300, "hears": true, "holds": false } },
+                "link": 300, "nonce": 0xA1A2_A3A4_A5A6_A7A8_u64, "body": { "keep_alive": { "stamp": 1_000_000, "received": 300, "hears": true, "holds": false, "misses": false } },
             }}),
         ),
         datagram(("other_fleet", "another fleet is told as such"), 8, &answer, &json!({ "other_fleet": 7 })).lossy(),

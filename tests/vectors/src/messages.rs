@@ -428,7 +428,7 @@ fn session_bodies() -> Vec<Vector> {
         age: Duration::from_micros(100_000),
     };
     let release = Release { call: 0x0102_0304, class: Priority::Low };
-    let report = Report { received: 0x0A0B_0C0D, hears: true, holds: false };
+    let report = Report { received: 0x0A0B_0C0D, hears: true, holds: false, misses: false };
     let emergency = [&SessionBody::message_prefix(0)[..], &request(false, &[])].concat();
     let body =
         |names, bytes: &[u8], value: &Value| Vector::new(names, Kind::SessionBody, Context::default(), bytes, value);
@@ -440,14 +440,14 @@ fn session_bodies() -> Vec<Vector> {
             ),
             &SessionBody::keep_alive(0x0001_0203_0405_0607, report),
             &json!({ "keep_alive": {
-                "stamp": 0x0001_0203_0405_0607_u64, "received": 0x0A0B_0C0D, "hears": true, "holds": false,
+                "stamp": 0x0001_0203_0405_0607_u64, "received": 0x0A0B_0C0D, "hears": true, "holds": false, "misses": false,
             }}),
         ),
         body(("ping", "to be answered at once, in a datagram"), &SessionBody::PING, &json!({ "ping": {} })),
         body(
-            ("pong", "the answer, of a unit that does not read more of the stream for now"),
-            &SessionBody::pong(Report { hears: false, holds: true, ..report }),
-            &json!({ "pong": { "received": 0x0A0B_0C0D, "hears": false, "holds": true } }),
+            ("pong", "the answer, of a unit that does not read more of the stream for now, and misses a keep-alive"),
+            &SessionBody::pong(Report { hears: false, holds: true, misses: true, ..report }),
+            &json!({ "pong": { "received": 0x0A0B_0C0D, "hears": false, "holds": true, "misses": true } }),
         ),
         body(("close", "the stream is dead"), &SessionBody::close(13), &json!({ "close": { "code": 13 } })),
         body(

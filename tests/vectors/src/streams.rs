@@ -47,7 +47,7 @@ fn stream(names: (&'static str, &'static str), limits: (usize, usize), bytes: &[
 }
 
 fn small_frames() -> Vec<Vector> {
-    let keep_alive = SessionBody::keep_alive(1_000_000, Report { received: 300, hears: false, holds: true });
+    let keep_alive = SessionBody::keep_alive(1_000_000, Report { received: 300, holds: true, ..Report::default() });
     let frames = [
         frame(&Frame::Ping),
         frame(&Frame::Pong),
@@ -55,7 +55,7 @@ fn small_frames() -> Vec<Vector> {
         frame(&Frame::Refuse(4)),
         frame(&Frame::Close(1)),
     ];
-    let value = json!(["ping", "pong", { "session": { "keep_alive": { "stamp": 1_000_000, "received": 300, "hears": false, "holds": true } } }, { "refuse": 4 }, { "close": 1 }]);
+    let value = json!(["ping", "pong", { "session": { "keep_alive": { "stamp": 1_000_000, "received": 300, "hears": false, "holds": true, "misses": false } } }, { "refuse": 4 }, { "close": 1 }]);
     vec![
         stream(
             ("frames", "one after the other: ping, pong, session, refuse, close"),

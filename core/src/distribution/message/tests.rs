@@ -8,7 +8,7 @@ use proptest::prelude::*;
 const MS: Duration = Duration::from_millis(1);
 /// Unknown flags that a callee may ignore.
 const SKIPPABLE: u8 = 0x08;
-const REPORT: Report = Report { received: 0x0102_0304, hears: true, holds: false };
+const REPORT: Report = Report { received: 0x0102_0304, hears: true, holds: false, misses: true };
 
 fn headers() -> impl Strategy<Value = RequestHeader> {
     let numbers = (any::<u32>(), any::<u16>(), any::<u16>(), any::<u32>(), any::<u64>(), any::<u32>());

@@ -22,6 +22,8 @@ pub struct Report {
     pub hears: bool,
     /// More bytes of the stream are not read for now, since what came before them has no room: the unit is slow, not dead.
     pub holds: bool,
+    /// The unit misses a keep-alive of the peer: nothing of it comes, neither in the stream nor as a datagram.
+    pub misses: bool,
 }
 
 /// What became of the bytes that were written into the stream.
@@ -115,7 +117,7 @@ mod tests {
     }
 
     fn reported(received: u32) -> Report {
-        Report { received, hears: true, holds: false }
+        Report { received, hears: true, ..Report::default() }
     }
 
     /// When a stream is found dead to which the peer reports so at each second.

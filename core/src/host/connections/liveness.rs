@@ -34,6 +34,8 @@ pub struct Liveness {
     hears: bool,
     /// Those of this unit arrive there.
     is_heard: bool,
+    /// The peer misses a keep-alive of this unit.
+    is_missed: bool,
     stream_heard: Instant,
     /// When a datagram was last missed.
     missed_at: Option<Instant>,
@@ -62,9 +64,14 @@ pub struct Look {
     pub lost: bool,
 }
 
+/// How long after a sign of life a keep-alive counts as missed.
+pub(crate) fn missed_after(period: Duration) -> Duration {
+    period + period.divided_by(2)
+}
+
 impl Silence {
     fn new(now: Instant, period: Duration) -> Self {
-        Self { next_check: now + period + period.divided_by(2), missed: 0 }
+        Self { next_check: now + missed_after(period), missed: 0 }
     }
 
     /// Counts one missed keep-alive if the time for it has come.
@@ -91,6 +98,7 @@ impl Liveness {
             due: now,
             hears: false,
             is_heard: false,
+            is_missed: false,
             stream_heard: now,
             missed_at: None,
             delivery: Delivery::new(now),
@@ -118,7 +126,7 @@ impl Liveness {
     /// The peer reported what it receives, when `sent` bytes had been written into the stream. If the stream is dead: whether more
     /// than one segment is missing there.
     pub(crate) fn reported(&mut self, now: Instant, sent: u32, report: Report) -> Option<bool> {
-        self.is_heard = report.hears;
+        (self.is_heard, self.is_missed) = (report.hears, report.misses);
         let lossy = self.missed_at.is_some_and(|at| now < at + LOSSY);
         self.delivery.reported(now, sent, report, self.stream_heard, lossy).map(is_long)
     }
@@ -131,6 +139,11 @@ impl Liveness {
     /// Whether this unit's datagrams come through, as the peer told last.
     pub const fn is_heard(&self) -> bool {
         self.is_heard
+    }
+
+    /// Whether the peer hears nothing of this unit, as it reported last.
+    pub(crate) const fn is_missed(&self) -> bool {
+        self.is_missed
     }
 
     /// Whether datagrams of the peer were waited for in vain for three keep-alives.
@@ -146,7 +159,7 @@ impl Liveness {
     /// How long ago the peer was last heard. Late looks make it too short by as much as they were late.
     pub fn silent_for(&self, now: Instant) -> Duration {
         let missed = (0..self.silence.missed).fold(Duration::ZERO, |missed, _| missed + self.period);
-        now.since(self.silence.next_check - missed - self.period - self.period.divided_by(2))
+        now.since(self.silence.next_check - missed - missed_after(self.period))
     }
 
     /// How long ago something came in the stream.

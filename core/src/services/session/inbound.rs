@@ -284,6 +284,10 @@ impl<P: Port> Session<P> {
     fn session_body(&mut self, cx: &mut Context<'_, P>, span: Span, lent: &[u8], way: Way) -> Option<Event> {
         let body = SessionBody::decode(self.wire.link.view(span, lent));
         if body.is_some() {
+            if self.wire.liveness.is_silent() {
+                // Tell the peer at once that it is heard again.
+                self.wire.due.set(Part::KeepAlive, cx.now);
+            }
             match way {
                 Way::Stream => self.wire.liveness.heard(cx.now),
                 Way::Datagram if self.wire.liveness.heard_datagram(cx.now) => {

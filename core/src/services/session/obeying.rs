@@ -9,6 +9,7 @@ use crate::distribution::claim::Claim;
 use crate::distribution::connection_handler::MayMove;
 use crate::distribution::hello::ClaimReport;
 use crate::distribution::message::Control;
+use crate::host::connections::missed_after;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
@@ -25,8 +26,8 @@ pub(super) struct Obedience {
     /// For a manager with a higher claim: until when the peer has to show life, and until when its orders may continue. Both in
     /// the far future if there is none.
     gives_way: (Instant, Instant),
-    /// The hub knows that the peer misses keep-alives.
-    is_silent: bool,
+    /// The hub knows that this unit does not hear the peer, or the peer does not hear this unit.
+    is_cut_off: bool,
     /// This unit has raised its own claim, and the peer has not been notified.
     pub(super) has_news: bool,
 }
@@ -37,7 +38,7 @@ impl Obedience {
             may_move: None,
             waits: false,
             gives_way: (Instant::FAR_FUTURE, Instant::FAR_FUTURE),
-            is_silent: false,
+            is_cut_off: false,
             has_news: false,
         }
     }
@@ -62,14 +63,18 @@ impl Obedience {
         self.may_move = None;
     }
 
-    /// Tells the hub when the peer was last heard, once it misses a keep-alive: a standby that asks counts from then, and not
-    /// from the end of the link. To be called as soon as the peer is heard again, before anything can end the link.
+    /// Tells the hub when this unit and the peer last heard each other, once either misses a keep-alive: a standby that asks counts
+    /// from then, and not from the end of the link. To be called as soon as either is heard again, before anything can end the link.
     pub(super) fn note_silence<P: Port>(&mut self, wire: &Wire<P>, cx: &mut Context<'_, P>) {
-        let is_silent = wire.liveness.is_silent();
-        if core::mem::replace(&mut self.is_silent, is_silent) != is_silent
+        let (is_silent, is_missed) = (wire.liveness.is_silent(), wire.liveness.is_missed());
+        let is_cut_off = is_silent || is_missed;
+        if core::mem::replace(&mut self.is_cut_off, is_cut_off) != is_cut_off
             && let Some(remote) = &wire.remote
         {
-            let heard = if is_silent { cx.now - wire.liveness.silent_for(cx.now) } else { Instant::FAR_FUTURE };
+            let silent = if is_silent { wire.liveness.silent_for(cx.now) } else { Duration::ZERO };
+            // It misses one when at least so much time has passed.
+            let missed = if is_missed { missed_after(wire.own_keep_alive()) } else { Duration::ZERO };
+            let heard = if is_cut_off { cx.now - silent.max(missed) } else { Instant::FAR_FUTURE };
             cx.hub.enter(&mut |hub| hub.node.manager_heard(heard, &remote.hello.identity));
         }
     }

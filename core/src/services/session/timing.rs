@@ -179,6 +179,10 @@ impl<P: Port> Session<P> {
             // Tell the peer at once, in the stream, so that it sends its keep-alives there.
             self.wire.due.set(Part::KeepAlive, cx.now);
         }
+        if look.missed && self.wire.liveness.is_silent() {
+            // Tell the peer at once that it is not heard: a manager that hears nothing is to be replaced soon.
+            self.wire.due.set(Part::KeepAlive, cx.now);
+        }
         if look.ask {
             self.wire.send_datagram(cx, &SessionBody::PING, &[]);
         }
@@ -191,7 +195,9 @@ impl<P: Port> Session<P> {
     /// Evaluates the peer's report of what has reached it.
     pub(super) fn reported(&mut self, cx: &mut Context<'_, P>, report: Report) {
         let sent = self.wire.sent();
-        if let Some(long) = self.wire.liveness.reported(cx.now, sent, report) {
+        let died = self.wire.liveness.reported(cx.now, sent, report);
+        self.granting.obedience.note_silence(&self.wire, cx);
+        if let Some(long) = died {
             let reason = CloseReason::StreamDead { long };
             // Send the reason by datagram, since the stream does not reach the peer: else it would have to time out by itself.
             for _ in 0..CHALLENGE_DATAGRAMS {
@@ -224,8 +230,7 @@ impl<P: Port> Session<P> {
 
     fn send_keep_alive(&mut self, cx: &mut Context<'_, P>) {
         // The peer's timeout counts from the interval in the hello, even if the constraint has become longer.
-        let reported = Duration::from_millis(self.wire.reported_keep_alive.into());
-        let pause = self.wire.constraints.keep_alive.min(reported).max(Duration::from_millis(1));
+        let pause = self.wire.constraints.keep_alive.min(self.wire.own_keep_alive()).max(Duration::from_millis(1));
         self.wire.due.set(Part::KeepAlive, cx.now + pause);
         self.wire.publishing.actuators_due = true;
         self.pump(cx);

@@ -271,6 +271,9 @@ impl<P: Port> Wire<P> {
     /// Notes that the stream brought bytes.
     #[inline(never)]
     pub(super) fn heard(&mut self, now: Instant) {
+        if self.liveness.is_silent() {
+            self.due.set(Part::KeepAlive, now);
+        }
         self.liveness.heard(now);
         self.note_liveness();
     }
@@ -303,6 +306,11 @@ impl<P: Port> Wire<P> {
         self.send(cx, Priority::High, message.len(), &mut |writer| writer.put(message)).is_ok()
     }
 
+    /// The keep-alive interval by which the peer counts.
+    pub(super) fn own_keep_alive(&self) -> Duration {
+        Duration::from_millis(self.reported_keep_alive.into())
+    }
+
     /// Bytes written to the stream so far, modulo 2^32 as in reports.
     pub(super) fn sent(&self) -> u32 {
         self.link.counters.value(LinkCounter::BytesSent) as u32
@@ -314,6 +322,7 @@ impl<P: Port> Wire<P> {
             received: self.link.counters.value(LinkCounter::BytesReceived) as u32,
             hears: self.liveness.hears(),
             holds: self.holds,
+            misses: self.liveness.is_silent(),
         }
     }
 

@@ -100,8 +100,8 @@ fn frames() -> impl Strategy<Value = Vec<u8>> {
     });
     let body = prop_oneof![
         prop::collection::vec(any::<u8>(), 0..20),
-        (any::<u64>(), any::<u32>(), any::<bool>(), any::<bool>()).prop_map(|(stamp, received, hears, holds)| {
-            SessionBody::keep_alive(stamp, Report { received, hears, holds }).to_vec()
+        (any::<u64>(), any::<u32>(), any::<[bool; 3]>()).prop_map(|(stamp, received, [hears, holds, misses])| {
+            SessionBody::keep_alive(stamp, Report { received, hears, holds, misses }).to_vec()
         }),
         (0..6_u32, 0..4_u8, any::<u64>()).prop_map(|(call, class, stamp)| renewal(call, class, stamp)),
         (0..6_u32, 0..4_u8).prop_map(|(call, class)| release(call, class)),

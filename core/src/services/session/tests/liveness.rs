@@ -86,6 +86,29 @@ fn a_vehicle_knows_when_it_last_heard_its_manager() {
     assert_eq!(since(&pair), before);
 }
 
+/// The manager's keep-alives say so: a standby need not wait until it has given the vehicle up.
+#[test]
+fn a_vehicle_that_its_manager_does_not_hear_counts_from_then() {
+    let tagged = TaggedClaim { claim: Claim { term: 5, claimant: 1 }, ..TaggedClaim::NONE };
+    let mut pair = Pair::prepared(&Setup::default(), |pair| pair.manager.hub.hub.node.set_claim(tagged));
+    let manager = pair.manager.hub.hub.node.identity().clone();
+    let since = |pair: &Pair| pair.agv.hub.hub.node.obeyed_report(pair.agv.now, &manager).map(|report| report.since);
+    pair.run(Duration::from_millis(10_000));
+    pair.agv.net.datagrams = Datagrams::Lost;
+    pair.agv.net.frozen = true;
+    pair.run(Duration::from_millis(1_400));
+    assert_eq!(since(&pair), Some(0), "it may be heard yet");
+    pair.run(Duration::from_millis(200));
+    assert!(since(&pair).is_some_and(|since| (1_500..=1_600).contains(&since)), "{:?}", since(&pair));
+    assert_eq!(pair.agv.counter(LinkCounter::KeepAlivesMissed), 0, "it hears the manager");
+    // Heard again, it learns that before the next keep-alive.
+    pair.agv.net.datagrams = Datagrams::Pass;
+    pair.agv.net.frozen = false;
+    pair.run(Duration::from_millis(500));
+    assert_eq!(since(&pair), Some(0));
+    assert!(pair.manager.session.is_live() && pair.agv.session.is_live());
+}
+
 /// The frame may be the last thing that the link brings: nothing is polled between the two.
 #[test]
 fn a_manager_that_is_heard_again_was_heard_then_even_if_the_link_ends_at_once() {
