@@ -7,6 +7,7 @@
 //! | [`distances`], [`plan`] | who goes where next |
 //! | [`network`] | who the units are |
 //! | [`vehicle`], [`host`], [`manager`], [`mechanic`] | the units, each kind a process |
+//! | [`places`] | gates, lifts and crossings of several managers |
 //! | [`book`] | what outlives a manager |
 //! | [`faults`], [`run`] | what is broken in a run, and what came of it |
 
@@ -20,6 +21,7 @@ pub mod map;
 pub mod mechanic;
 pub mod network;
 pub mod orders;
+pub mod places;
 pub mod plan;
 pub mod run;
 pub mod text;

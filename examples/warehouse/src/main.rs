@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use anyhow::Result;
-use cara_warehouse::{host, manager, mechanic, run};
+use cara_warehouse::{host, manager, mechanic, places, run};
 use clap::{Parser, Subcommand};
 
 /// A warehouse of vehicles on one machine.
@@ -24,6 +24,8 @@ enum Role {
     Manager(manager::Options),
     /// The mechanic.
     Mechanic(mechanic::Options),
+    /// Places that vehicles of several managers share.
+    Places(places::Options),
 }
 
 fn main() -> Result<ExitCode> {
@@ -38,5 +40,6 @@ fn main() -> Result<ExitCode> {
         Role::Vehicles(options) => host::run(&options).map(|()| ExitCode::SUCCESS),
         Role::Manager(options) => manager::run(&options),
         Role::Mechanic(options) => mechanic::run(&options).map(|()| ExitCode::SUCCESS),
+        Role::Places(options) => places::run(&options).map(|()| ExitCode::SUCCESS),
     }
 }

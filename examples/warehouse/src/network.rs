@@ -8,6 +8,8 @@ use clap::Args;
 pub const MANAGER: (&str, u32) = ("warehouse", 1);
 /// The mechanic's.
 pub const MECHANIC: (&str, u32) = ("mechanic", 2);
+/// Of the unit that offers shared places.
+pub const PLACES: (&str, u32) = ("places", 3);
 /// Of the first vehicle; the others follow.
 const FIRST_ID: u32 = 101;
 /// Most vehicles.
