@@ -87,10 +87,11 @@ pub struct Hold<T: Send + 'static = ()> {
 }
 
 impl<T: Send + 'static> Hold<T> {
-    /// Whether the call's order is still held. Not once the node has ended it, which
+    /// Whether the call's order is still held. Not once its link has ended, or the node has ended it, which
     /// [`UnitEvent::LeaseEnded`](crate::UnitEvent::LeaseEnded) reports too.
     pub fn is_held(&self) -> bool {
-        self.call.link.lock().session.holds(self.call.id)
+        let link = self.call.link.lock();
+        link.session.is_live() && link.session.holds(self.call.id)
     }
 }
 

@@ -5,7 +5,7 @@ use std::fs::{File, TryLockError};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use cara_std::keys::{KeyError, full_name, parse_node, write_private};
@@ -14,9 +14,11 @@ use cara_std::{
     ServiceError, ServiceOptions,
 };
 
-use super::{LEASE_MS, Occupant, Record, Refused, Shared, SharedServer, Shown, Use, refusal};
+use super::{LEASE_MS, Occupant, Record, Refused, Shared, SharedServer, Shown, refusal};
 use crate::network::{Network, PLACES};
 
+/// A manager whose renewals are not answered lets no vehicle in after this.
+const STALE: Duration = Duration::from_millis(2 * LEASE_MS);
 /// How often the process looks for changes to print.
 const LOOK: Duration = Duration::from_millis(100);
 
@@ -50,8 +52,10 @@ pub struct Places(Arc<Mutex<Inner>>);
 struct Inner {
     record: Record,
     path: PathBuf,
-    /// The newest pass of each place that was given since the start.
-    passes: HashMap<String, LeaseWatch>,
+    /// The newest order of each place since the start.
+    orders: HashMap<String, LeaseWatch>,
+    /// When an order of each place ended, or the start.
+    ended: HashMap<String, Arc<Mutex<Instant>>>,
     _lock: File,
 }
 
@@ -73,7 +77,8 @@ impl Places {
         let mut record = text.parse::<Record>().map_err(|what| OpenError::Damaged { path: path.clone(), what })?;
         names.iter().for_each(|name| record.add(name));
         write_private(&path, record.to_string().as_bytes())?;
-        let inner = Inner { record, path, passes: HashMap::new(), _lock: lock };
+        let ended = names.iter().map(|name| (name.clone(), Arc::new(Mutex::new(Instant::now())))).collect();
+        let inner = Inner { record, path, orders: HashMap::new(), ended, _lock: lock };
         Ok(Self(Arc::new(Mutex::new(inner))))
     }
 
@@ -82,8 +87,11 @@ impl Places {
         functions.serve(SharedServer)?;
         for name in names {
             let definition = Definition::parse(&format!("enter_{name}(vehicle: string[64]) -> (pass: int)"))?;
-            // Nothing moves by a pass: `place` looks at its lease.
-            let options = ServiceOptions::new().lease(Duration::from_millis(LEASE_MS), || ());
+            let ended = self.lock().ended.get(name).cloned().unwrap_or_else(|| Arc::new(Mutex::new(Instant::now())));
+            // Nothing moves by a pass.
+            let options = ServiceOptions::new().lease(Duration::from_millis(LEASE_MS), move || {
+                *ended.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+            });
             let name = name.clone();
             let enter =
                 move |places: &mut Self, call: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
@@ -106,9 +114,9 @@ impl Places {
         // Not for a caller that has given up meanwhile: nobody would give the place back.
         call.commit(|| ())?;
         let granted = inner.change(|record| record.enter(place, &vehicle));
-        let pass = granted.map_err(|failure| call.fail(failure))?;
+        let pass = granted.map_err(|refused| call.fail(failure(&refused)))?;
         if let Some(lease) = &call.lease {
-            inner.passes.insert(place.to_owned(), lease.clone());
+            inner.orders.insert(place.to_owned(), lease.clone());
         }
         Ok(pass)
     }
@@ -120,12 +128,12 @@ impl Places {
 
 impl Inner {
     /// On disk before it counts.
-    fn change<R>(&mut self, change: impl FnOnce(&mut Record) -> Result<R, Refused>) -> Result<R, Failure> {
+    fn change<R>(&mut self, change: impl FnOnce(&mut Record) -> Result<R, Refused>) -> Result<R, Refused> {
         let mut record = self.record.clone();
-        let result = change(&mut record).map_err(|refused| failure(&refused))?;
+        let result = change(&mut record)?;
         if record != self.record {
             let written = write_private(&self.path, record.to_string().as_bytes());
-            written.map_err(|error| Failure::new(refusal::NOT_KEPT, &error.to_string()))?;
+            written.map_err(|error| Refused::NotKept(error.to_string()))?;
             self.record = record;
         }
         Ok(result)
@@ -133,27 +141,33 @@ impl Inner {
 
     fn shown(&self, place: &str) -> Result<Shown, Refused> {
         let occupant = self.record.occupant(place)?;
-        let r#use = match occupant {
-            Occupant::Nobody => Use::Free,
-            Occupant::Vehicle(_) if self.is_live(place) => Use::Held,
-            _ => Use::Blocked,
+        let state = match occupant {
+            Occupant::Nobody => "free",
+            Occupant::Vehicle(_) if self.is_live(place) => "held",
+            _ => "blocked",
         };
-        Ok(Shown { r#use, occupant: occupant.to_string() })
+        Ok(Shown { state: state.to_owned(), occupant: occupant.to_string() })
+    }
+
+    /// Whether the manager of the vehicle may think that its pass is live.
+    fn may_be_used(&self, place: &str, now: Instant) -> bool {
+        let ended = self.ended.get(place).map(|ended| *ended.lock().unwrap_or_else(PoisonError::into_inner));
+        self.is_live(place) || ended.is_some_and(|ended| now.saturating_duration_since(ended) < STALE)
     }
 
     fn is_live(&self, place: &str) -> bool {
-        self.passes.get(place).is_some_and(LeaseWatch::is_live)
+        self.orders.get(place).is_some_and(LeaseWatch::is_live)
     }
 }
 
 impl Shared for Places {
     fn place(&mut self, place: &str) -> Result<Shown, ServiceError> {
-        Ok(self.shown(place).map_err(|refused| failure(&refused).error())?)
+        self.shown(place).map_err(|refused| failure(&refused).error())
     }
 
     fn left(&mut self, place: &str, vehicle: &str, pass: i64) -> Result<(), ServiceError> {
         let vehicle = vehicle_of(vehicle)?;
-        self.lock().change(|record| record.left(place, &vehicle, pass)).map_err(|failure| failure.error())
+        self.lock().change(|record| record.left(place, &vehicle, pass)).map_err(|refused| failure(&refused).error())
     }
 
     fn release(
@@ -165,10 +179,10 @@ impl Shared for Places {
     ) -> Result<(), ServiceError> {
         let looked_for = occupant.parse::<Occupant>().map_err(|_| ServiceError::Failed(refusal::NO_VEHICLE))?;
         let mut inner = self.lock();
-        if inner.is_live(place) {
+        if looked_for != Occupant::Unknown && inner.may_be_used(place, Instant::now()) {
             return Err(ServiceError::Failed(refusal::LIVE));
         }
-        inner.change(|record| record.release(place, &looked_for)).map_err(|failure| call.fail(failure))?;
+        inner.change(|record| record.release(place, &looked_for)).map_err(|refused| call.fail(failure(&refused)))?;
         println!("released {place} of {looked_for} by {}: {reason:?}", full_name(call.caller()));
         Ok(())
     }
@@ -183,6 +197,7 @@ fn failure(refused: &Refused) -> Failure {
         Refused::NoPlace => refusal::NO_PLACE,
         Refused::Taken(_) => refusal::TAKEN,
         Refused::OldPass => refusal::OLD_PASS,
+        Refused::NotKept(_) => refusal::NOT_KEPT,
     };
     Failure::new(code, &refused.to_string())
 }
@@ -219,10 +234,25 @@ pub fn run(options: &Options) -> Result<()> {
         for name in names {
             let shown = places.shown(name)?;
             if known.get(name) != Some(&shown) {
-                println!("{name} {:?} {}", shown.r#use, shown.occupant);
+                println!("{name} {} {}", shown.state, shown.occupant);
                 known.insert(name.clone(), shown);
             }
         }
         std::thread::sleep(LOOK);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Instant, Places, STALE};
+
+    #[test]
+    fn a_place_is_not_released_before_its_last_manager_has_noticed() {
+        let (folder, names) = (tempfile::tempdir().unwrap(), ["gate".to_owned()]);
+        let before = Instant::now();
+        let places = Places::open(folder.path(), &names).unwrap();
+        let inner = places.lock();
+        assert!(inner.may_be_used("gate", before + STALE));
+        assert!(!inner.may_be_used("gate", Instant::now() + STALE));
     }
 }

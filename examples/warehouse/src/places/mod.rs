@@ -4,8 +4,8 @@
 //! ([`SharedPlace`]). Who may be in a place is on disk before a manager hears of it. A place becomes free only when a manager
 //! passes on that the vehicle with the newest pass has left, or when an operator has looked and releases it.
 //!
-//! A pass has a lease, which the manager renews while it is linked to the vehicle. Without renewals the place is [`Use::Blocked`]:
-//! as closed to other vehicles as before, but visible, and open to the vehicle's next manager and to an operator.
+//! A pass has a lease, which the manager renews while it is linked to the vehicle. Without renewals the place is blocked: as
+//! closed to other vehicles as before, but visible, and open to the vehicle's next manager and to an operator.
 //!
 //! What is not promised: a manager that says of its vehicle that it has left, although it has not, is believed.
 
@@ -26,36 +26,25 @@ pub const LEASE_MS: u64 = 1_000;
 pub mod refusal {
     /// Another vehicle may be in it.
     pub const TAKEN: u16 = 1;
-    /// A newer pass was given, or the place was released.
+    /// A newer pass was given.
     pub const OLD_PASS: u16 = 2;
     /// There is no such place.
     pub const NO_PLACE: u16 = 3;
     /// What names the vehicle is no full name, as `agv-1/101`.
     pub const NO_VEHICLE: u16 = 4;
-    /// The pass is live: the vehicle's manager gives the place back.
+    /// The vehicle's manager may still let it in, and gives the place back.
     pub const LIVE: u16 = 5;
     /// The record could not be written; the call may count all the same.
     pub const NOT_KEPT: u16 = 6;
 }
 
-/// How a place is used.
-#[derive(Variables, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Use {
-    /// No vehicle is in it.
-    #[default]
-    Free,
-    /// A vehicle may be in it, and its manager renews the pass.
-    Held,
-    /// A vehicle may be in it, or whether one is is not known, and nobody renews.
-    Blocked,
-}
-
 /// A place as its unit describes it.
-#[derive(Variables, Clone, Debug, Default, PartialEq)]
+#[derive(Variables, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Shown {
-    /// How it is used.
-    pub r#use: Use,
-    /// [`Occupant`] as text.
+    /// `free`, `held` by a vehicle whose manager renews its pass, or `blocked`.
+    #[size(8)]
+    pub state: String,
+    /// Who may be in it: [`Occupant`] as text.
     #[size(64)]
     pub occupant: String,
 }
@@ -71,7 +60,7 @@ pub trait Shared {
     #[idempotent]
     fn left(&mut self, #[size(32)] place: &str, #[size(64)] vehicle: &str, pass: i64) -> Result<(), ServiceError>;
 
-    /// An operator has looked: the occupant that blocks the place is not in it.
+    /// An operator has looked: the occupant that blocks the place is not in it. Refused until two leases after the last order.
     fn release(
         &mut self,
         call: &impl AnyCall<Order = LeaseWatch>,

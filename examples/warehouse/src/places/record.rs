@@ -18,7 +18,7 @@ pub enum Occupant {
     Unknown,
 }
 
-/// Why the record did not change.
+/// Why nothing has changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// There is no such place.
@@ -27,9 +27,12 @@ pub enum Refused {
     /// Another vehicle may be in it.
     #[error("{0} may be in it")]
     Taken(Occupant),
-    /// The vehicle has entered again since, or the place was released.
-    #[error("a newer pass was given, or the place was released")]
+    /// A newer pass was given since.
+    #[error("a newer pass was given")]
     OldPass,
+    /// The file could not be written.
+    #[error("{0}")]
+    NotKept(String),
 }
 
 /// A place.
@@ -88,8 +91,6 @@ impl Record {
         if place.occupant != *looked_for {
             return Err(Refused::Taken(place.occupant.clone()));
         }
-        // A pass that is on its way counts no longer.
-        place.pass = place.pass.wrapping_add(1);
         place.occupant = Occupant::Nobody;
         Ok(())
     }
@@ -134,6 +135,10 @@ impl FromStr for Record {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let mut record = Self::default();
+        // A name that was cut off may be another vehicle's.
+        if !text.is_empty() && !text.ends_with('\n') {
+            return Err("the last line is cut off".into());
+        }
         for (number, line) in text.lines().enumerate() {
             let place = || -> Option<_> {
                 let mut words = line.splitn(3, ' ');
