@@ -116,18 +116,19 @@ impl<T> Handle<T> {
         self.peers().filter(move |peer| peer.their_function_list().contains(function))
     }
 
-    /// How many s_units are connected (paper, listing line 4).
+    /// How many s_units are connected and have published their lists (paper, listing line 4).
     pub fn number_of_s_units(&self) -> usize {
         self.number_of(Role::SUnit)
     }
 
-    /// How many m_units are connected.
+    /// How many m_units are connected and have published their lists.
     pub fn number_of_m_units(&self) -> usize {
         self.number_of(Role::MUnit)
     }
 
     fn number_of(&self, role: Role) -> usize {
-        self.peers().filter(|peer| peer.identity().role() == role).count()
+        let is_listed = |peer: &Peer<T>| peer.session(LinkSession::is_listed).unwrap_or(false);
+        self.peers().filter(|peer| peer.identity().role() == role && is_listed(peer)).count()
     }
 
     /// Whether any node, such as the manager, is connected.

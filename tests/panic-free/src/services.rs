@@ -147,7 +147,7 @@ entry!(session_asked, {
         session.is_acknowledged(*unknown()),
     ));
     keep((session.constraints(), session.silent_for(*unknown()), session.bytes_queued()));
-    keep((session.stream_silent_for(*unknown()), session.hears_datagrams(), session.is_heard()));
+    keep((session.stream_silent_for(*unknown()), session.hears_datagrams(), session.is_heard(), session.is_listed()));
     session.hold_back();
     self::session().announce_claim(context());
 });

@@ -232,6 +232,8 @@ pub trait Node {
 
     /// The s_units that ever joined in the order of joining, and whether each is connected.
     fn s_units(&self) -> Vec<(Identity, bool)>;
+    /// How many s_units count.
+    fn number_of_s_units(&self) -> usize;
     /// The connected nodes.
     fn peers(&self) -> Vec<Identity>;
     /// The connected nodes that offer a function to this unit.
@@ -330,11 +332,6 @@ impl dyn Node {
     /// Whether a peer of this name offers a function to this unit.
     pub fn knows(&self, peer: &str, function: &str) -> bool {
         self.nodes_offering(function).iter().any(|identity| identity.name() == peer)
-    }
-
-    /// How many s_units are connected.
-    pub fn number_of_s_units(&self) -> usize {
-        self.s_units().iter().filter(|(_, connected)| *connected).count()
     }
 
     /// How many events match.

@@ -496,6 +496,7 @@ impl<P: Port> Session<P> {
                 None
             }
             Control::ListEnd { serial } => {
+                self.wire.listed = true;
                 self.wire.publishing.acknowledge(serial);
                 self.pump(cx);
                 Some(Event::ListChanged)

@@ -227,6 +227,7 @@ impl<P: Port> Session<P> {
             liveness: Liveness::new(now, constraints.keep_alive),
             holds: false,
             joined: false,
+            listed: false,
             challenged: false,
             clock: peer_clock::PeerClock::new(),
             due: due::Due::new(),
@@ -311,6 +312,11 @@ impl<P: Port> Session<P> {
     /// The peer's identity, once it has joined.
     pub fn peer(&self) -> Option<&Identity> {
         self.wire.identity().filter(|_| self.wire.joined)
+    }
+
+    /// Whether the peer has joined and its list of functions, which may be empty, is complete. A node counts from then on.
+    pub const fn is_listed(&self) -> bool {
+        self.wire.joined && self.wire.listed
     }
 
     /// The peer's boot epoch, once its hello has come.

@@ -74,6 +74,8 @@ pub(super) struct Wire<P: Port> {
     pub(super) holds: bool,
     /// The hub has taken the peer.
     pub(super) joined: bool,
+    /// The peer has listed its functions.
+    pub(super) listed: bool,
     /// The hub waits for a sign of life to decide about a duplicate.
     pub(super) challenged: bool,
     pub(super) clock: PeerClock,

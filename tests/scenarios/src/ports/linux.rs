@@ -577,6 +577,10 @@ impl Node for Handle {
         peers.iter().map(|peer| (peer.identity().clone(), peer.is_connected())).collect()
     }
 
+    fn number_of_s_units(&self) -> usize {
+        self.system().map(|system| system.number_of_s_units()).unwrap_or_default()
+    }
+
     fn peers(&self) -> Vec<Identity> {
         self.connected().iter().map(|peer| peer.identity().clone()).collect()
     }

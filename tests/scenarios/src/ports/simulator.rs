@@ -469,6 +469,10 @@ impl Node for SimNode {
         self.handle.s_units_ever()
     }
 
+    fn number_of_s_units(&self) -> usize {
+        self.handle.number_of_s_units()
+    }
+
     fn peers(&self) -> Vec<Identity> {
         self.handle.peers()
     }

@@ -28,7 +28,6 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
         manager.broadcast();
         let _ = world.run_until(&|| manager.number_of_s_units() == 1, secs(2));
     }
-    met(world, &manager, "agv", "go_to");
     let list = "pos_info(position: int[2]) -> (position: int[2])\ngo_to(position: int[2])\n";
     assert_eq!(manager.their_function_list("agv"), list);
 

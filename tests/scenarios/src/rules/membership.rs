@@ -29,6 +29,7 @@ fn an_index_keeps_its_meaning_when_another_node_leaves(world: &mut dyn World) {
     }
     let names = || manager.s_units().iter().map(|(identity, _)| identity.name().to_owned()).collect::<Vec<_>>();
     assert_eq!(names(), ["one", "two", "three"]);
+    world.wait("all count", || manager.number_of_s_units() == 3, secs(10));
     agvs[1].stop();
     world.wait("two has left", || manager.number_of_s_units() == 2, secs(10));
     assert_eq!(names(), ["one", "two", "three"]);
@@ -142,12 +143,8 @@ fn an_m_unit_has_m_units_and_s_units(world: &mut dyn World) {
     let agvs: Vec<_> = agvs.collect();
     for (index, manager) in managers.iter().enumerate() {
         let own = agvs.iter().filter(|(_, own)| *own == index).count();
-        world.wait(
-            "it knows two m_units and its s_units",
-            || manager.nodes_offering("note").len() == 2 + own,
-            secs(40),
-        );
-        assert_eq!(manager.number_of_s_units(), own);
+        let knows = || manager.nodes_offering("note").len() == 2 + own && manager.number_of_s_units() == own;
+        world.wait("it knows two m_units and its s_units", knows, secs(40));
         assert_eq!(manager.peers().len(), 2 + own, "and nobody else");
     }
     for (agv, own) in &agvs {

@@ -193,6 +193,13 @@ impl UnitHandle {
         self.peers().into_iter().filter(|peer| peer.role() == Role::SUnit).collect()
     }
 
+    /// How many s_units are connected and have published their lists.
+    pub fn number_of_s_units(&self) -> usize {
+        let s_unit = |link: &Link| link.session.peer().is_some_and(|peer| peer.role() == Role::SUnit);
+        let counts = |link: &Link| link.session.is_listed() && s_unit(link);
+        self.machine(|machine, _| machine.links.iter().filter(|(_, link)| counts(link)).count()).unwrap_or_default()
+    }
+
     /// The s_units that have joined this life of the unit, connected or not.
     pub fn roster(&self) -> Vec<Identity> {
         let joined =

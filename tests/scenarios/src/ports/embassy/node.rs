@@ -231,6 +231,10 @@ impl Node for Rc<BoardNode> {
         unit.roster().map(|peer| (peer.identity().clone(), peer.is_connected())).collect()
     }
 
+    fn number_of_s_units(&self) -> usize {
+        self.unit().map(|unit| unit.number_of_s_units()).unwrap_or_default()
+    }
+
     fn peers(&self) -> Vec<Identity> {
         self.connected().iter().map(|peer| peer.identity().clone()).collect()
     }
