@@ -4,7 +4,7 @@ use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::session::RequestOptions;
 
-use super::{Bystander, pair};
+use super::{Bystander, keep_alives_pass, pair};
 use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Unit, World, millis, number, secs};
 
@@ -26,8 +26,9 @@ fn life(seconds: u64) -> RequestOptions {
 /// A command into a stream that is frozen for eight seconds, while keep-alives pass.
 fn frozen(world: &mut dyn World, service: &Service, options: RequestOptions) -> (Unit, Unit) {
     let (manager, agv) = pair(world, service);
+    keep_alives_pass(world, [&manager, &agv]);
     let mut bystander = Bystander::add(world, &manager);
-    let calm = secs(2) + millis(world.random(1_000));
+    let calm = millis(world.random(1_000));
     world.run_for(calm);
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(8)));
     manager.request_with("agv", "go", &number("n", 1), options).expect("it is accepted");
@@ -52,7 +53,7 @@ fn a_stale_command_from_a_frozen_link_does_not_run(world: &mut dyn World) {
 fn a_blocking_command_from_a_frozen_link_does_not_run(world: &mut dyn World) {
     let service = Service::numbered("go");
     let (manager, agv) = pair(world, &service);
-    world.run_for(secs(2));
+    keep_alives_pass(world, [&manager, &agv]);
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(8)));
     let start = world.now();
     let asked = world.ask_with(&manager, "agv", "go", &mut number("n", 1), life(2));

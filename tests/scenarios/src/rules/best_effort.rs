@@ -1,11 +1,9 @@
 //! Telemetry: now or never.
 
 use cara_core::error::Error;
-use cara_core::host::connections::LinkCounter;
-use cara_core::services::session::{Delivery, RequestOptions};
 use cara_sim::Path;
 
-use super::pair;
+use super::{BEST_EFFORT, best_effort_passes, pair, sent};
 use crate::scenario::scenarios;
 use crate::{Fault, Service, Unit, World, millis, number, secs, text};
 
@@ -15,29 +13,10 @@ scenarios![
     best_effort_is_for_short_messages_without_a_reply: "delivery", Rough, [], ["RequestsWithheld"];
 ];
 
-const BEST_EFFORT: RequestOptions = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::new() };
-
-/// A manager and an AGV that has told that datagrams come: right behind a join, best effort goes in the stream.
 fn live_pair(world: &mut dyn World, service: &Service) -> (Unit, Unit) {
     let (manager, agv) = pair(world, service);
-    let mut in_a_row = 0;
-    for n in -1_000..0 {
-        let before = sent(&manager);
-        manager.request_with("agv", "telemetry", &number("n", n), BEST_EFFORT).expect("it is accepted at once");
-        let [in_the_stream, in_datagrams] = sent(&manager);
-        let goes_in_a_datagram = in_the_stream == before[0] && in_datagrams > before[1];
-        world.run_for(millis(10));
-        // What the AGV told earlier may come later, for so long.
-        in_a_row = if goes_in_a_datagram { in_a_row + 1 } else { 0 };
-        if in_a_row == 30 {
-            return (manager, agv);
-        }
-    }
-    panic!("within 10 s the AGV has not told that datagrams come");
-}
-
-fn sent(unit: &Unit) -> [u64; 2] {
-    [LinkCounter::MessagesSent, LinkCounter::DatagramsSent].map(|counter| unit.counted(counter))
+    best_effort_passes(world, &manager, "agv", "telemetry");
+    (manager, agv)
 }
 
 fn best_effort_loses_without_blocking(world: &mut dyn World) {

@@ -3,7 +3,7 @@
 use cara_core::error::{CloseReason, Error};
 use cara_core::services::session::RequestOptions;
 
-use super::{met, pair};
+use super::{keep_alives_pass, met, pair};
 use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Unit, World, millis, number, secs};
 
@@ -48,7 +48,8 @@ fn silent(event: &Seen) -> bool {
 
 fn a_silent_peer_is_lost_after_three_keep_alives(world: &mut dyn World) {
     let (manager, agv) = pair(world, &Service::numbered("note"));
-    let calm = secs(3) + millis(world.random(2_000));
+    keep_alives_pass(world, [&manager, &agv]);
+    let calm = millis(world.random(2_000));
     world.run_for(calm);
     let cut = world.now();
     world.fault(Fault::Cut(&manager, &agv));
@@ -86,7 +87,8 @@ fn stream_dead(event: &Seen) -> bool {
 fn a_dead_stream_ends_the_link_though_datagrams_pass(world: &mut dyn World) {
     let (manager, agv) = pair(world, &Service::numbered("note"));
     world.wait("both are connected", || agv.is_connected("manager") && manager.is_connected("agv"), secs(40));
-    let calm = secs(3) + millis(world.random(5_000));
+    keep_alives_pass(world, [&manager, &agv]);
+    let calm = millis(world.random(5_000));
     world.run_for(calm);
     let one_way = world.random(3);
     if one_way != 1 {
@@ -110,7 +112,7 @@ fn a_dead_stream_ends_the_link_though_datagrams_pass(world: &mut dyn World) {
 fn a_stream_held_for_a_while_is_not_dead(world: &mut dyn World) {
     let (manager, agv) = pair(world, &Service::numbered("note"));
     world.wait("both are connected", || agv.is_connected("manager") && manager.is_connected("agv"), secs(40));
-    world.run_for(secs(3));
+    keep_alives_pass(world, [&manager, &agv]);
     for _ in 0..5 {
         world.fault(Fault::FreezeStreams(&manager, &agv, secs(7)));
         world.fault(Fault::FreezeStreams(&agv, &manager, secs(7)));

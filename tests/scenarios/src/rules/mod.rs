@@ -31,8 +31,10 @@ mod turns;
 use std::sync::{Arc, Mutex};
 
 use cara_core::error::ServiceError;
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::session::{Delivery, RequestOptions};
 
-use crate::{Scenario, Service, Spec, Unit, World, number, secs};
+use crate::{Scenario, Service, Spec, Unit, World, millis, number, secs};
 
 /// Every scenario.
 pub fn all() -> Vec<Scenario> {
@@ -89,6 +91,36 @@ fn pair(world: &mut dyn World, service: &Service) -> (Unit, Unit) {
     let agv = world.add(Spec::agv("agv", 7).service(service));
     met(world, &manager, "agv", service.name());
     (manager, agv)
+}
+
+const BEST_EFFORT: RequestOptions = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::new() };
+
+/// Calls a function until its calls leave as datagrams: before the peer has reported that they arrive, best effort goes in the stream.
+fn best_effort_passes(world: &mut dyn World, unit: &Unit, peer: &str, function: &str) {
+    let mut in_a_row = 0;
+    for n in -1_000..0 {
+        let before = sent(unit);
+        unit.request_with(peer, function, &number("n", n), BEST_EFFORT).expect("it is accepted at once");
+        let [in_the_stream, in_datagrams] = sent(unit);
+        let goes_in_a_datagram = in_the_stream == before[0] && in_datagrams > before[1];
+        world.run_for(millis(10));
+        // An earlier report may come later, for so long.
+        in_a_row = if goes_in_a_datagram { in_a_row + 1 } else { 0 };
+        if in_a_row == 30 {
+            return;
+        }
+    }
+    panic!("within 10 s {peer} has not reported that datagrams arrive");
+}
+
+fn sent(unit: &Unit) -> [u64; 2] {
+    [LinkCounter::MessagesSent, LinkCounter::DatagramsSent].map(|counter| unit.counted(counter))
+}
+
+/// Waits until a datagram of each has reached the other: from then on keep-alives keep the link while its stream is held up.
+fn keep_alives_pass(world: &mut dyn World, units: [&Unit; 2]) {
+    let received = || units.iter().all(|unit| unit.counted(LinkCounter::DatagramsReceived) > 0);
+    world.wait("datagrams pass both ways", received, secs(40));
 }
 
 /// An AGV that has nothing to do with what goes wrong: its calls go on.

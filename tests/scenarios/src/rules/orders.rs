@@ -6,7 +6,7 @@ use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::{Delivery, RequestOptions};
 
-use super::{met, pair};
+use super::{best_effort_passes, met, pair};
 use crate::scenario::scenarios;
 use crate::{Fault, Gate, Seen, Service, Spec, World, millis, number, secs};
 
@@ -25,10 +25,13 @@ const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(60)), ..Requ
 
 /// The later one goes as a datagram beside a stream that is held up.
 fn a_call_made_earlier_never_replaces_a_later_one(world: &mut dyn World) {
-    let service = mover();
+    let (service, note) = (mover(), Service::numbered("note"));
     let log = service.log();
-    let (manager, agv) = pair(world, &service);
-    world.run_for(secs(1));
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7).service(&service).service(&note));
+    met(world, &manager, "agv", "drive");
+    met(world, &manager, "agv", "note");
+    best_effort_passes(world, &manager, "agv", "note");
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(4)));
     let first = manager.request_with("agv", "drive", &number("n", 1), PATIENT).expect("it is accepted");
     let best_effort = RequestOptions { delivery: Delivery::BestEffort, ..PATIENT };

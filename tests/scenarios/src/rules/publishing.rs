@@ -4,7 +4,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 
-use super::{met, pair};
+use super::{keep_alives_pass, met, pair};
 use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
 
@@ -91,8 +91,7 @@ fn publishing_returns_at_once_or_waits_as_asked(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     let agv = world.add(Spec::agv("agv", 7));
     world.wait("it has joined", || manager.is_connected("agv") && agv.is_connected("manager"), secs(40));
-    // Keep-alives pass, so that the link outlives the pause of its stream.
-    world.run_for(secs(2));
+    keep_alives_pass(world, [&manager, &agv]);
     manager.add_service(&Service::new("late()")).expect("there is room");
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(6)));
     manager.publish().expect("it can be published");
