@@ -13,6 +13,7 @@ use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::services::hub::Hub;
 use cara_core::services::publications::Publications;
+use cara_core::time::Duration;
 use core::net::SocketAddr;
 
 use crate::access::AccessTable;
@@ -56,6 +57,7 @@ pub struct Builder<T, R> {
     discovery_port: Option<u16>,
     tcp_port: u16,
     threads: Option<Threads>,
+    spin: Duration,
     /// The m_units that an m_unit connects to, if not all.
     m_units: Option<Box<[Identity]>>,
     #[cfg(feature = "control")]
@@ -99,6 +101,7 @@ impl<R> Builder<(), R> {
             discovery_port: None,
             tcp_port: 0,
             threads: None,
+            spin: Duration::ZERO,
             m_units: None,
             #[cfg(feature = "control")]
             control,
@@ -302,6 +305,14 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
+    /// A thread that waits for a reply, or for the next of calls that follow each other at once, polls the link for so long before
+    /// it sleeps: a round trip saves the time of waking it, and a CPU is busy meanwhile (`docs/performance.md`, "Spinning"). At
+    /// most 1 ms; zero, which is not at all, unless set. On a link where that was in vain ever fewer waits spin, down to one in 256.
+    pub fn spin(mut self, at_most: impl Into<Duration>) -> Self {
+        self.spin = at_most.into();
+        self
+    }
+
     /// The application's state, which methods get (paper, section 2: "the object class to be passed as a template
     /// parameter").
     pub fn state<U: Send + 'static>(self, state: U) -> Builder<U, R> {
@@ -316,6 +327,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             discovery_port: self.discovery_port,
             tcp_port: self.tcp_port,
             threads: self.threads,
+            spin: self.spin,
             m_units: self.m_units,
             #[cfg(feature = "control")]
             control: self.control,
@@ -419,6 +431,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             hub: HubCell::new(Hub { node, publications }),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
+            spin: self.spin,
             state: self.state,
             datagrams,
             listener,

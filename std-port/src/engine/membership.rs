@@ -38,7 +38,7 @@ struct Dialed<'i>(Option<&'i Identity>);
 
 impl<T: Send + 'static> Engine<T> {
     /// Puts a stream into the table of links. `None` when the table is full.
-    fn open_link(&self, stream: Stream, address: SocketAddr, dialed: Option<Dialed<'_>>) -> Option<Arc<LinkCell>> {
+    fn open_link(&self, mut stream: Stream, address: SocketAddr, dialed: Option<Dialed<'_>>) -> Option<Arc<LinkCell>> {
         let mut links = self.links.table_mut();
         let index = links.iter().position(Option::is_none)?;
         let id = LinkId(u16::try_from(index).ok()?);
@@ -61,6 +61,7 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(span) = self.key_watch.renews_every() {
             session.renew_every(span);
         }
+        stream.spin(self.spin);
         let link = Arc::new(LinkCell::new(self.driver.unit_number()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
         drop(links);

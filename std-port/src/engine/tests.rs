@@ -27,7 +27,7 @@ use crate::sys::datagram::Socket;
 use crate::sys::epoll::wait_readable;
 use crate::testing::{Pair, fleet, until};
 use crate::threads::Driven;
-use crate::{Interfaces, Parameters, Served, ServiceError, ServiceOptions, Unit, UnitEvent};
+use crate::{CommunicationSystem, Interfaces, Parameters, Served, ServiceError, ServiceOptions, Unit, UnitEvent};
 
 /// Too long for the buffer that a link has of its own.
 const LONG: usize = 16_000;
@@ -341,4 +341,46 @@ fn a_unit_whose_clock_waits_does_not_keep_time() {
     });
     pair.manager.stop();
     assert!(!pair.manager.keeps_time(Duration::from_millis(1)));
+}
+
+/// One that spins has to notice what wakes one that sleeps: the reply, the time-out and the end of the link.
+#[test]
+fn a_caller_that_spins_has_its_reply_its_time_out_and_the_end_of_the_link() {
+    let (fleet, spin) = (fleet(), Duration::from_millis(1));
+    let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::Loopback);
+    let manager = manager.fleet(fleet).insecure().spin(spin).build().unwrap();
+    let agv = Unit::builder("agv", 1, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
+    let agv = agv.fleet(fleet).insecure().spin(spin).build().unwrap();
+    let (begun, begins) = channel();
+    let (release, released) = channel::<()>();
+    let released = Mutex::new(released);
+    let hang = move |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> {
+        begun.send(()).map_err(|_| ServiceError::NotReady)?;
+        lock(&released).recv().map_err(|_| ServiceError::NotReady)
+    };
+    let same = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    agv.my_function_list().add_function("hang", &Parameters::new(), hang).unwrap();
+    agv.my_function_list().add_function("same", &*text(10), same).unwrap();
+    agv.publish_my_function_list().unwrap();
+    manager.start().unwrap();
+    agv.start().unwrap();
+    until(|| manager.number_of_s_units() == 1);
+    let peer = manager.s_unit("agv").unwrap();
+    until(|| peer.their_function_list().len() == 2);
+    for _ in 0..100 {
+        peer.block_request("same", &mut *text(10)).unwrap();
+    }
+    let link = manager.engine().links.all().remove(0);
+    let call = |timeout| peer.call("hang", &mut Parameters::new()).timeout(timeout).wait().map(drop);
+    assert_eq!(call(Duration::from_millis(20)).unwrap_err().error, Error::TimedOut);
+    assert!(link.stream.spun_in_vain() > 0, "it has not spun");
+    release.send(()).unwrap();
+    begins.recv().unwrap();
+    std::thread::scope(|scope| {
+        let waiting = scope.spawn(|| call(PATIENT));
+        begins.recv().unwrap();
+        manager.stop();
+        assert_eq!(waiting.join().unwrap().unwrap_err().error, Error::Interrupted);
+    });
+    release.send(()).unwrap();
 }

@@ -7,6 +7,7 @@ pub mod datagram;
 pub mod epoll;
 pub mod interfaces;
 pub mod limits;
+mod spinning;
 pub(crate) mod stream;
 
 use std::hash::{BuildHasher, Hasher, RandomState};

@@ -18,6 +18,7 @@ use rustix::net::{
 };
 
 use super::epoll::wait_readable;
+use super::spinning::Spinning;
 
 /// The longest that one blocking receive lasts; a waiting caller looks at its deadline and timers this often.
 pub(crate) const SLICE: Duration = Duration::from_millis(50);
@@ -66,6 +67,7 @@ pub(crate) struct Stream {
     local: OnceLock<Option<Ipv4Addr>>,
     /// Why it could not be opened.
     failed: OnceLock<Errno>,
+    spinning: Spinning,
 }
 
 impl Stream {
@@ -142,7 +144,18 @@ impl Stream {
     }
 
     fn new(socket: OwnedFd) -> Self {
-        Self { socket, local: OnceLock::new(), failed: OnceLock::new() }
+        Self { socket, local: OnceLock::new(), failed: OnceLock::new(), spinning: Spinning::default() }
+    }
+
+    /// Threads that wait for it poll it for so long before they sleep, as far as that helps.
+    pub(crate) fn spin(&mut self, span: Duration) {
+        self.spinning = Spinning::lasting(span);
+    }
+
+    /// Waits in a row, or nearly, that have spun in vain.
+    #[cfg(test)]
+    pub(crate) fn spun_in_vain(&self) -> u32 {
+        self.spinning.misses()
     }
 
     /// Sends what the kernel takes of `slices`, in order, without waiting; 0 when it has no room.
@@ -179,6 +192,11 @@ impl Stream {
 
     /// Receives into `buffer`, which must not be empty.
     pub(crate) fn receive(&self, buffer: &mut [u8], wait: Wait) -> Received {
+        let (received, wait) = self.spinning.spin(wait, || self.receive_once(buffer, Wait::Not));
+        if received == Received::WouldBlock { self.receive_once(buffer, wait) } else { received }
+    }
+
+    fn receive_once(&self, buffer: &mut [u8], wait: Wait) -> Received {
         let flags = match wait {
             Wait::Not => RecvFlags::DONTWAIT,
             Wait::Slice => RecvFlags::empty(),

@@ -28,6 +28,7 @@ pub(super) struct File {
     pub(super) insecure: Maybe<bool>,
     pub(super) discovery_port: Maybe<u16>,
     pub(super) tcp_port: Maybe<u16>,
+    pub(super) spin: Maybe<Time>,
     pub(super) manager: Maybe<Manager>,
     pub(super) m_units: Maybe<Vec<Spanned<String>>>,
     pub(super) access: Maybe<String>,

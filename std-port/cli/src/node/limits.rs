@@ -11,6 +11,8 @@ use super::values::{Size, Time};
 
 /// Longest message that a Linux unit takes.
 const LONGEST_MESSAGE: u64 = 256 * 1024;
+/// Longest that a Linux unit polls before it sleeps.
+const LONGEST_SPIN: Duration = Duration::from_millis(1);
 /// Chunks: an emergency fits into the shortest, and none is longer than what the protocol allows.
 const CHUNKS: RangeInclusive<u64> = 320..=4096;
 /// Entries of a table, so that no mistake asks for more memory than there is.
@@ -67,6 +69,16 @@ pub(super) fn capacities(table: &file::Capacities, mistakes: &mut Vec<Mistake>) 
     set(&mut sizes.signature_bytes, &table.signature_bytes, SIGNATURE_BYTES, mistakes);
     set(&mut sizes.their_signature_bytes, &table.their_signature_bytes, SIGNATURE_BYTES, mistakes);
     sizes
+}
+
+/// How long a thread polls before it sleeps, with what the file says.
+pub(super) fn spin(value: &Maybe<Time>, mistakes: &mut Vec<Mistake>) -> Duration {
+    let Some(value) = value else { return Duration::ZERO };
+    let span = value.get_ref().0;
+    if span > LONGEST_SPIN {
+        mistakes.push(Mistake::new(value.span(), "this time is too long", "write a time of at most 1 ms"));
+    }
+    span
 }
 
 /// What the black box may take with what the file says.

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use cara_std::access::AccessTable;
 use cara_std::control::{Control, Operators};
-use cara_std::{Capacities, Constraints, Identity, Interfaces};
+use cara_std::{Capacities, Constraints, Duration, Identity, Interfaces};
 
 use super::black_box::Budget;
 use super::file::{self, File, Maybe, Role};
@@ -38,6 +38,8 @@ pub(super) struct Settings {
     pub(super) keys: Keys,
     pub(super) discovery_port: Option<Placed<u16>>,
     pub(super) tcp_port: Option<Placed<u16>>,
+    /// How long a thread polls before it sleeps.
+    pub(super) spin: Duration,
     pub(super) constraints: Constraints,
     pub(super) capacities: Capacities,
     pub(super) control: Control,
@@ -151,6 +153,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         keys: keys(file, over, mistakes),
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
+        spin: limits::spin(&file.spin, mistakes),
         constraints: limits::constraints(&file.constraints, limits::defaults(role, over.stands_by), mistakes),
         control: control(&file.control, role, mistakes),
         audit: audit(&file.control, mistakes),

@@ -67,6 +67,16 @@ fn the_example_shows_the_defaults() {
     assert_eq!(of_standby(EXAMPLE), Constraints::M_UNIT, "what is written counts");
 }
 
+#[test]
+fn a_node_spins_for_a_millisecond_at_most_and_not_unless_it_is_told() {
+    let spins =
+        |line: &str| settings(&format!("name = \"a\"\nid = 1\n{line}\n")).map(|settings| settings.spin.as_micros());
+    let told = ["", "spin = 0", "spin = \"100us\"", "spin = \"1ms\""].map(|line| spins(line).unwrap());
+    assert_eq!(told, [0, 0, 100, 1_000]);
+    let mistake = spins("spin = \"1001us\"").unwrap_err();
+    assert!(mistake.contains("at most 1 ms"), "{mistake}");
+}
+
 /// With the comment signs of keys and tables taken out, the example is that of an s_unit.
 #[test]
 fn what_the_example_leaves_out_is_right_too() {

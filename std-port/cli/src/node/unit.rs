@@ -249,7 +249,7 @@ impl Node {
 
 fn with<R>(builder: Builder<(), R>, settings: &Settings) -> Result<Builder<(), R>, AccessError> {
     let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
-    let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
+    let builder = builder.constraints(settings.constraints).capacities(settings.capacities).spin(settings.spin);
     let builder = settings.keys.given_to(builder);
     let builder = match &settings.discovery_port {
         Some(port) => builder.discovery_port(port.value),

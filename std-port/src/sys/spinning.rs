@@ -1,0 +1,134 @@
+//! Spinning: a thread that waits for a stream polls it for a while before it sleeps, as long as that brings something.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Instant;
+
+use cara_core::time::Duration;
+
+use super::stream::{Received, Wait};
+
+/// The longest that a thread may poll before it sleeps.
+pub(crate) const LONGEST_SPIN: Duration = Duration::from_millis(1);
+
+/// After so many waits in vain one in 256 spins, which costs a wait 4 us in the mean at most.
+const MOST_MISSES: u32 = 8;
+
+/// How long waits for one stream spin, and how often it was in vain lately. One thread waits at a time; where a second one
+/// does, a wait more or less spins.
+#[derive(Debug, Default)]
+pub(super) struct Spinning {
+    span: Duration,
+    misses: AtomicU32,
+    skipped: AtomicU32,
+}
+
+impl Spinning {
+    /// Waits spin for so long.
+    pub(super) fn lasting(span: Duration) -> Self {
+        Self { span: span.min(LONGEST_SPIN), ..Self::default() }
+    }
+
+    /// Polls with `receive` until something comes or the time is over; returns what is left of the wait as well. Polls not
+    /// at all where it is off, has not helped lately, or would outlast the wait.
+    pub(super) fn spin(&self, wait: Wait, mut receive: impl FnMut() -> Received) -> (Received, Wait) {
+        let spins = match wait {
+            Wait::Not => false,
+            Wait::Slice => true,
+            Wait::AtMost(left) => left > self.span,
+        };
+        if !spins || self.span == Duration::ZERO || !self.is_worth_it() {
+            return (Received::WouldBlock, wait);
+        }
+        let began = Instant::now();
+        let misses = self.misses.load(Ordering::Relaxed);
+        loop {
+            let received = receive();
+            if received != Received::WouldBlock {
+                self.misses.store(misses / 2, Ordering::Relaxed);
+                return (received, wait);
+            }
+            let spun = Duration::from(began.elapsed());
+            if spun >= self.span {
+                self.misses.store((misses + 1).min(MOST_MISSES), Ordering::Relaxed);
+                let left = match wait {
+                    Wait::AtMost(left) => Wait::AtMost(left - spun),
+                    wait => wait,
+                };
+                return (received, left);
+            }
+            // The peer, or the thread that takes a stop, may wait for this CPU.
+            std::thread::yield_now();
+        }
+    }
+
+    #[cfg(test)]
+    pub(super) fn misses(&self) -> u32 {
+        self.misses.load(Ordering::Relaxed)
+    }
+
+    /// One wait in `2^misses`.
+    fn is_worth_it(&self) -> bool {
+        let skipped = self.skipped.load(Ordering::Relaxed) + 1;
+        let is_due = skipped >> self.misses.load(Ordering::Relaxed) > 0;
+        self.skipped.store(if is_due { 0 } else { skipped }, Ordering::Relaxed);
+        is_due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SPAN: Duration = Duration::from_micros(10);
+
+    /// How many of so many waits spin, where nothing comes.
+    fn in_vain(spinning: &Spinning, waits: usize) -> usize {
+        let spins = |_: &usize| {
+            let mut polled = false;
+            let (received, _) = spinning.spin(Wait::Slice, || {
+                polled = true;
+                Received::WouldBlock
+            });
+            assert_eq!(received, Received::WouldBlock);
+            polled
+        };
+        (0..waits).filter(spins).count()
+    }
+
+    #[test]
+    fn it_is_off_unless_it_has_a_span() {
+        assert_eq!(in_vain(&Spinning::default(), 100), 0);
+    }
+
+    #[test]
+    fn what_does_not_help_is_tried_seldom_and_begins_again_when_it_helps() {
+        let spinning = Spinning::lasting(SPAN);
+        assert_eq!(in_vain(&spinning, 511), 9, "after 1, 2, 4 … 256 waits");
+        assert_eq!(in_vain(&spinning, 2_560), 10);
+        while spinning.misses() > 0 {
+            spinning.spin(Wait::Slice, || Received::Bytes(1));
+        }
+        let mut polls = 0;
+        for _ in 0..100 {
+            spinning.spin(Wait::Slice, || {
+                polls += 1;
+                Received::Bytes(1)
+            });
+        }
+        assert_eq!(polls, 100, "each wait spins as long as it helps");
+    }
+
+    #[test]
+    fn no_spin_outlasts_the_wait_and_what_it_took_is_off_the_wait() {
+        let spinning = Spinning::lasting(Duration::from_secs(9));
+        assert_eq!(spinning.span, LONGEST_SPIN);
+        for wait in [Wait::Not, Wait::AtMost(LONGEST_SPIN)] {
+            let (_, left) = spinning.spin(wait, || panic!("it polls"));
+            assert_eq!(left, wait);
+        }
+        let all = Duration::from_millis(30);
+        let (_, left) = spinning.spin(Wait::AtMost(all), || Received::WouldBlock);
+        let Wait::AtMost(left) = left else { panic!("{left:?}") };
+        assert!(left <= all - LONGEST_SPIN, "{left:?}");
+    }
+}
