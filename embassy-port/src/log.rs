@@ -143,8 +143,11 @@ impl Source for LogCell {
     }
 
     fn newest(&self, look: &mut dyn FnMut(&Value<'_>)) {
-        self.waits.set(false);
         self.piece.newest(look);
+    }
+
+    fn taken(&self) {
+        self.waits.set(false);
     }
 }
 

@@ -90,6 +90,7 @@ mod latch;
 mod lease;
 mod line_queue;
 mod locks;
+mod log;
 #[cfg(feature = "metrics")]
 pub mod metrics;
 mod my_function_list;
@@ -153,6 +154,7 @@ pub use handler::{IntoHandler, Served, ServiceOptions};
 pub use heart::{Heart, Hold};
 pub use lease::{LeaseEnded, LeaseWatch};
 pub use line_queue::LineQueue;
+pub use log::Log;
 pub use my_function_list::MyFunctionList;
 pub use name_and_id::NameAndId;
 pub use peer::{Peer, TheirFunction, TheirFunctionList};

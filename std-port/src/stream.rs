@@ -32,7 +32,7 @@ const LOOK: Duration = Duration::from_millis(100);
 pub struct Stream<T: Send + 'static = ()> {
     engine: Arc<Engine<T>>,
     definition: Definition,
-    own: Arc<OwnStream>,
+    pub(crate) own: Arc<OwnStream>,
 }
 
 impl<T: Send + 'static> Clone for Stream<T> {

@@ -42,6 +42,8 @@ pub trait Source {
     fn version(&self) -> u32;
     /// Lends the newest value, if there is one.
     fn newest(&self, look: &mut dyn FnMut(&Value<'_>));
+    /// A link has sent the newest value, or skipped it as too long: a source whose values follow each other may publish the next.
+    fn taken(&self) {}
 }
 
 /// Stores the newest value of a stream in lent bytes.

@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Condvar, Mutex, OnceLock, PoisonError, Weak};
 use std::task::Waker;
 
 use cara_core::error::Error;
@@ -21,11 +21,18 @@ pub(crate) struct OwnStream {
     newest: Mutex<Newest<Box<[u8]>>>,
     /// Sequentially consistent with the links' subscription flags: of a new value and a new subscription one sees the other.
     version: AtomicU32,
+    on_taken: OnceLock<Box<dyn Fn() + Send + Sync>>,
 }
 
 impl OwnStream {
     pub(crate) fn new(bytes: usize) -> Self {
-        Self { newest: Mutex::new(Newest::new(vec![0; bytes].into())), version: AtomicU32::new(0) }
+        let newest = Mutex::new(Newest::new(vec![0; bytes].into()));
+        Self { newest, version: AtomicU32::new(0), on_taken: OnceLock::new() }
+    }
+
+    /// Calls `taken` whenever a link has taken the newest value, with the link locked. Only the first one counts.
+    pub(crate) fn on_taken(&self, taken: impl Fn() + Send + Sync + 'static) {
+        let _ = self.on_taken.set(Box::new(taken));
     }
 
     pub(crate) fn put(&self, put: impl FnOnce(&mut Newest<Box<[u8]>>) -> Result<(), Error>) -> Result<(), Error> {
@@ -44,6 +51,12 @@ impl Source for OwnStream {
     fn newest(&self, look: &mut dyn FnMut(&Value<'_>)) {
         if let Some(value) = lock(&self.newest).value() {
             look(&value);
+        }
+    }
+
+    fn taken(&self) {
+        if let Some(taken) = self.on_taken.get() {
+            taken();
         }
     }
 }

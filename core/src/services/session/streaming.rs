@@ -331,6 +331,7 @@ impl StreamsPart {
         if matches!(result, Err(Error::Full(_))) {
             return Attempt::Later(cx.now + RETRY);
         }
+        source.taken();
         if result.is_ok() {
             wire.link.counters.add(LinkCounter::SamplesSent, 1);
             let second = (total as u64).saturating_mul(SECOND);

@@ -134,6 +134,7 @@ pub(super) struct Metrics {
 #[serde(deny_unknown_fields)]
 pub(super) struct Log {
     pub(super) level: Maybe<String>,
+    pub(super) stream: Maybe<bool>,
 }
 
 /// `[black_box]`

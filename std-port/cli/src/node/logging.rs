@@ -5,15 +5,17 @@ use std::fmt::{self, Write as _};
 use std::io::{IsTerminal, Write};
 use std::time::Duration;
 
-use cara_std::LineQueue;
+use cara_std::{LineQueue, Log};
 use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::filter::{LevelFilter, ParseError};
+use tracing_subscriber::fmt::writer::MakeWriterExt;
 use tracing_subscriber::layer::{Context, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer};
 
 use super::black_box::{BlackBox, Cause};
+use super::settings::Settings;
 use cara_tools::exit::Ended;
 
 /// The default log filter.
@@ -27,6 +29,8 @@ pub(super) struct Logging {
     /// The environment's `RUST_LOG` stands above the file's level.
     fixed: bool,
     lines: LineQueue,
+    /// The same lines for the unit's manager.
+    stream: Option<Log>,
 }
 
 impl Drop for Logging {
@@ -91,7 +95,8 @@ impl Visit for Fields<'_> {
 
 impl Logging {
     /// Begins to log. The command line's level stands above `RUST_LOG`, and that above the file's.
-    pub(super) fn start(command_line: Option<&str>, file: Option<&str>, black_box: &BlackBox) -> anyhow::Result<Self> {
+    pub(super) fn start(command_line: Option<&str>, settings: &Settings, black_box: &BlackBox) -> anyhow::Result<Self> {
+        let file = settings.file_log.as_deref();
         let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
         let fixed = command_line.is_some() || environment.is_some();
         let filter = match (command_line, environment) {
@@ -121,13 +126,24 @@ impl Logging {
             .with_env_filter(filter);
         let builder = builder.with_filter_reloading();
         let handle = builder.reload_handle();
+        let stream = settings.streams_log.then(Log::default);
+        // Sending a piece of it writes lines of the level TRACE.
+        let streamed = stream.clone().map(|log| {
+            let writer = (move || log.clone()).with_max_level(Level::DEBUG);
+            tracing_subscriber::fmt::layer().with_ansi(false).with_writer(writer)
+        });
         // Another one is there only if a test has set it; that one may stay.
-        let _ = builder.finish().with(Boxed(black_box.clone())).try_init();
+        let _ = builder.finish().with(Boxed(black_box.clone())).with(streamed).try_init();
         let change = Box::new(move |filter| {
             // Fails only once the subscriber is gone.
             let _ = handle.reload(filter);
         });
-        Ok(Self { change, fixed, lines })
+        Ok(Self { change, fixed, lines, stream })
+    }
+
+    /// The lines for the unit's manager.
+    pub(super) fn stream(&self) -> Option<&Log> {
+        self.stream.as_ref()
     }
 
     /// Takes the level of a file that has changed.

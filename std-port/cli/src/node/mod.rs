@@ -113,7 +113,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         return Ok(Exit::Done.into());
     }
     let black_box = BlackBox::new(&settings);
-    let logging = logging::Logging::start(over.log.as_deref(), settings.file_log.as_deref(), &black_box)?;
+    let logging = logging::Logging::start(over.log.as_deref(), &settings, &black_box)?;
     running::run(settings, &over, &logging, &black_box, global)?;
     Ok(Exit::Done.into())
 }

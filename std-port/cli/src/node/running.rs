@@ -42,6 +42,9 @@ pub(super) fn run(
             Ended::usage(format!("the audit log {path} cannot be written: {error}"))
         }
     })?;
+    if let Some(log) = logging.stream() {
+        node.my_function_list().add_log(log).map_err(|error| Ended::usage(format!("[log] stream: {error}")))?;
+    }
     offer_all(&node, &settings, &programs, black_box)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     let (ending, fenced) = (signals.handle(), Arc::new(OnceLock::new()));

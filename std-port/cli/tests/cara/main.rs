@@ -10,6 +10,7 @@ mod giving_up;
 mod handing;
 mod holding;
 mod hung;
+mod logging;
 mod managers;
 mod measuring;
 mod places;
