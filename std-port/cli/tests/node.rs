@@ -46,7 +46,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
 // --- mistakes
 
 /// A file, where its mistake is, and a part of what is said about it.
-const MISTAKES: [(&str, &str, &str); 50] = [
+const MISTAKES: [(&str, &str, &str); 51] = [
     ("name = \"a", "1:10", "expected `\"`"),
     ("name = \"a\"\nid = \n", "2:6", "value"),
     ("name = \"a\"\nid = 1\nid = 2", "3:1", "duplicate key"),
@@ -96,6 +96,11 @@ const MISTAKES: [(&str, &str, &str); 50] = [
     ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"0.0.0.0:9464\"", "4:10", "--metrics-anywhere"),
     ("name = \"a\"\nid = 1\n[log]\nlevel = \"a=b=c\"", "4:9", "no level"),
     ("name = \"a\"\nid = 1\n[log]\nlevel = \"bogus\"", "4:9", "`bogus`"),
+    (
+        "name = \"a\"\nid = 1\nrole = \"s_unit\"\nmanager = { name = \"m\", id = 1 }\n[black_box]\nstreams = [\"pose\"]",
+        "6:11",
+        "an s_unit reads no streams",
+    ),
     ("name = \"a\"\nid = 1\n[log]\nstream = true", "4:10", "an m_unit streams no log"),
     ("name = \"a\"\nid = 1\n[[functions]]\nanswer = \"echo\"", "3:1", "no signature"),
     ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f(n: integer)\"\nanswer = \"echo\"", "4:19", "a type"),
@@ -519,8 +524,16 @@ fn the_end_of_the_node_makes_safe_once() {
 #[test]
 fn what_led_to_a_stop_is_in_a_black_box() {
     let halt = "[[functions]]\nsignature = \"halt(n: int) -> (n: int)\"\nanswer = \"echo\"\nstop = true\n";
-    let mut node = Node::start_with(halt, &["--state", "state"]);
-    let (_unit, manager) = node.vehicle("agv", 7);
+    let mut node = Node::start_with(&format!("[black_box]\nstreams = [\"pose\"]\n{halt}"), &["--state", "state"]);
+    let (unit, manager) = node.vehicle("agv", 7);
+    let definition = cara_std::Definition::stream("pose(n: int)").unwrap();
+    let pose = unit.my_function_list().add_stream(&definition, cara_std::Duration::ZERO).unwrap();
+    unit.publish_my_function_list().unwrap();
+    // The first one is in the box long before the second one is sent.
+    until("two values are sent", || {
+        pose.publish(&number(1234)).unwrap();
+        manager.counters().into_iter().any(|(name, count)| name == "SamplesSent" && count > 1)
+    });
     manager.block_request("halt", &mut number(17)).unwrap();
     assert!(node.process.terminate(PATIENCE).unwrap().success());
     let cara = |arguments: &[&str]| {
@@ -536,7 +549,10 @@ fn what_led_to_a_stop_is_in_a_black_box() {
         (1, &"stop".into(), &"plant/1".into()),
         "{listed}"
     );
-    let replayed = cara(&["replay", boxes[0]["file"].as_str().unwrap()]);
+    let file = boxes[0]["file"].as_str().unwrap();
+    let written = std::fs::read(node.folder.path().join(file)).unwrap();
+    assert!(text(&written).contains("\"values\":{\"n\":1234}"), "no value of `pose` is in it");
+    let replayed = cara(&["replay", file]);
     for part in ["joined", "halt {\"n\":17}", "signal=\"SIGTERM\""] {
         assert!(replayed.contains(part), "`{part}` is not in {replayed}");
     }

@@ -143,6 +143,7 @@ pub(super) struct Log {
 pub(super) struct BlackBox {
     pub(super) keep: Maybe<Size>,
     pub(super) size: Maybe<Size>,
+    pub(super) streams: Maybe<Vec<String>>,
 }
 
 /// `[[functions]]`

@@ -64,6 +64,7 @@ pub(super) fn run(
     }
     service::up(&node);
     node.follow_commands(black_box.clone());
+    node.follow_streams(&settings.boxed_streams, black_box.clone());
     let mut settings = settings;
     for signal in signals.forever() {
         tracing::info!(signal = signal_hook::low_level::signal_name(signal), "signal");

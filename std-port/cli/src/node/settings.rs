@@ -60,6 +60,8 @@ pub(super) struct Settings {
     /// Its manager gets the log as a stream.
     pub(super) streams_log: bool,
     pub(super) black_box: Budget,
+    /// Streams of the nodes that are in an m_unit's black box.
+    pub(super) boxed_streams: Vec<String>,
     pub(super) services: Vec<Service>,
 }
 
@@ -164,6 +166,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         file_log: log(file, mistakes),
         streams_log: streams_log(file, role, mistakes),
         black_box: limits::black_box(&file.black_box, mistakes),
+        boxed_streams: boxed_streams(file, role, mistakes),
         services: functions::services(&source, &file.functions, capacities.functions, mistakes),
         capacities,
         source,
@@ -398,6 +401,15 @@ fn streams_log(file: &File, role: Role, mistakes: &mut Vec<Mistake>) -> bool {
         mistakes.push(Mistake::new(stream.span(), "an m_unit streams no log", help));
     }
     *stream.get_ref()
+}
+
+fn boxed_streams(file: &File, role: Role, mistakes: &mut Vec<Mistake>) -> Vec<String> {
+    let Some(streams) = &file.black_box.streams else { return Vec::new() };
+    if role == Role::SUnit {
+        let help = "leave it out: it is for an m_unit, which reads the streams of its nodes";
+        mistakes.push(Mistake::new(streams.span(), "an s_unit reads no streams", help));
+    }
+    streams.get_ref().clone()
 }
 
 fn log(file: &File, mistakes: &mut Vec<Mistake>) -> Option<String> {

@@ -19,6 +19,9 @@ use super::black_box::{BlackBox, Cause, Look};
 use super::http::Metrics;
 use super::settings::Settings;
 
+/// Between two values of a stream in the black box.
+const BOXED_MS: u64 = 1_000;
+
 /// An m_unit or an s_unit.
 pub(super) enum Node {
     Manager(CommunicationSystem),
@@ -229,6 +232,25 @@ impl Node {
         };
         if let Err(error) = std::thread::Builder::new().name("cara-commands".into()).spawn(follow) {
             tracing::warn!(%error, "the black box has no commands");
+        }
+    }
+
+    /// Puts the values of streams with these names into the black box, of all nodes.
+    pub(super) fn follow_streams(&self, names: &[String], black_box: BlackBox) {
+        let Self::Manager(system) = self else { return };
+        if names.is_empty() {
+            return;
+        }
+        let (system, names) = (system.downgrade(), names.to_vec());
+        let follow = move || {
+            let Some(system) = system.upgrade() else { return };
+            execute(&system, &Question::Streams { interval_ms: BOXED_MS, names }, &mut |answer| {
+                black_box.take(&answer);
+                ControlFlow::Continue(())
+            });
+        };
+        if let Err(error) = std::thread::Builder::new().name("cara-streams".into()).spawn(follow) {
+            tracing::warn!(%error, "the black box has no streams");
         }
     }
 
