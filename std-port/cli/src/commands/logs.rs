@@ -1,4 +1,4 @@
-//! `cara logs`: the logs of boards, as they come over their links.
+//! `cara logs`: the logs of units, as they come over their links.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -21,8 +21,8 @@ const STREAM: &str = "log";
 /// What is kept of a line that has no end.
 const LONGEST: usize = 64 * 1024;
 
-/// Shows the logs of boards that are built with the feature `logs`, as they come; first what each has kept for this, also of its
-/// life before. Ctrl-C ends it.
+/// Shows the logs of units, as they come: of boards that are built with the feature `logs`, and of units on Linux that stream theirs.
+/// First comes what each has kept, a board also of its life before. Ctrl-C ends it.
 ///
 /// A log of defmt takes the firmware's ELF. Others are lines of text.
 #[derive(clap::Args)]
@@ -47,7 +47,9 @@ pub(crate) fn run(Arguments { node, elf, span }: Arguments, global: &Global) -> 
             let node = nodes::connected(&mut operator, &node)?.selector;
             let published = nodes::functions(&mut operator, &node)?;
             if !published.iter().any(|function| function.name == STREAM && nodes::is_stream(function)) {
-                let text = format!("{node} has no log for others: is its firmware built with the feature `logs`?");
+                let text = format!(
+                    "{node} has no log for others: a board's firmware takes the feature `logs`, the file of `cara node` `[log] stream = true`"
+                );
                 return Err(Ended::failed("NoLog", text));
             }
             Question::Stream { node, name: Some(STREAM.to_owned()), interval_ms: 0 }
@@ -140,6 +142,30 @@ struct Log {
     reader: Option<Box<dyn Read>>,
 }
 
+/// The logs of units on Linux, line by line.
+#[derive(Default)]
+pub(super) struct Texts(HashMap<String, Log>);
+
+impl Texts {
+    /// The lines that end in a piece, as events. `None` if it is no piece, or a board's, which takes the firmware to be read.
+    pub(super) fn events(&mut self, answer: &Answer) -> Option<Vec<Answer>> {
+        let Answer::Value { node, stream, unix_ms, values, .. } = answer else { return None };
+        if stream.split('(').next() != Some(STREAM) {
+            return None;
+        }
+        let Piece { at, build: None, bytes } = Piece::of(values)? else { return None };
+        let log = self.0.entry(node.clone()).or_insert_with(Log::of_text);
+        let event = |line| {
+            let text = match line {
+                Line::Text(text) => text,
+                Line::Lost(bytes) => format!("{bytes} bytes are lost here"),
+            };
+            Answer::Event { at_ms: 0, unix_ms: *unix_ms, event: STREAM.to_owned(), node: Some(node.clone()), text }
+        };
+        Some(log.take(at, &bytes).into_iter().map(event).collect())
+    }
+}
+
 /// Makes lines of bytes.
 trait Read {
     fn read(&mut self, bytes: &[u8], found: &mut Vec<Line>);
@@ -149,6 +175,10 @@ trait Read {
 }
 
 impl Log {
+    fn of_text() -> Self {
+        Self { build: None, next: None, reader: Some(Box::<Lines>::default()) }
+    }
+
     fn take(&mut self, at: u32, piece: &[u8]) -> Vec<Line> {
         let (next, mut found) = (self.next.unwrap_or(at), Vec::new());
         let Some(reader) = &mut self.reader else { return found };
@@ -371,20 +401,16 @@ mod tests {
         Line::Text(text.to_owned())
     }
 
-    fn empty() -> Log {
-        Log { build: None, next: None, reader: Some(Box::<Lines>::default()) }
-    }
-
     #[test]
     fn pieces_make_lines_and_what_is_lost_is_counted() {
-        let mut log = empty();
+        let mut log = Log::of_text();
         assert_eq!(log.take(7, b"one\ntw"), [text("one")]);
         assert_eq!(log.take(13, b"o\n"), [text("two")]);
         assert_eq!(log.take(13, b"o\n"), [], "sent again");
         assert_eq!(log.take(13, b"o\nthree\n"), [text("three")]);
         assert_eq!(log.take(121, b"rest\nfour\n"), [Line::Lost(100), text("rest"), text("four")]);
         assert_eq!(log.take(0, b"anew\n"), [text("anew")], "power was off");
-        let mut wrapping = empty();
+        let mut wrapping = Log::of_text();
         assert_eq!(wrapping.take(u32::MAX, b"ab"), []);
         assert_eq!(wrapping.take(1, b"c\n"), [text("abc")]);
         assert_eq!(wrapping.take(4, b"d\n"), [Line::Lost(1), text("d")]);

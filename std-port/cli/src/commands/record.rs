@@ -10,6 +10,8 @@ use blake2::{Blake2s256, Digest};
 use cara_std::control::protocol::{Answer, NodeInfo, OrderInfo, Question, UnitInfo};
 use serde_json::json;
 
+use super::logs::Texts;
+use crate::nodes;
 use crate::operator::{Need, Operator, Way};
 use crate::recording::{Limits, Recorder};
 use cara_tools::exit::{Ended, Exit};
@@ -25,7 +27,7 @@ use cara_tools::units::{parse_bytes, parse_time, show_bytes};
 pub(crate) struct Arguments {
     /// The file. A recording that is there becomes FILE.1.
     file: PathBuf,
-    /// Record the streams of this name, of all nodes; may be repeated.
+    /// Record the streams of this name, of all nodes; may be repeated. `log` is recorded line by line, as events.
     #[arg(long, value_name = "NAME")]
     stream: Vec<String>,
     /// Record at most so many values of a stream a second; as many as the node grants, up to 50, if absent.
@@ -147,13 +149,16 @@ fn about(unit: &UnitInfo) -> BTreeMap<String, String> {
 /// Records the answers to a question that has no end, also after the manager was away.
 fn follow(way: &Way, recorder: &Recorder, mut question: Question) {
     let is_streams = matches!(question, Question::Streams { .. });
-    let mut is_warned = false;
+    let (mut is_warned, mut logs) = (false, Texts::default());
     loop {
         let mut is_followed = false;
         let ended = way.open().and_then(|mut operator| {
             operator.watch(&question, None, |answer| {
                 is_followed = true;
-                recorder.take(&answer);
+                match logs.events(&answer) {
+                    Some(lines) => lines.iter().for_each(|line| recorder.take(line)),
+                    None => recorder.take(&answer),
+                }
                 Ok(true)
             })
         });
@@ -204,11 +209,18 @@ fn look(first: Operator, way: &Way, recorder: &Recorder, every: Duration) {
             if is_due {
                 questions.extend([Question::Unit, Question::Counters { node: None }]);
             }
+            let mut changed = Vec::new();
             for question in questions {
                 operator.ask(&question, |answer| {
-                    record_changed(recorder, &mut known, answer, is_due);
+                    changed.extend(record_changed(recorder, &mut known, answer, is_due));
                     Ok(())
                 })?;
+            }
+            for node in changed {
+                // A node that has left meanwhile has none.
+                if let Ok(functions) = nodes::functions(&mut operator, &node) {
+                    recorder.take_functions(&node, &functions);
+                }
             }
             Ok(operator)
         });
@@ -223,24 +235,38 @@ fn look(first: Operator, way: &Way, recorder: &Recorder, every: Duration) {
     }
 }
 
-fn record_changed(recorder: &Recorder, known: &mut HashMap<String, Answer>, answer: Answer, is_due: bool) {
-    let (key, lasting, is_sampled) = match &answer {
+/// Returns the node whose functions may be others than before.
+fn record_changed(
+    recorder: &Recorder,
+    known: &mut HashMap<String, Answer>,
+    answer: Answer,
+    is_due: bool,
+) -> Option<String> {
+    let (key, lasting, is_sampled, offers) = match &answer {
         Answer::Node(node) => {
             let lasting = NodeInfo { connected_ms: None, left_ms: None, searched_ms: None, link: None, ..node.clone() };
-            (format!("{}/{}@{}", node.name, node.id, node.role), Answer::Node(lasting), node.connected)
+            let name = format!("{}/{}", node.name, node.id);
+            let key = format!("{name}@{}", node.role);
+            (key, Answer::Node(lasting), node.connected, Some(name).filter(|_| node.connected))
         }
         Answer::Order(order) => {
             let lasting = OrderInfo { left_ms: None, age_ms: None, ..order.clone() };
-            (format!("{}/{} {}", order.node, order.id, order.function), Answer::Order(lasting), false)
+            (format!("{}/{} {}", order.node, order.id, order.function), Answer::Order(lasting), false, None)
         }
         Answer::Unit(unit) => {
-            (String::new(), Answer::Unit(UnitInfo { uptime_ms: 0, connected: 0, ..unit.clone() }), false)
+            let lasting = UnitInfo { uptime_ms: 0, connected: 0, ..unit.clone() };
+            (String::new(), Answer::Unit(lasting), false, None)
         }
-        Answer::Counters { .. } => return recorder.take(&answer),
-        _ => return,
+        Answer::Counters { .. } => {
+            recorder.take(&answer);
+            return None;
+        }
+        _ => return None,
     };
-    if is_sampled && is_due || known.get(&key) != Some(&lasting) {
+    let has_changed = known.get(&key) != Some(&lasting);
+    if is_sampled && is_due || has_changed {
         recorder.take(&answer);
         known.insert(key, lasting);
     }
+    offers.filter(|_| has_changed)
 }

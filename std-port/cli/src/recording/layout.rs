@@ -4,13 +4,14 @@
 
 use std::borrow::Cow;
 
-use cara_std::control::protocol::{Answer, Argument, UnitInfo};
+use cara_std::control::protocol::{Answer, Argument, FunctionInfo, UnitInfo};
 use serde_json::{Map, Value, json};
 
 use crate::commands::call::values as values_of;
 
 const EVENTS: &str = "/events";
 const COMMANDS: &str = "/commands";
+pub(super) const FUNCTIONS: &str = "/functions";
 
 /// A message, and the channel that it belongs to.
 pub(super) struct Message {
@@ -48,6 +49,11 @@ pub(super) fn message(answer: &Answer, came: u64) -> Option<Message> {
         _ => return None,
     };
     Some(of(topic, published, json!(answer)))
+}
+
+/// What a node offers.
+pub(super) fn functions(node: &str, functions: &[FunctionInfo], came: u64) -> Message {
+    of(FUNCTIONS, came, json!({ "node": node, "functions": functions }))
 }
 
 /// What the recording says of itself.
@@ -109,6 +115,10 @@ pub(super) fn schema(message: &Message) -> (String, Value) {
     let (name, members) = match &*message.topic {
         EVENTS => ("cara.Event", json!({ "at_ms": 0, "unix_ms": 0, "event": "", "node": "", "text": "" })),
         COMMANDS => ("cara.Command", command()),
+        FUNCTIONS => {
+            let function = json!({ "name": "", "signature": "", "priority": "", "help": "" });
+            ("cara.Functions", json!({ "node": "", "functions": [function] }))
+        }
         "/nodes" => ("cara.Node", node()),
         "/orders" => ("cara.Order", order()),
         "/recording" => {

@@ -8,8 +8,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use cara_std::LineQueue;
-use cara_std::control::protocol::Answer;
+use cara_std::control::protocol::{Answer, FunctionInfo};
 use mcap::McapResult;
+use serde::Serialize;
 use serde_json::json;
 
 use super::file::{Files, Limits};
@@ -49,7 +50,16 @@ impl Recorder {
 
     /// Records an answer. Never waits: what finds no place is counted.
     pub(crate) fn take(&self, answer: &Answer) {
-        match line_of(answer) {
+        self.write(line_of(answer));
+    }
+
+    /// Records what a node offers, likewise.
+    pub(crate) fn take_functions(&self, node: &str, functions: &[FunctionInfo]) {
+        self.write(line_of(&(node, functions)));
+    }
+
+    fn write(&self, line: Option<Vec<u8>>) {
+        match line {
             Some(line) => self.queue.write(&line),
             None => drop(self.state.too_long.fetch_add(1, Ordering::Relaxed)),
         }
@@ -209,10 +219,10 @@ impl Writer {
     }
 }
 
-/// An answer that comes now, with its time before it; `None` if it is too long.
-pub(super) fn line_of(answer: &Answer) -> Option<Vec<u8>> {
+/// An answer that comes now, or a node and its functions, with its time before it; `None` if it is too long.
+pub(super) fn line_of(body: &impl Serialize) -> Option<Vec<u8>> {
     let mut line = now().to_le_bytes().to_vec();
-    serde_json::to_writer(&mut line, answer).ok().filter(|()| line.len() <= LONGEST)?;
+    serde_json::to_writer(&mut line, body).ok().filter(|()| line.len() <= LONGEST)?;
     Some(line)
 }
 
@@ -224,7 +234,12 @@ pub(super) fn came(line: &[u8]) -> Option<u64> {
 /// What is recorded of a line, and when that came; `None` if nothing is.
 pub(super) fn message_of(line: &[u8]) -> io::Result<Option<(Message, u64)>> {
     let came = came(line).ok_or(io::ErrorKind::InvalidData)?;
-    let answer = serde_json::from_slice(line.get(TIME..).unwrap_or_default())?;
+    let body = line.get(TIME..).unwrap_or_default();
+    if body.starts_with(b"[") {
+        let (node, functions): (String, Vec<FunctionInfo>) = serde_json::from_slice(body)?;
+        return Ok(Some((layout::functions(&node, &functions, came), came)));
+    }
+    let answer = serde_json::from_slice(body)?;
     Ok(layout::message(&answer, came).map(|message| (message, came)))
 }
 

@@ -10,9 +10,13 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use cara_std::control::protocol::{Answer, Argument, ArgumentValue, CONTROL_VERSION, Failure, Number, Question};
+use cara_std::control::protocol::{
+    Answer, Argument, ArgumentValue, CONTROL_VERSION, Failure, FunctionInfo, Number, Question,
+};
+use serde::Deserialize;
 use serde_json::Value;
 
+use super::layout::FUNCTIONS;
 use super::reading::Message;
 
 /// Answers that wait for a client that watches; it loses more.
@@ -35,6 +39,8 @@ struct State {
     nodes: BTreeMap<String, Answer>,
     orders: BTreeMap<String, Answer>,
     counters: BTreeMap<Option<String>, Answer>,
+    /// By node.
+    functions: BTreeMap<String, Vec<Answer>>,
     /// The last value of each, by node and name.
     streams: BTreeMap<(String, String), Answer>,
     watching: Vec<(Watched, SyncSender<Answer>)>,
@@ -75,6 +81,10 @@ impl Stage {
         if message.topic == "/counters" {
             if let Some((node, counters)) = counters_of(&message.body) {
                 state.counters.insert(node, counters);
+            }
+        } else if message.topic == FUNCTIONS {
+            if let Some((node, functions)) = functions_of(&message.body) {
+                state.functions.insert(node, functions);
             }
         } else if message.topic.starts_with("/streams/") {
             let Some((key, value)) = value_of(&message.body) else { return };
@@ -147,6 +157,10 @@ impl Stage {
                 Question::Nodes { offering: None } => state.nodes.values().cloned().collect(),
                 Question::Orders { node: None } => state.orders.values().cloned().collect(),
                 Question::Counters { node: None } => state.counters.values().cloned().collect(),
+                Question::Functions { node } => {
+                    let found = state.functions.iter().find(|(of, _)| is_of(of, node));
+                    found.map(|(_, functions)| functions.clone()).unwrap_or_default()
+                }
                 Question::Stream { node, name: None, .. } => {
                     let of_node = state.streams.iter().filter(|((of, _), _)| of == node);
                     of_node.map(|(_, value)| value.clone()).collect()
@@ -190,6 +204,21 @@ fn send(mut stream: &UnixStream, answer: &Answer) -> io::Result<()> {
     let mut line = serde_json::to_vec(answer)?;
     line.push(b'\n');
     stream.write_all(&line)
+}
+
+/// Whether a node, NAME/ID, is meant by NAME, NAME/ID or #ID.
+fn is_of(node: &str, meant: &str) -> bool {
+    node == meant || node.split_once('/').is_some_and(|(name, id)| name == meant || meant.strip_prefix('#') == Some(id))
+}
+
+fn functions_of(body: &[u8]) -> Option<(String, Vec<Answer>)> {
+    #[derive(Deserialize)]
+    struct Functions {
+        node: String,
+        functions: Vec<FunctionInfo>,
+    }
+    let Functions { node, functions } = serde_json::from_slice(body).ok()?;
+    Some((node, functions.into_iter().map(Answer::Function).collect()))
 }
 
 /// Counters, which a recording has by name.
@@ -259,7 +288,12 @@ mod tests {
                 "/streams/agv/7/pose",
                 r#"{"node":"agv/7","stream":"pose(p: float[2])","unix_ms":5,"age_us":1,"values":{"p":[0.5,1]}}"#,
             ),
+            (
+                "/functions",
+                r#"{"node":"agv/7","functions":[{"name":"go_to","signature":"go_to(x: int)","lease_us":5}]}"#,
+            ),
             ("/streams/agv/7/pose", "{}"),
+            ("/functions", "[]"),
             ("/nodes", "damaged"),
         ] {
             stage.show(&message(topic, body));
@@ -271,6 +305,13 @@ mod tests {
         let mut ask = |question| client.ask(&question).unwrap().map(Result::unwrap).collect::<Vec<_>>();
         let [Answer::Node(node)] = &ask(Question::Nodes { offering: None })[..] else { panic!("one node") };
         assert!(node.connected && node.functions == 2);
+        for node in ["agv", "agv/7", "#7"] {
+            let [Answer::Function(function)] = &ask(Question::Functions { node: node.into() })[..] else {
+                panic!("{node}")
+            };
+            assert!(function.name == "go_to" && function.attributes.lease.is_some());
+        }
+        assert!(ask(Question::Functions { node: "agv-1".into() }).is_empty());
         let counters = vec![("RequestsSent".to_owned(), 3)];
         assert_eq!(ask(Question::Counters { node: None }), [Answer::Counters { node: Some("agv/7".into()), counters }]);
         let [Answer::Value { values, .. }] =

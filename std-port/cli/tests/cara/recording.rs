@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
+use std::io::Write as _;
 use std::path::Path;
 use std::process::Command;
 
@@ -9,6 +10,19 @@ use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use serde_json::Value;
 
 use crate::support::{Running, Stage, until};
+
+/// A line of the log of `agv-1`.
+const LOGGED: &str = "agv-1 has drawn its map";
+
+/// An AGV that streams its log as well.
+fn stage() -> (Stage, cara_std::Unit, cara_std::Stream) {
+    let (stage, agv, pose) = crate::streaming::stage();
+    let mut log = cara_std::Log::default();
+    agv.my_function_list().add_log(&log).unwrap();
+    agv.publish_my_function_list().unwrap();
+    log.write_all(format!("{LOGGED}\n").as_bytes()).unwrap();
+    (stage, agv, pose)
+}
 
 /// The channels of a file that is written at this moment.
 fn topics(file: &Path) -> BTreeSet<String> {
@@ -27,7 +41,7 @@ fn losses(file: &Path) -> u64 {
 /// Records until something of every kind can be read. One recording is ended, and one is killed.
 fn record(stage: &mut Stage, file: &Path, killed: &Path) {
     let record = |file: &Path| {
-        let more = ["record", file.to_str().unwrap(), "--stream", "pose", "--every", "20ms"];
+        let more = ["record", file.to_str().unwrap(), "--stream", "pose", "--stream", "log", "--every", "20ms"];
         let mut recording = Running::start(stage.command(&more));
         recording.expect("recording manager/1");
         recording
@@ -37,11 +51,11 @@ fn record(stage: &mut Stage, file: &Path, killed: &Path) {
     until("both watch", || of_look(&topics(file)) && of_look(&topics(killed)));
     stage.ends(0, &["set", ".", "request_timeout", "19s"]);
     stage.start_agv("late-1", 12);
-    let all = ["/commands", "/counters", "/events", "/nodes", "/streams/agv-1/11/pose", "/unit"];
+    let all = ["/commands", "/counters", "/events", "/functions", "/nodes", "/streams/agv-1/11/pose", "/unit"];
     let all: BTreeSet<_> = all.map(str::to_owned).into();
     let has_all = |file: &Path| {
-        topics(file) == all
-            && stage.cara(&["replay", file.to_str().unwrap()]).out.contains("joined            late-1/12")
+        let shown = stage.cara(&["replay", file.to_str().unwrap()]).out;
+        topics(file) == all && ["joined            late-1/12", LOGGED].iter().all(|part| shown.contains(part))
     };
     until("all is written down", || has_all(file) && has_all(killed));
     to_kill.kill();
@@ -52,7 +66,7 @@ fn record(stage: &mut Stage, file: &Path, killed: &Path) {
 
 #[test]
 fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_file_to_read() {
-    let (mut stage, agv, _pose) = crate::streaming::stage();
+    let (mut stage, agv, _pose) = stage();
     let folder = tempfile::tempdir().unwrap();
     let (file, killed) = (folder.path().join("a.mcap"), folder.path().join("killed.mcap"));
     record(&mut stage, &file, &killed);
@@ -71,6 +85,7 @@ fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_fil
     let (file, socket) = (file.to_str().unwrap(), socket.to_str().unwrap());
     let _replaying = Running::start(stage.command(&["replay", file, "--serve", socket, "--speed", "1000"]));
     until("the recording answers", || stage.cara(&["scan", "--socket", socket, "--json"]).out.contains("late-1"));
+    until("its functions are shown", || stage.cara(&["functions", "agv-1", "--socket", socket]).out.contains("pose"));
     stage.ends(2, &["stop", "--all", "--socket", socket]).says("this is a recording");
     stage.ends(1, &["replay", folder.path().join("none").to_str().unwrap()]);
     agv.stop();
@@ -116,7 +131,7 @@ fn a_full_disk_costs_messages_that_are_counted_and_the_recording_goes_on() {
 fn tools_of_pypi_read_a_recording() {
     let python =
         std::env::var_os("CARA_TEST_PYTHON").expect("CARA_TEST_PYTHON names a python with mcap and jsonschema");
-    let (mut stage, agv, _pose) = crate::streaming::stage();
+    let (mut stage, agv, _pose) = stage();
     let folder = tempfile::tempdir().unwrap();
     let (file, killed) = (folder.path().join("a.mcap"), folder.path().join("killed.mcap"));
     record(&mut stage, &file, &killed);
@@ -127,7 +142,7 @@ fn tools_of_pypi_read_a_recording() {
     };
     let (whole, cut) = (read(&file), read(&killed));
     assert!(whole["summary"].as_bool().unwrap() && !cut["summary"].as_bool().unwrap(), "{whole} {cut}");
-    for topic in ["/commands", "/counters", "/events", "/nodes", "/streams/agv-1/11/pose", "/unit"] {
+    for topic in ["/commands", "/counters", "/events", "/functions", "/nodes", "/streams/agv-1/11/pose", "/unit"] {
         assert!(
             whole["topics"][topic].as_u64() > Some(0) && cut["topics"][topic].as_u64() > Some(0),
             "{topic}: {whole} {cut}"
