@@ -19,6 +19,8 @@ pub enum Fault {
     KillManager,
     /// Another manager takes over.
     TakeOver,
+    /// Some links are cut, or lose much, for a while.
+    Cut,
 }
 
 /// Each kind with the least number of them in a run, and the seconds between two in a long one.
@@ -31,14 +33,24 @@ const KINDS: [(Fault, u32, f64); 7] = [
     (Fault::KillManager, 1, 150.0),
     (Fault::TakeOver, 1, 210.0),
 ];
+/// As above, in a run that cuts links.
+const CUTS: (Fault, u32, f64) = (Fault::Cut, 1, 40.0);
+/// A soak looks for what grows while a manager lives, and where vehicles start again and again.
+const SOAK_KILLS: f64 = 4.0;
+const SOAK_STARTS: f64 = 0.2;
 /// The part of a run in which things are broken; the rest is left to finish.
 const PART: std::ops::Range<f64> = 0.06..0.86;
 
 /// The faults of a run that takes so long, in the order of their times.
-pub fn schedule(seed: u64, span: Duration) -> Vec<(Duration, Fault)> {
+pub fn schedule(seed: u64, span: Duration, is_soak: bool) -> Vec<(Duration, Fault)> {
     let mut rng = fastrand::Rng::with_seed(seed);
     let mut faults = Vec::new();
-    for (index, (fault, least, every)) in KINDS.into_iter().enumerate() {
+    for (index, (fault, least, every)) in KINDS.into_iter().chain(is_soak.then_some(CUTS)).enumerate() {
+        let every = match fault {
+            Fault::KillManager | Fault::TakeOver if is_soak => every * SOAK_KILLS,
+            Fault::Off if is_soak => every * SOAK_STARTS,
+            _ => every,
+        };
         let count = least.max((span.as_secs_f64() / every) as u32);
         let width = (PART.end - PART.start) / f64::from(count);
         // Those that happen once are kept apart: each has its own place in the run.
@@ -61,8 +73,8 @@ mod tests {
     #[test]
     fn a_short_run_has_each_often_enough() {
         let span = Duration::from_secs(45);
-        let faults = schedule(1, span);
-        assert_eq!(faults, schedule(1, span));
+        let faults = schedule(1, span, false);
+        assert_eq!(faults, schedule(1, span, false));
         for (fault, least, _) in KINDS {
             let count = faults.iter().filter(|(_, other)| *other == fault).count();
             assert_eq!(count, least as usize, "{fault:?}");
@@ -73,8 +85,19 @@ mod tests {
     }
 
     #[test]
+    fn a_soak_cuts_links_kills_seldom_and_starts_often() {
+        let count = |is_soak, fault| {
+            let faults = schedule(1, Duration::from_secs(7_200), is_soak);
+            faults.iter().filter(|(_, other)| *other == fault).count()
+        };
+        assert_eq!((count(true, Fault::Cut), count(false, Fault::Cut)), (180, 0));
+        assert_eq!((count(true, Fault::KillManager), count(false, Fault::KillManager)), (12, 48));
+        assert_eq!((count(true, Fault::Off), count(false, Fault::Off)), (2_400, 480));
+    }
+
+    #[test]
     fn a_long_run_has_more() {
-        let faults = schedule(1, Duration::from_secs(600));
+        let faults = schedule(1, Duration::from_secs(600), false);
         assert_eq!(faults.iter().filter(|(_, fault)| *fault == Fault::Stop).count(), 200);
         assert_eq!(faults.iter().filter(|(_, fault)| *fault == Fault::KillManager).count(), 4);
     }

@@ -49,7 +49,8 @@ struct Told {
     crash: Option<(String, String)>,
 }
 
-fn time(text: &str) -> Result<Duration> {
+/// A time on the command line.
+pub(crate) fn time(text: &str) -> Result<Duration> {
     let (number, unit) = text.split_at(text.len().saturating_sub(1));
     let seconds = match unit {
         "s" => 1,

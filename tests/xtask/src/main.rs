@@ -32,6 +32,7 @@ mod manifests;
 mod msrv;
 mod mutants;
 mod names;
+mod networks;
 mod orders;
 mod packages;
 mod panic_free;
@@ -42,6 +43,7 @@ mod release;
 mod runner;
 mod sanitize;
 mod security;
+mod soak;
 mod source;
 mod upgrade;
 mod workspace;
@@ -141,6 +143,10 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
+    /// Breaks the network between two hosts in many ways, and prints what is lost and how long calls take to be answered again.
+    Networks(networks::Networks),
+    /// Runs the warehouse for hours while everything fails, and looks at what its processes hold: nothing may grow.
+    Soak(soak::Soak),
     /// Runs the Linux port's tests under the thread sanitizer, or the core's in Miri; needs a nightly compiler.
     Sanitize(sanitize::Sanitize),
     /// Attacks units on the simulator, a board in QEMU and Linux units, and prints what was tried and what came of it.
@@ -185,6 +191,8 @@ fn main() -> ExitCode {
         Task::Fuzz(options) => fuzz::run(&options),
         Task::Chaos(options) => chaos::run(&options),
         Task::Mutants(options) => mutants::run(&options),
+        Task::Networks(options) => networks::run(&options),
+        Task::Soak(options) => soak::run(&options),
         Task::Sanitize(options) => sanitize::run(&options),
         Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),

@@ -26,6 +26,15 @@ pub(super) struct Said {
 pub(super) struct Usage {
     pub(super) cpu: Duration,
     pub(super) resident_kib: u64,
+    pub(super) threads: u64,
+}
+
+/// What it holds.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Held {
+    /// Its share of what it has in common with others included.
+    pub(super) proportional_kib: u64,
+    pub(super) descriptors: usize,
 }
 
 /// A process.
@@ -40,12 +49,18 @@ impl Child {
     pub(super) fn start(number: usize, keys: &Path, arguments: &[String], said: Sender<Said>) -> Result<Self> {
         let program = std::env::current_exe()?;
         let mut command = Command::new(program);
-        command.args(arguments).env("CARA_KEYS", keys).stdin(Stdio::piped()).stdout(Stdio::piped());
+        command.args(arguments).env("CARA_KEYS", keys);
+        Self::run(number, command, said)
+    }
+
+    /// Starts a program, and hears what it prints.
+    pub(super) fn run(number: usize, mut command: Command, said: Sender<Said>) -> Result<Self> {
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
         if std::env::var_os("RUST_LOG").is_none() {
             // What is broken on purpose is no news.
             command.env("RUST_LOG", "off");
         }
-        let mut process = command.spawn().with_context(|| format!("cannot start {}", arguments.join(" ")))?;
+        let mut process = command.spawn().with_context(|| format!("cannot start {command:?}"))?;
         let output = process.stdout.take();
         Ok(Self::hear(number, process, output, said, Some))
     }
@@ -119,6 +134,11 @@ impl Child {
             self.usage = usage;
         }
     }
+
+    /// What it holds now; `None` once it is gone.
+    pub(super) fn held(&self) -> Option<Held> {
+        held(self.process.id())
+    }
 }
 
 impl Drop for Child {
@@ -137,8 +157,19 @@ fn usage(pid: u32) -> Option<Usage> {
     // Linux counts these in hundredths of a second for programs.
     let cpu = Duration::from_millis((ticks(11)? + ticks(12)?) * 10);
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-    let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
-    Some(Usage { cpu, resident_kib: resident.split_whitespace().next()?.parse().ok()? })
+    let (resident_kib, threads) = (field(&status, "VmRSS:")?, field(&status, "Threads:")?);
+    Some(Usage { cpu, resident_kib, threads })
+}
+
+fn held(pid: u32) -> Option<Held> {
+    let memory = std::fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?;
+    let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).ok()?.count();
+    Some(Held { proportional_kib: field(&memory, "Pss:")?, descriptors })
+}
+
+/// The first number behind a word.
+fn field(text: &str, word: &str) -> Option<u64> {
+    text.lines().find_map(|line| line.strip_prefix(word))?.split_whitespace().next()?.parse().ok()
 }
 
 #[cfg(test)]
@@ -146,7 +177,9 @@ mod tests {
     #[test]
     fn the_kernel_tells_of_this_process() {
         let usage = super::usage(std::process::id()).unwrap();
-        assert!(usage.resident_kib > 100);
+        assert!(usage.resident_kib > 100 && usage.threads > 0);
+        let held = super::held(std::process::id()).unwrap();
+        assert!(held.proportional_kib > 100 && held.descriptors > 2);
         assert!(super::usage(u32::MAX).is_none());
     }
 }

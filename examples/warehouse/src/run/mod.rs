@@ -3,6 +3,7 @@
 mod board;
 mod child;
 mod report;
+mod soak;
 mod stage;
 mod truth;
 
@@ -20,6 +21,7 @@ use crate::network::{MOST_VEHICLES, vehicle_name};
 use crate::orders::{self, Order};
 use board::{Board, BoardOptions};
 use report::Tally;
+use soak::Samples;
 use stage::{Heard, Stage};
 use truth::Truth;
 
@@ -36,6 +38,9 @@ const OFF: Duration = Duration::from_secs(3);
 const FROZEN: Duration = Duration::from_millis(1_200);
 /// The manager is away for so long.
 const AWAY: Duration = Duration::from_millis(1_500);
+/// Links are cut for so long, and have so long to come back before anything else is broken.
+const CUT: Duration = Duration::from_secs(12);
+const BACK: Duration = Duration::from_secs(12);
 /// It is told so again until it does.
 const REPORTED_AGAIN: Duration = Duration::from_secs(3);
 /// A fault that cannot happen now is tried again.
@@ -64,6 +69,9 @@ pub struct Options {
     /// Two managers stand by for each other: where one is killed the other commands.
     #[arg(long)]
     standby: bool,
+    /// For `cargo xtask soak`: also writes what each process holds here, cuts links, and runs `cara web`.
+    #[arg(long, value_name = "FILE", requires = "minutes")]
+    soak: Option<PathBuf>,
     /// Breaks nothing.
     #[arg(long)]
     no_faults: bool,
@@ -89,6 +97,10 @@ enum Due {
     SwitchOn(String),
     ThawManager,
     StartManager,
+    /// Links are whole again.
+    Heal,
+    /// Those that were cut have had time to come back.
+    Back,
 }
 
 /// Runs; success only if all was as it has to be.
@@ -120,6 +132,8 @@ pub fn run(options: &Options) -> Result<ExitCode> {
         looked: Instant::now(),
         progress: Instant::now(),
         stopped: HashSet::new(),
+        samples: options.soak.as_deref().map(Samples::open).transpose()?,
+        cut: false,
     };
     run.stage.show(&format!("{} vehicles, {} orders, seed {}", options.vehicles, orders.len(), options.seed));
     let finished = run.play(span, options);
@@ -180,6 +194,9 @@ struct Run<'m> {
     progress: Instant,
     /// Vehicles that were stopped, until they are let go on.
     stopped: HashSet<String>,
+    samples: Option<Samples>,
+    /// Links are cut, or just come back.
+    cut: bool,
 }
 
 impl Run<'_> {
@@ -196,9 +213,15 @@ impl Run<'_> {
         if options.standby {
             self.stage.start_standby()?;
         }
+        if self.samples.is_some() {
+            self.stage.start_page()?;
+        }
         let start = Instant::now();
         if !options.no_faults {
-            self.due = schedule(options.seed, span).into_iter().map(|(at, fault)| (at, Due::Break(fault))).collect();
+            self.due = schedule(options.seed, span, options.soak.is_some())
+                .into_iter()
+                .map(|(at, fault)| (at, Due::Break(fault)))
+                .collect();
         }
         while self.truth.done.len() < self.tally.orders || !self.due.is_empty() || !self.commanding {
             self.hear()?;
@@ -219,6 +242,11 @@ impl Run<'_> {
         if self.looked.elapsed() >= Duration::from_secs(1) {
             self.looked = Instant::now();
             self.look();
+            if let Some(samples) = &mut self.samples
+                && samples.is_due()
+            {
+                samples.write(&self.stage.held())?;
+            }
         }
         for heard in self.stage.hear(Duration::from_millis(50)) {
             match heard {
@@ -296,7 +324,7 @@ impl Run<'_> {
     /// Does one thing; what follows from it, after what time.
     fn do_one(&mut self, due: Due) -> Result<Option<(Duration, Due)>> {
         // A manager that is away or new is left to come up first.
-        let is_calm = self.commanding && self.old_manager.is_none() && !self.frozen;
+        let is_calm = self.commanding && self.old_manager.is_none() && !self.frozen && !self.cut;
         Ok(match due {
             Due::Break(fault) if !is_calm => Some((AGAIN, Due::Break(fault))),
             Due::Break(fault) => self.break_one(fault)?,
@@ -317,6 +345,15 @@ impl Run<'_> {
                 self.stage.thaw_managers()?;
                 self.frozen = false;
                 self.tally.freezes += 1;
+                None
+            }
+            Due::Heal => {
+                soak::heal()?;
+                Some((BACK, Due::Back))
+            }
+            Due::Back => {
+                self.cut = false;
+                self.tally.cuts += 1;
                 None
             }
             // Only once its standby does what it did.
@@ -368,6 +405,12 @@ impl Run<'_> {
                 self.stage.freeze_manager()?;
                 self.frozen = true;
                 Some((FROZEN, Due::ThawManager))
+            }
+            Fault::Cut => {
+                let rule = soak::cut(&mut self.rng)?;
+                self.stage.show(&format!("links are cut: {}", rule.replace('\n', "; ")));
+                self.cut = true;
+                Some((CUT, Due::Heal))
             }
             Fault::TakeOver if !self.stage.has_standby() => {
                 self.stage.show("another manager takes over");

@@ -14,6 +14,8 @@ pub(super) struct Tally {
     pub(super) freezes: usize,
     pub(super) kills: usize,
     pub(super) take_overs: usize,
+    /// How often links were cut.
+    pub(super) cuts: usize,
     /// With a standby: after each kill, until a vehicle drove again.
     pub(super) standby: Vec<Duration>,
     /// Vehicles that were mended by the mechanic.
@@ -124,6 +126,9 @@ fn figures(tally: &Tally, truth: &Truth<'_>) {
             "stop-all        {stopped} of {asked} vehicles acknowledged it, the last one after {:.1} ms",
             millis(*took)
         );
+    }
+    if tally.cuts > 0 {
+        println!("cuts            {}, of 12 s each", tally.cuts);
     }
     println!("CPU             {:.1} s, {:.2} processors", tally.cpu.as_secs_f64(), tally.cpu.as_secs_f64() / seconds);
     println!("memory          {} MiB at most, of all processes together", tally.resident_kib / 1_024);

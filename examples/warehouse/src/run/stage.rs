@@ -1,6 +1,10 @@
 //! The processes of a run.
 
 use std::collections::HashMap;
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
+use std::process::Command;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -12,6 +16,7 @@ use tempfile::TempDir;
 
 use super::board::{Board, Log};
 use super::child::{Child, Said};
+use super::soak;
 use crate::files::MapFiles;
 use crate::network::{MANAGER, Network, vehicle_name};
 use crate::orders::Order;
@@ -38,6 +43,7 @@ enum Role {
     Board,
     Manager,
     Mechanic,
+    Page,
 }
 
 /// All processes, and what they share.
@@ -129,6 +135,41 @@ impl Stage {
         let (fleet, map) = (self.network.fleet, self.files.map.display());
         self.show(&format!("to watch: cara web --unit {}/{} --fleet {fleet} --background {map}", MANAGER.0, MANAGER.1));
         Ok(())
+    }
+
+    /// Starts `cara web`, and reads it as a browser does.
+    pub(super) fn start_page(&mut self) -> Result<()> {
+        let (place, token) = (self.folder.path().join("token"), format!("{:032x}", fastrand::u128(..)));
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&place)?;
+        writeln!(file, "{token}")?;
+        let mut page = Command::new(std::env::current_exe()?.with_file_name("cara"));
+        page.arg("web").arg("--unit").arg(format!("{}/{}", MANAGER.0, MANAGER.1));
+        page.arg("--fleet").arg(self.network.fleet.to_string()).arg("--background").arg(&self.files.map);
+        page.arg("--token-file").arg(&place).arg("--listen").arg(format!("127.0.0.1:{}", soak::PAGE));
+        let child = Child::run(self.children.len(), page, self.sender.clone())?;
+        self.add(Role::Page, child);
+        soak::read_page(token);
+        Ok(())
+    }
+
+    /// What each process holds, a line each: columns of the file of a soak.
+    pub(super) fn held(&self) -> Vec<String> {
+        let line = |number: &usize| {
+            let (child, usage) = (&self.children[*number], self.children[*number].usage);
+            let (held, sent) = (child.held()?, self.sent.get(number).copied().unwrap_or_default());
+            let process = match &self.roles[*number] {
+                Role::Vehicles { first, count } => format!("vehicles {first} to {}", first + count - 1),
+                Role::Board => "board".to_owned(),
+                Role::Manager if *number == self.manager => "manager".to_owned(),
+                Role::Manager => "standby".to_owned(),
+                Role::Mechanic => "mechanic".to_owned(),
+                Role::Page => "page".to_owned(),
+            };
+            let (memory, cpu) = (usage.resident_kib, usage.cpu.as_millis());
+            let counts = format!("{},{},{cpu},{},{}", held.descriptors, usage.threads, sent[0], sent[1]);
+            Some(format!("{process},{number},{memory},{},{counts}", held.proportional_kib))
+        };
+        self.running.iter().filter_map(line).collect()
     }
 
     /// How many vehicles there are.
@@ -228,7 +269,7 @@ impl Stage {
     pub(super) fn notify_vehicle(&mut self, verb: &str, name: &str) -> Result<()> {
         let has = |role: &Role| match role {
             Role::Vehicles { first, count } => (*first..first + count).any(|number| vehicle_name(number) == name),
-            Role::Board | Role::Manager | Role::Mechanic => false,
+            Role::Board | Role::Manager | Role::Mechanic | Role::Page => false,
         };
         let number = self.roles.iter().position(has).with_context(|| format!("no process has {name}"))?;
         self.children[number].show(&format!("{verb} {name}"));
@@ -285,7 +326,7 @@ impl Stage {
         match role {
             Role::Vehicles { .. } | Role::Board => Some(Heard::Vehicle(line)),
             Role::Manager => Some(Heard::Manager(child, line)),
-            Role::Mechanic => None,
+            Role::Mechanic | Role::Page => None,
         }
     }
 
@@ -322,9 +363,10 @@ impl Stage {
     pub(super) fn end(&mut self) -> Vec<String> {
         let mut wrong = Vec::new();
         for number in std::mem::take(&mut self.running).into_iter().rev() {
-            // An emulator has no input: it is the last one of all that loses its power.
-            if self.roles[number] == Role::Board {
-                wrong.extend(self.children[number].kill().err().map(|error| format!("the board: {error}")));
+            // Neither ends with its input. An emulator is the last one of all that loses its power.
+            if matches!(self.roles[number], Role::Board | Role::Page) {
+                let killed = self.children[number].kill();
+                wrong.extend(killed.err().map(|error| format!("{:?}: {error}", self.roles[number])));
                 continue;
             }
             match self.children[number].end(ENDING) {

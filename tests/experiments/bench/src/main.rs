@@ -20,6 +20,7 @@ mod plots;
 mod progress;
 mod results;
 mod share;
+mod soak;
 mod statistics;
 mod table;
 
@@ -54,6 +55,13 @@ enum Command {
         #[arg(long)]
         linux: bool,
         /// Where the figure goes, and the rows of Linux.
+        folder: Option<PathBuf>,
+    },
+    /// Slopes of what the processes of a soak held; an error where something has grown.
+    Soak {
+        /// The file of `cargo xtask soak`.
+        csv: PathBuf,
+        /// Where the figure goes.
         folder: Option<PathBuf>,
     },
     /// Counts what each end of a round trip asks of the kernel; an error where that has grown.
@@ -91,6 +99,11 @@ fn main() -> Result<()> {
             let shares = if linux { deadlines::linux::measure() } else { deadlines::measure() }?;
             print!("{}", deadlines::table(&shares));
             folder.map_or(Ok(()), |folder| plots::draw_deadlines(&shares, linux, &folder))
+        }
+        Command::Soak { csv, folder } => {
+            let processes = soak::parsed(&csv)?;
+            folder.map_or(Ok(()), |folder| plots::draw_soak(&processes, &folder))?;
+            soak::judge(&processes)
         }
         Command::Counts => counts::check(),
         Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),

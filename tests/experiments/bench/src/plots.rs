@@ -12,6 +12,7 @@ use anyhow::{Context, Result};
 use crate::deadlines::Share;
 use crate::experiments::SIMULATED;
 use crate::results::{Availability, Mode, Response, Results};
+use crate::soak::{self, Life, Processes};
 use axis::Axis;
 use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
@@ -59,6 +60,27 @@ pub(crate) fn draw_deadlines(shares: &[Share], linux: bool, folder: &Path) -> Re
         std::fs::write(folder.join(format!("{name}.json")), serde_json::to_string_pretty(shares)? + "\n")?;
     }
     chart::draw(&[vec![chart]], &about.map(str::to_owned), &folder.join(name))
+}
+
+/// Draws what the processes of a soak held over its hours.
+pub(crate) fn draw_soak(processes: &Processes, folder: &Path) -> Result<()> {
+    let chart = |index: usize| {
+        let line = |(process, lives): (&String, &Vec<Life>)| {
+            let points: Vec<_> = lives.iter().flatten().map(|sample| (sample.hours, sample.values[index])).collect();
+            // More marks than this could not be told apart.
+            let each = points.len().div_ceil(40).max(1);
+            let means = points.chunks(each).map(|points| {
+                let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / points.len() as f64;
+                Point::new(mean(|point| point.0), mean(|point| point.1))
+            });
+            Line::measured(process, means.collect())
+        };
+        let name = soak::QUANTITIES[index].name;
+        Chart::new(name, Axis::linear("hours"), Axis::linear(name), processes.iter().map(line).collect())
+    };
+    std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
+    let rows = [vec![chart(0), chart(1)], vec![chart(2), chart(3)]];
+    chart::draw(&rows, &["lives without their first half hour".to_owned()], &folder.join("soak"))
 }
 
 fn figures(results: &Results) -> Vec<Figure> {

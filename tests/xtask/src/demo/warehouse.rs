@@ -2,6 +2,7 @@
 //! `examples/warehouse`.
 
 use std::ffi::OsStr;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -32,6 +33,17 @@ pub(crate) struct Options {
     /// The last vehicle is firmware in QEMU.
     #[arg(long, requires = "warehouse")]
     board: bool,
+    /// For `cargo xtask soak`: what processes hold goes here.
+    #[arg(long, requires = "minutes", hide = true)]
+    soak: Option<PathBuf>,
+}
+
+impl Options {
+    /// Those of a soak.
+    pub(crate) fn soak(vehicles: u32, minutes: u32, seed: u64, board: bool, csv: PathBuf) -> Self {
+        let (vehicles, minutes, seed) = (Some(vehicles), Some(minutes), Some(seed));
+        Self { warehouse: true, vehicles, minutes, seed, standby: true, board, soak: Some(csv) }
+    }
 }
 
 /// Runs the warehouse; its exit code says whether all was as it has to be.
@@ -43,9 +55,10 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
     ];
     let given = numbers.iter().filter_map(|(name, number)| Some([(*name).to_owned(), (*number)?.to_string()]));
     let standby = options.standby.then(|| "--standby".to_owned());
-    let given: Vec<String> = given.flatten().chain(standby).collect();
-    let code = if options.board {
-        with_board(&given)?
+    let soak = options.soak.iter().flat_map(|csv| ["--soak".to_owned(), csv.to_string_lossy().into_owned()]);
+    let given: Vec<String> = given.flatten().chain(standby).chain(soak).collect();
+    let code = if options.board || options.soak.is_some() {
+        in_own_network(options.board, &given)?
     } else {
         binaries::debug("warehouse")?.args(["run"]).args(given).code()?
     };
@@ -58,30 +71,35 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
 
 /// A short run with an emulated board among the vehicles.
 pub(crate) fn check() -> Outcome {
-    firmware::emulated(|| with_board(&[]))
+    firmware::emulated(|| in_own_network(true, &[]))
 }
 
 /// This host on the board's cable, and the board.
 const ADDRESSES: [&str; 2] = ["10.77.0.1/24", "10.77.0.2/24"];
 const CABLE: &str = "cable0";
 
-/// A run with an emulated board, in a network of its own; its exit code.
-fn with_board(given: &[String]) -> Result<Option<i32>> {
-    let image = firmware::warehouse_image()?;
-    // A board is given its keys by the command beside the program.
+/// A run in a network of its own, maybe with an emulated board; its exit code.
+fn in_own_network(with_board: bool, given: &[String]) -> Result<Option<i32>> {
+    let image = with_board.then(firmware::warehouse_image).transpose()?;
+    // A board is given its keys by the command beside the program, which has the page as well.
     binaries::build(&["cara"])?;
     let warehouse = binaries::debug("warehouse")?;
-    let again = ["demo", "--warehouse", "--board"].into_iter().chain(given.iter().map(String::as_str));
-    match network::own(again, &["qemu-system-arm"], true)? {
+    let words = ["demo", "--warehouse"].into_iter().chain(with_board.then_some("--board"));
+    let again = words.chain(given.iter().map(String::as_str));
+    let needs: &[&str] = if with_board { &["qemu-system-arm"] } else { &["nft"] };
+    match network::own(again, needs, with_board)? {
         Own::Inside => {}
         Own::Ended(status) => return Ok(status.code()),
         Own::Impossible(reason) => {
-            eprintln!("a board needs root, or a user that may make namespaces and open /dev/net/tun: {reason}");
+            eprintln!(
+                "this needs root, or a user that may make namespaces, and open /dev/net/tun for a board: {reason}"
+            );
             return Ok(Some(NOT_ALLOWED));
         }
     }
-    let [host, board] = ADDRESSES;
     network::run("ip link set lo up")?;
+    let Some(image) = image else { return warehouse.args(["run"]).args(given).code() };
+    let [host, board] = ADDRESSES;
     network::run(&format!("ip tuntap add name {CABLE} mode tap"))?;
     network::run(&format!("ip address add {host} brd + dev {CABLE}"))?;
     network::run(&format!("ip link set {CABLE} up"))?;
