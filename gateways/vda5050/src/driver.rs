@@ -13,6 +13,10 @@ const ASKED_BUSY: Duration = Duration::from_millis(100);
 const ASKED_IDLE: Duration = Duration::from_millis(500);
 /// A vehicle that has not said for so long how it is counts as lost, though its link lives.
 const SILENT: Duration = Duration::from_secs(2);
+/// While a write takes longer, nothing is renewed: the vehicle stops.
+const STUCK: Duration = Duration::from_secs(1);
+/// After a write has failed, the next one begins so much later.
+const WRITTEN_AGAIN: Duration = Duration::from_millis(200);
 
 /// The side to the vehicle.
 pub trait Vehicle {
@@ -31,7 +35,15 @@ pub struct Driver<V, K> {
     pub machine: Machine,
     vehicle: V,
     record: K,
-    is_kept: bool,
+    /// How often the record has changed, and how many of these changes are on disk.
+    changes: u64,
+    kept: u64,
+    /// The changes that are being written, and since when.
+    writing: Option<(u64, Duration)>,
+    /// The last write failed, and the next one begins then.
+    failed_until: Option<Duration>,
+    /// A command that is told once so many changes are on disk.
+    held: Option<(Command, u64)>,
     asked: Option<Duration>,
     answered: Duration,
     is_silent: bool,
@@ -42,7 +54,21 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
     /// Nothing is asked or told yet.
     pub const fn new(machine: Machine, vehicle: V, record: K) -> Self {
         let (asked, answered, is_silent, failed) = (None, Duration::ZERO, false, None);
-        Self { machine, vehicle, record, is_kept: true, asked, answered, is_silent, failed }
+        let (changes, kept, writing, failed_until, held) = (0, 0, None, None, None);
+        Self {
+            machine,
+            vehicle,
+            record,
+            changes,
+            kept,
+            writing,
+            failed_until,
+            held,
+            asked,
+            answered,
+            is_silent,
+            failed,
+        }
     }
 
     /// The side to the vehicle.
@@ -50,23 +76,39 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
         &mut self.vehicle
     }
 
-    /// Asks the vehicle if that is due, and tells it what follows. After an error nothing was told that is not on disk, and no
-    /// state may be published.
+    /// Asks the vehicle if that is due, and tells it what follows, once that is on disk. A stop waits for no disk. No state may be
+    /// published unless [`is_kept`](Self::is_kept) afterwards.
     pub fn turn(&mut self, now: Duration) -> io::Result<()> {
         if self.machine.must_halt(now) {
             self.tell(&Command::Halt, now);
         }
         self.ask(now);
-        self.keep()?;
-        while let Some(command) = self.machine.next(now) {
-            if command != Command::Halt {
-                self.keep()?;
+        self.machine.reserve_header_ids();
+        loop {
+            let is_kept = self.keep(now)?;
+            if self.held.as_ref().is_some_and(|(_, changes)| *changes > self.kept) {
+                return Ok(());
+            }
+            // What was heard while the disk was slow may have changed what the vehicle is to do.
+            let held = self.held.take().map(|(command, _)| command).filter(|command| self.machine.is_wanted(command));
+            let command = match held {
+                Some(command) => command,
+                None if !is_kept => return Ok(()),
+                None => match self.machine.next(now) {
+                    Some(command) => command,
+                    None => break,
+                },
+            };
+            self.note_changes();
+            if command != Command::Halt && self.changes > self.kept && is_kept {
+                self.held = Some((command, self.changes));
+                continue;
             }
             if !self.tell(&command, now) {
                 break;
             }
         }
-        self.keep()
+        self.keep(now).map(drop)
     }
 
     /// Whether the vehicle has done it.
@@ -90,14 +132,45 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
         self.failed.as_deref()
     }
 
-    /// Writes the record if it has changed.
-    pub fn keep(&mut self) -> io::Result<()> {
-        self.is_kept &= !self.machine.take_changed();
-        if !self.is_kept {
-            self.record.keep(self.machine.record(), &mut || self.vehicle.beat())?;
-            self.is_kept = true;
+    /// Whether all that has changed is on disk.
+    pub const fn is_kept(&self) -> bool {
+        self.changes == self.kept
+    }
+
+    /// Whether the disk takes too long, or refuses: nothing may be renewed whose end could not be kept.
+    pub fn is_stuck(&self, now: Duration) -> bool {
+        let is_late = |(_, since): (u64, Duration)| now.saturating_sub(since) >= STUCK;
+        self.failed_until.is_some() || self.writing.is_some_and(is_late)
+    }
+
+    /// Writes the record if it has changed, and waits for the disk a little. Whether all changes are written.
+    pub fn keep(&mut self, now: Duration) -> io::Result<bool> {
+        self.note_changes();
+        if self.writing.is_none() && !self.is_kept() && self.failed_until.is_none_or(|until| now >= until) {
+            let started = self.record.start(self.machine.record());
+            self.noted(started, now)?;
+            self.writing = Some((self.changes, now));
         }
-        Ok(())
+        if let Some((changes, _)) = self.writing
+            && let Some(result) = self.record.ended()
+        {
+            self.writing = None;
+            self.noted(result, now)?;
+            (self.kept, self.failed_until) = (changes, None);
+        }
+        self.vehicle.beat();
+        Ok(self.is_kept())
+    }
+
+    fn note_changes(&mut self) {
+        self.changes += u64::from(self.machine.take_changed());
+    }
+
+    fn noted(&mut self, result: io::Result<()>, now: Duration) -> io::Result<()> {
+        if result.is_err() {
+            self.failed_until = Some(now + WRITTEN_AGAIN);
+        }
+        result
     }
 
     fn ask(&mut self, now: Duration) {

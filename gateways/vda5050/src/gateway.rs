@@ -190,13 +190,10 @@ impl Gateway {
         }
         let now = self.began.elapsed();
         let turned = self.driver.turn(now);
-        let is_watched = turned.is_ok() && !self.driver.is_silent();
+        let is_watched = !self.driver.is_stuck(self.began.elapsed()) && !self.driver.is_silent();
         self.driver.vehicle_mut().give_up(!is_watched);
         if let Err(error) = turned {
-            // Nothing is said that would not be known after a restart.
             eprintln!("{}: the record cannot be written: {error}", self.serial_number);
-            std::thread::sleep(Duration::from_millis(200));
-            return;
         }
         if self.driver.failed() != self.failed.as_deref() {
             self.failed = self.driver.failed().map(str::to_owned);
@@ -204,7 +201,10 @@ impl Gateway {
                 eprintln!("{}: {why}", self.serial_number);
             }
         }
-        self.publish();
+        // Nothing is said that would not be known after a restart.
+        if self.driver.is_kept() {
+            self.publish();
+        }
         self.seen.linked.store(self.driver.machine.is_linked(), Ordering::Relaxed);
         self.seen.out_of_service.store(self.tried.is_some(), Ordering::Relaxed);
     }
@@ -243,7 +243,6 @@ impl Gateway {
                 self.shown = None;
                 self.broker(true);
                 self.look_at_certificates();
-                let _ = self.send_factsheet();
             }
             Heard::Lost(why) => {
                 let was_there = self.client.take().is_some();
@@ -391,7 +390,7 @@ impl Gateway {
     }
 
     fn send_connection(&mut self, connection_state: ConnectionState) -> Option<()> {
-        let header = self.header(Topic::Connection)?;
+        let header = self.header(Topic::Connection);
         (self.said, self.is_echoed) = (header.header_id, false);
         self.will.store(header.header_id.saturating_add(1), Ordering::SeqCst);
         self.send("connection", QoS::AtLeastOnce, true, &Connection { header, connection_state })?;
@@ -400,7 +399,7 @@ impl Gateway {
     }
 
     fn send_factsheet(&mut self) -> Option<()> {
-        let header = self.header(Topic::Factsheet)?;
+        let header = self.header(Topic::Factsheet);
         let factsheet = Factsheet { header, ..self.factsheet.clone() };
         self.send("factsheet", QoS::AtMostOnce, true, &factsheet)
     }
@@ -419,7 +418,7 @@ impl Gateway {
         if !(has_news || is_due || age.is_none_or(|age| age >= state_every)) {
             return Some(());
         }
-        let header = self.header(Topic::State)?;
+        let header = self.header(Topic::State);
         self.send("state", QoS::AtMostOnce, false, &State { header, report: report.clone() })?;
         self.reported = Some((report, Instant::now()));
         Some(())
@@ -431,17 +430,14 @@ impl Gateway {
             return;
         }
         let Some(Report { agv_position: Some(at), velocity, .. }) = self.driver.machine.report() else { return };
-        let Some(header) = self.header(Topic::Visualization) else { return };
+        let header = self.header(Topic::Visualization);
         self.visualized = Instant::now();
         let message = Visualization { header, agv_position: Some(at), velocity };
         let _ = self.send("visualization", QoS::AtMostOnce, false, &message);
     }
 
-    /// A header, once its number is kept.
-    fn header(&mut self, topic: Topic) -> Option<Header> {
-        let header_id = self.driver.machine.header_id(topic);
-        self.driver.keep().ok()?;
-        Some(header(&self.config, &self.serial_number, header_id))
+    fn header(&mut self, topic: Topic) -> Header {
+        header(&self.config, &self.serial_number, self.driver.machine.header_id(topic))
     }
 
     fn send(&self, topic: &str, quality: QoS, is_retained: bool, message: &impl Serialize) -> Option<()> {
@@ -453,7 +449,11 @@ impl Gateway {
     /// Says OFFLINE and waits until that has arrived. What moves stops, as its heart goes.
     fn stop(mut self, is_silent: bool) {
         self.link.end();
-        if !is_silent && self.send_connection(ConnectionState::Offline).is_some() {
+        let end = Instant::now() + LAST_WORDS;
+        while !self.driver.keep(self.began.elapsed()).unwrap_or_default() && Instant::now() < end {
+            std::thread::sleep(TURN);
+        }
+        if !is_silent && self.driver.is_kept() && self.send_connection(ConnectionState::Offline).is_some() {
             let end = Instant::now() + LAST_WORDS;
             while let Ok(heard) = self.link.heard.recv_timeout(end.saturating_duration_since(Instant::now())) {
                 if matches!(heard, Heard::Acknowledged | Heard::Lost(_)) {

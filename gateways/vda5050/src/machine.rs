@@ -27,6 +27,9 @@ const BACK_OFF: Duration = Duration::from_millis(500);
 /// With so many edges left, or fewer, the vehicle is told of those that follow.
 const TOLD_AGAIN: usize = LEGS / 2;
 
+/// Header ids of a block.
+const HEADER_IDS: u32 = 1_000;
+
 /// A topic of the gateway's own messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Topic {
@@ -136,19 +139,22 @@ impl Machine {
         self.record.is_order_open() || self.record.actions.iter().any(|entry| !entry.status.has_ended())
     }
 
-    /// The next header id of a topic (6.4). They are taken in blocks, so that the record is not written for each message; after a
-    /// start they go on above.
+    /// The next header id of a topic (6.4). After a start they go on above what is reserved.
     pub const fn header_id(&mut self, topic: Topic) -> u32 {
-        /// Of a block.
-        const BLOCK: u32 = 1_000;
-        let (next, kept) = (&mut self.header_ids[topic as usize], &mut self.record.header_ids[topic as usize]);
-        if *next >= *kept {
-            *kept = next.saturating_add(BLOCK);
-            self.has_changed = true;
-        }
+        let next = &mut self.header_ids[topic as usize];
         let id = *next;
         *next = next.saturating_add(1);
         id
+    }
+
+    /// Reserves header ids in blocks, and before they are used up: no message waits for a disk because of its id alone.
+    pub fn reserve_header_ids(&mut self) {
+        for (next, kept) in self.header_ids.iter().zip(&mut self.record.header_ids) {
+            if next.saturating_add(HEADER_IDS / 2) > *kept {
+                *kept = next.saturating_add(HEADER_IDS);
+                self.has_changed = true;
+            }
+        }
     }
 
     /// A message that cannot be read, or is not for now.
@@ -459,6 +465,7 @@ impl Machine {
             self.broker_lost = None;
             self.is_held = false;
             self.is_report_due = true;
+            self.is_factsheet_due = true;
         } else if self.broker_lost.is_none() {
             self.broker_lost = Some((now, self.status.as_ref().map(|status| status.driven)));
         }
@@ -509,6 +516,10 @@ impl Machine {
         self.status.as_ref().is_some_and(able)
     }
 
+    fn may_begin(&self) -> bool {
+        self.is_able() && !self.record.is_paused && !self.is_held
+    }
+
     fn may_drive(&self) -> bool {
         let is_stopped = self.record.is_paused || self.is_held || self.record.is_cancelled;
         self.is_able() && !is_stopped && !block_driving(&self.record.actions)
@@ -532,14 +543,34 @@ impl Machine {
         self.next_drive(boot)
     }
 
+    /// Whether a command that has waited for the disk is still to be told.
+    pub fn is_wanted(&mut self, command: &Command) -> bool {
+        let may_begin = self.may_begin();
+        match command {
+            Command::Drive { .. } => self.is_drive_sent && self.may_drive(),
+            Command::Halt => true,
+            Command::InitPosition { .. } => self.is_position_sent,
+            Command::Act { number, .. } | Command::EndAction { number } => {
+                let entry = self.record.actions.iter_mut().find(|entry| entry.number == *number && entry.runs());
+                let Some(entry) = entry else { return false };
+                if matches!(command, Command::EndAction { .. }) {
+                    return entry.is_end_sent;
+                }
+                entry.is_sent &= may_begin && entry.ends_as.is_none();
+                entry.is_sent
+            }
+        }
+    }
+
     fn next_action(&mut self, boot: u64) -> Option<Command> {
-        let is_able = self.is_able();
+        let may_begin = self.may_begin();
         for entry in &mut self.record.actions {
             if entry.ends_as.is_some() && entry.runs() && !entry.is_end_sent {
                 entry.is_end_sent = true;
                 return Some(Command::EndAction { number: entry.number });
             }
-            if is_able && entry.runs() && entry.ends_as.is_none() && !entry.is_sent {
+            // Also one that has begun: it ended with the link or the lease, and the vehicle would go on with it.
+            if may_begin && entry.runs() && entry.ends_as.is_none() && !entry.is_sent {
                 entry.is_sent = true;
                 return Some(Command::Act { number: entry.number, action: entry.action.clone() });
             }
@@ -549,7 +580,7 @@ impl Machine {
                 return Some(Command::InitPosition { action: entry.action.clone() });
             }
         }
-        if !is_able || self.record.is_paused || self.is_held {
+        if !may_begin {
             return None;
         }
         let index = startable(&self.record.actions, self.policy.actions_at_once)?;

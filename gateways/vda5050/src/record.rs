@@ -3,15 +3,17 @@
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{RecvTimeoutError, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 
 use crate::state::Record;
 use crate::vehicle::BEAT;
 
-/// What keeps a record.
+/// What keeps a record. It is written while the vehicle's loop goes on: a disk must hold up neither a renewal nor a stop.
 pub trait Keep {
-    /// Returns once the record would outlive a cut of power. Calls `beat` while it waits: a disk must not hold up a renewal.
-    fn keep(&mut self, record: &Record, beat: &mut dyn FnMut()) -> io::Result<()>;
+    /// Starts to write. The write before has ended.
+    fn start(&mut self, record: &Record) -> io::Result<()>;
+    /// How the write ended, once it would outlive a cut of power: waits up to 20 ms, and `None` if it goes on.
+    fn ended(&mut self) -> Option<io::Result<()>>;
 }
 
 /// A file, which is replaced as a whole.
@@ -19,6 +21,15 @@ pub trait Keep {
 pub struct Store {
     /// Without one nothing is kept.
     file: Option<PathBuf>,
+    /// From the first write on.
+    writer: Option<Writer>,
+}
+
+/// A thread that writes one text at a time.
+#[derive(Debug)]
+struct Writer {
+    texts: SyncSender<Vec<u8>>,
+    results: Receiver<io::Result<()>>,
 }
 
 impl Store {
@@ -33,20 +44,49 @@ impl Store {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Record::default(),
             Err(error) => return Err(error),
         };
-        Ok((Self { file: Some(file) }, record))
+        Ok((Self { file: Some(file), writer: None }, record))
     }
 
     /// For a vehicle that is out of service, and has no record.
     pub const fn nowhere() -> Self {
-        Self { file: None }
+        Self { file: None, writer: None }
     }
 }
 
 impl Keep for Store {
-    fn keep(&mut self, record: &Record, beat: &mut dyn FnMut()) -> io::Result<()> {
-        let Some(kept) = &self.file else { return Ok(()) };
+    fn start(&mut self, record: &Record) -> io::Result<()> {
+        let Some(file) = &self.file else { return Ok(()) };
         let text = serde_json::to_vec(record)?;
-        apart(|| replace(kept, &text), beat)
+        let writer = match &mut self.writer {
+            Some(writer) => writer,
+            none => none.insert(Writer::start(file.clone())?),
+        };
+        writer.texts.send(text).map_err(|_| io::Error::other("the record's thread has ended"))
+    }
+
+    fn ended(&mut self) -> Option<io::Result<()>> {
+        let Some(writer) = &self.writer else { return Some(Ok(())) };
+        match writer.results.recv_timeout(BEAT) {
+            Ok(result) => Some(result),
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => {
+                self.writer = None;
+                Some(Err(io::Error::other("the write panicked")))
+            }
+        }
+    }
+}
+
+impl Writer {
+    fn start(file: PathBuf) -> io::Result<Self> {
+        let (texts, to_write) = sync_channel::<Vec<u8>>(1);
+        let (done, results) = sync_channel(1);
+        let run = move || {
+            let mut written = to_write.iter().map(|text| replace(&file, &text));
+            while written.next().is_some_and(|result| done.send(result).is_ok()) {}
+        };
+        std::thread::Builder::new().name("record".into()).spawn(run)?;
+        Ok(Self { texts, results })
     }
 }
 
@@ -59,40 +99,4 @@ fn replace(kept: &Path, text: &[u8]) -> io::Result<()> {
     // The rename is in the folder.
     let folder = kept.parent().unwrap_or(Path::new("."));
     File::open(folder)?.sync_all()
-}
-
-/// Writes on a thread of its own, and beats until that is done.
-fn apart(write: impl FnOnce() -> io::Result<()> + Send, beat: &mut dyn FnMut()) -> io::Result<()> {
-    let (done, result) = sync_channel(1);
-    std::thread::scope(|scope| {
-        std::thread::Builder::new().name("record".into()).spawn_scoped(scope, move || done.send(write()))?;
-        loop {
-            match result.recv_timeout(BEAT) {
-                Ok(result) => return result,
-                Err(RecvTimeoutError::Timeout) => beat(),
-                Err(RecvTimeoutError::Disconnected) => return Err(io::Error::other("the write panicked")),
-            }
-        }
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::mpsc::channel;
-    use std::time::Duration;
-
-    use super::{apart, io};
-
-    /// The write ends once the loop has beaten five times.
-    #[test]
-    fn the_loop_beats_while_the_disk_is_slow() {
-        let (beat, beats) = channel();
-        let write = move || {
-            let heard = (0..5).try_for_each(|_| beats.recv_timeout(Duration::from_secs(10)));
-            heard.map_err(io::Error::other)
-        };
-        apart(write, &mut || beat.send(()).unwrap_or_default()).unwrap();
-        let failed = apart(|| Err(io::ErrorKind::StorageFull.into()), &mut || ()).unwrap_err();
-        assert_eq!(failed.kind(), io::ErrorKind::StorageFull);
-    }
 }

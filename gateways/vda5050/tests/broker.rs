@@ -228,6 +228,36 @@ fn a_record_that_cannot_be_written_stops_the_vehicle() {
     }
 }
 
+/// A write that does not come back: what stops the vehicle is heard meanwhile, else it stops 1 s later by its lease.
+#[test]
+fn a_disk_that_hangs_holds_up_no_stop() {
+    for (kind, bound) in [("startPause", 200), ("stateRequest", 1_000 + LEASE_MS + LEASE_MS / 2 + 150)] {
+        let plant = Plant::start("{ do = \"stop\" }");
+        plant.order("o1", 0, 0, "a! k!");
+        plant.vehicle.wait_for("drive 1 k");
+        sleep(Duration::from_millis(300));
+        // A pipe that nobody reads hangs who opens it.
+        let pipe = plant.folder.path().join("state/vda5050/0001.next");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        plant.instant("stateRequest", "p0");
+        sleep(Duration::from_millis(100));
+        plant.instant(kind, "p1");
+        let sent = Instant::now();
+        plant.vehicle.wait_for("stood");
+        let took = plant.vehicle.at("stood").unwrap().duration_since(sent);
+        println!("the disk hangs, {kind}: stood after {took:?}");
+        assert!(took < Duration::from_millis(bound), "{took:?}");
+        assert_eq!([plant.action("p0"), plant.action("p1")], ["", ""], "said, and not written");
+        // A pipe cannot be synchronized: that write fails, and the next one is to a file.
+        let end = std::fs::File::open(&pipe).unwrap();
+        std::fs::remove_file(&pipe).unwrap();
+        plant.wait_for("it is kept", |plant| plant.action("p1") == "FINISHED");
+        drop(end);
+        plant.instant("stopPause", "p2");
+        plant.wait_for_end("o1", "k");
+    }
+}
+
 /// One record that cannot be read is that vehicle's trouble alone, and mended without a restart.
 #[test]
 fn a_damaged_record_puts_its_vehicle_out_of_service() {

@@ -402,6 +402,7 @@ fn instant_actions_are_done_once() {
         ("dance", "i5", "FAILED"),
     ] {
         pair.machine.take_report_due();
+        pair.machine.take_factsheet_due();
         pair.machine.instant_actions(instant(kind, id));
         assert!(pair.machine.take_report_due(), "{kind}");
         assert_eq!(pair.machine.take_factsheet_due(), kind == "factsheetRequest");

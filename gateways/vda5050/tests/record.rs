@@ -2,7 +2,7 @@
 
 mod fake;
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,6 +10,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use cara_vda5050::driver::{Driver, Vehicle};
+use cara_vda5050::errors::{Kind, Refusal};
 use cara_vda5050::machine::{Machine, Topic};
 use cara_vda5050::message::Order;
 use cara_vda5050::record::{Keep, Store};
@@ -27,15 +28,20 @@ struct Dying {
 }
 
 impl Keep for Dying {
-    fn keep(&mut self, record: &Record, beat: &mut dyn FnMut()) -> io::Result<()> {
+    fn start(&mut self, record: &Record) -> io::Result<()> {
         self.writes = self.writes.saturating_sub(1);
         if self.writes > 0 || self.is_written {
-            self.store.keep(record, beat)?;
+            self.store.start(record)?;
+            while self.store.ended().transpose()?.is_none() {}
         } else {
             let text = serde_json::to_vec(record)?;
             std::fs::write(self.folder.join("0001.next"), &text[..text.len() / 2])?;
         }
         if self.writes == 0 { Err(io::Error::other("killed")) } else { Ok(()) }
+    }
+
+    fn ended(&mut self) -> Option<io::Result<()>> {
+        Some(Ok(()))
     }
 }
 
@@ -144,7 +150,8 @@ fn step(
     header_ids: &mut Vec<u32>,
     ended: &mut BTreeMap<String, Vec<String>>,
 ) -> io::Result<()> {
-    driver.turn(Duration::from_secs(turn as u64))?;
+    let now = Duration::from_secs(turn as u64);
+    driver.turn(now)?;
     let record = driver.machine.record();
     let of_order = record.actions.iter().filter(|entry| entry.action.action_id != "i1");
     let states = of_order.map(|entry| format!("{:?}", entry.state())).collect();
@@ -154,13 +161,13 @@ fn step(
         Some(Sent::Instant(kind, id)) => driver.machine.instant_actions(instant(kind, id)),
         None => {}
     }
-    driver.keep()?;
+    driver.keep(now)?;
     if turn == 3 {
         // This one is not repeated: if it was not kept, it is not known.
         driver.machine.instant_actions(instant("stateRequest", "i1"));
     }
     let header_id = driver.machine.header_id(Topic::State);
-    driver.keep()?;
+    driver.keep(now)?;
     header_ids.push(header_id);
     driver.vehicle_mut().step();
     Ok(())
@@ -216,6 +223,8 @@ fn a_damaged_record_is_not_overwritten() {
 struct Log {
     done: Rc<RefCell<Vec<&'static str>>>,
     status: Option<Status>,
+    /// How many writes end; those behind them go on until there are more.
+    writes: Rc<Cell<usize>>,
 }
 
 impl Vehicle for Log {
@@ -231,41 +240,102 @@ impl Vehicle for Log {
 }
 
 impl Keep for Log {
-    fn keep(&mut self, _: &Record, _: &mut dyn FnMut()) -> io::Result<()> {
+    fn start(&mut self, _: &Record) -> io::Result<()> {
         self.done.borrow_mut().push("keep");
         Ok(())
     }
+
+    fn ended(&mut self) -> Option<io::Result<()>> {
+        self.writes.set(self.writes.get().checked_sub(1)?);
+        Some(Ok(()))
+    }
 }
 
-fn logged() -> (Driver<Log, Log>, Rc<RefCell<Vec<&'static str>>>) {
-    let done = Rc::<RefCell<Vec<&'static str>>>::default();
-    let log = |status| Log { done: done.clone(), status };
+type Done = Rc<RefCell<Vec<&'static str>>>;
+
+/// At node a, without an order; also how many writes end.
+fn idle() -> (Driver<Log, Log>, Done, Rc<Cell<usize>>) {
+    let (done, writes) = (Done::default(), Rc::new(Cell::new(usize::MAX)));
+    let log = |status| Log { done: done.clone(), status, writes: writes.clone() };
     let machine = Machine::new(Record::default(), policy(), Duration::ZERO);
     let mut driver = Driver::new(machine, log(Some(Fake::at("a").status)), log(None));
     driver.machine.broker(true, Duration::ZERO);
     driver.turn(Duration::ZERO).unwrap();
+    (driver, done, writes)
+}
+
+fn logged() -> (Driver<Log, Log>, Done, Rc<Cell<usize>>) {
+    let (mut driver, done, writes) = idle();
     driver.machine.order(order("o1", 0, 0, "a! b!"));
     driver.turn(Duration::ZERO).unwrap();
     assert_eq!(done.borrow().last(), Some(&"drive"));
     done.borrow_mut().clear();
-    (driver, done)
+    (driver, done, writes)
 }
 
 /// Neither the disk nor a question to the vehicle comes before a stop.
 #[test]
 fn a_stop_is_told_first() {
     for kind in ["startPause", "cancelOrder"] {
-        let (mut driver, done) = logged();
+        let (mut driver, done, _) = logged();
         driver.machine.instant_actions(instant(kind, "i1"));
         driver.turn(Duration::from_secs(1)).unwrap();
         assert_eq!(done.borrow()[0], "halt", "{kind}: {:?}", done.borrow());
     }
 }
 
+/// A write that does not end: the stop is told, and it is not said. The rest waits.
+#[test]
+fn a_stop_waits_for_no_write_and_what_moves_does() {
+    let (mut driver, done, writes) = logged();
+    driver.vehicle_mut().status.as_mut().unwrap().is_ordered = true;
+    writes.set(0);
+    driver.machine.refuse(&Refusal::new(Kind::Validation, "a change"));
+    driver.turn(Duration::from_millis(20)).unwrap();
+    assert!(!driver.is_kept() && !driver.is_stuck(Duration::from_millis(900)));
+    assert!(driver.is_stuck(Duration::from_millis(1_100)));
+    let (begun, told) = (done.borrow().len(), |word| done.borrow().iter().filter(|done| **done == word).count());
+    driver.machine.instant_actions(instant("startPause", "p1"));
+    driver.turn(Duration::from_millis(40)).unwrap();
+    assert_eq!(done.borrow()[begun], "halt");
+    driver.machine.instant_actions(instant("stopPause", "p2"));
+    driver.turn(Duration::from_millis(60)).unwrap();
+    assert!(!driver.is_kept() && told("drive") == 0, "{:?}", done.borrow());
+    writes.set(usize::MAX);
+    // The write that was under way, then that of what came meanwhile.
+    [80, 100].into_iter().for_each(|at| driver.turn(Duration::from_millis(at)).unwrap());
+    assert!(driver.is_kept() && !driver.is_stuck(Duration::from_secs(9)) && told("drive") == 1, "{:?}", done.borrow());
+}
+
+/// What was decided before a pause or the order's end, and waits for its write, is not told after it.
+#[test]
+fn what_waits_for_a_write_is_told_only_while_it_is_wanted() {
+    for (way, word, kind) in [
+        ("a! b!", "drive", "startPause"),
+        ("a!:beep b!", "act", "startPause"),
+        ("a! b!", "drive", "cancelOrder"),
+        ("a!:beep b!", "act", "cancelOrder"),
+    ] {
+        let (mut driver, done, writes) = idle();
+        // The order is written; what follows from it is not.
+        writes.set(1);
+        driver.machine.order(order("o1", 0, 0, way));
+        driver.turn(Duration::from_millis(20)).unwrap();
+        driver.machine.instant_actions(instant(kind, "i1"));
+        driver.turn(Duration::from_millis(40)).unwrap();
+        writes.set(usize::MAX);
+        (3..6).for_each(|turn| driver.turn(Duration::from_millis(20 * turn)).unwrap());
+        assert!(driver.is_kept() && !done.borrow().contains(&word), "{kind}: {:?}", done.borrow());
+        driver.machine.instant_actions(instant("stopPause", "i2"));
+        (6..9).for_each(|turn| driver.turn(Duration::from_millis(20 * turn)).unwrap());
+        assert_eq!(done.borrow().contains(&word), kind == "startPause", "{kind}: {:?}", done.borrow());
+    }
+}
+
 /// Its link lives, and it says nothing.
 #[test]
 fn a_vehicle_that_is_not_heard_of_counts_as_lost() {
-    let (mut driver, _) = logged();
+    let (mut driver, ..) = logged();
     driver.vehicle_mut().status = None;
     driver.turn(Duration::from_secs(1)).unwrap();
     assert!(!driver.is_silent() && driver.machine.is_linked(), "one question without an answer");
