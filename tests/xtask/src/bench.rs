@@ -35,6 +35,9 @@ pub(crate) struct Options {
     /// Draws the paper's figures 6, 7 and 8 and the ratios here, as SVG.
     #[arg(long, value_name = "DIR")]
     plots: Option<std::path::PathBuf>,
+    /// Makes the tables of this page anew, `docs/performance.md`.
+    #[arg(long, value_name = "FILE")]
+    page: Option<std::path::PathBuf>,
     /// Further options of `cara-bench experiments`, such as `--only response --chars 100`.
     #[arg(last = true)]
     more: Vec<String>,
@@ -52,7 +55,8 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
         command.arg("--peers").arg(options.peers.join(","));
     }
     command.args(options.rounds.iter().flat_map(|rounds| ["--rounds".to_owned(), rounds.to_string()]));
-    for (name, path) in [("--json", &options.json), ("--resume", &options.resume), ("--plots", &options.plots)] {
+    let paths = [&options.json, &options.resume, &options.plots, &options.page];
+    for (name, path) in ["--json", "--resume", "--plots", "--page"].into_iter().zip(paths) {
         if let Some(path) = path {
             // The program runs in the project's root, wherever this command was started.
             command.arg(name).arg(absolute(path)?);

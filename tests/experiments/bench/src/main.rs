@@ -14,6 +14,7 @@ mod deadlines;
 mod experiments;
 mod lanes;
 mod nodes;
+mod page;
 mod pair;
 mod peers;
 mod plots;
@@ -48,6 +49,13 @@ enum Command {
         json: PathBuf,
         /// Where they go.
         folder: PathBuf,
+    },
+    /// Makes the tables of `docs/performance.md` anew.
+    Page {
+        /// What a run wrote.
+        json: PathBuf,
+        /// The page.
+        page: PathBuf,
     },
     /// The share of deadlines met at loads of 50 to 150 %, in the simulator; prints a table.
     Deadlines {
@@ -95,6 +103,7 @@ fn main() -> Result<()> {
             experiments::run(&options)
         }
         Command::Plots { json, folder } => plots::draw(&results::Results::read(&json)?, &folder),
+        Command::Page { json, page } => page::write(&results::Results::read(&json)?, &page),
         Command::Deadlines { linux, folder } => {
             let shares = if linux { deadlines::linux::measure() } else { deadlines::measure() }?;
             print!("{}", deadlines::table(&shares));

@@ -120,7 +120,8 @@ pub(crate) struct Done {
 /// Round trips of one peer in one cell.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Response {
-    /// `floor`, `floor_again`, `cara`, `cara_among_1000_idle` (that many more s_units are connected to the server), or another system.
+    /// `floor`, `floor_again`, `cara`, `cara_spinning` (both ends spin for 100 µs), `cara_among_1000_idle` (that many more s_units are
+    /// connected to the server), or another system.
     pub(crate) peer: String,
     /// 1: a client and a server. 2: beside them the paper's five nodes, in a process on the client's CPU, each of which calls the same
     /// function with 1,000 characters, 1 to 20 ms after its last reply.

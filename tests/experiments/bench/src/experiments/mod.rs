@@ -3,7 +3,7 @@
 mod availability;
 mod constraints;
 mod far;
-mod goals;
+pub(crate) mod goals;
 mod link;
 mod plan;
 mod response;
@@ -20,6 +20,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 
+use crate::page;
 use crate::peers::{Outside, Selection};
 use crate::plots;
 use crate::progress::{is_stopped, stop_at_interrupt, was_stopped};
@@ -72,6 +73,9 @@ pub(crate) struct Options {
     /// Draws the paper's figures 6, 7 and 8 and the ratios there, as SVG.
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
+    /// Makes the tables of this page anew, `docs/performance.md`.
+    #[arg(long, value_name = "FILE")]
+    page: Option<PathBuf>,
 }
 
 /// One kind of row each.
@@ -167,7 +171,8 @@ pub(crate) fn run(options: &Options) -> Result<()> {
     let written = write(&results, options.json.as_deref());
     table::show(&results);
     let drawn = options.plots.as_deref().map_or(Ok(()), |folder| plots::draw(&results, folder));
-    failures.extend([written, drawn].into_iter().filter_map(Result::err).map(|error| format!("{error:#}")));
+    let paged = options.page.as_deref().map_or(Ok(()), |page| page::write(&results, page));
+    failures.extend([written, drawn, paged].into_iter().filter_map(Result::err).map(|error| format!("{error:#}")));
     failures.extend(silent_losses(&results));
     if failures.is_empty() { Ok(()) } else { bail!("{}", failures.join("\n")) }
 }

@@ -7,7 +7,7 @@ use cara_processes::cable::Wire;
 
 use crate::counted;
 use crate::pair::Setting;
-use crate::peers::{Contender, Outside, SECURED};
+use crate::peers::{Contender, Outside, SECURED, SPINNING, SPINNING_SECURED};
 use cara_bench_ends::{Burst, Order, Pin, pin};
 
 /// How much is run.
@@ -164,6 +164,7 @@ pub(crate) struct LinkBursts {
 
 const COMPARED: [&str; 4] = ["floor", "floor_again", "cara", SECURED];
 const AMONG: [&str; 5] = ["floor", "floor_again", "cara", SECURED, "cara_among_1000_idle"];
+const SPUN: [&str; 7] = ["floor", "floor_again", "cara", SECURED, SPINNING, SPINNING_SECURED, "cara_among_1000_idle"];
 const SHARED: [&str; 5] = ["floor", "floor_again", "cara", SECURED, "cara_one_link"];
 /// The paper's sizes, and one beyond them.
 const CHARS: [u32; 8] = [1, 10, 100, 1_000, 5_000, 10_000, 20_000, 100_000];
@@ -275,7 +276,10 @@ fn response(extent: Extent, pins: &[Pin], places: &[Pin], print: bool, outside: 
         for &pin in pins {
             let setting = Setting { pin, distribution, print, wire: None };
             let is_shortened = extent == Extent::Quick && (pin == Pin::None || distribution == 2);
-            let peers = if is_shortened { &COMPARED[..] } else { &AMONG[..] };
+            // Spinning is for ends with a CPU each.
+            let spins = distribution == 1 && pin == Pin::Split;
+            let others = if spins { &SPUN[..] } else { &AMONG[..] };
+            let peers = if is_shortened { &COMPARED[..] } else { others };
             let outside = if is_shortened || print { &[] } else { outside };
             add(setting, with(peers, outside.iter()), extent.of(24, 4, 1), orders(&CHARS, calls, 0));
         }

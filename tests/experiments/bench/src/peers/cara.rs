@@ -36,11 +36,19 @@ pub(crate) enum Cara {
     LinkEach,
     /// As `LinkEach`, with keys.
     Secured,
+    /// Both ends spin before they sleep, without keys or with.
+    Spinning {
+        /// With keys.
+        secured: bool,
+    },
     /// All callers of a process use one link.
     OneLink(Mutex<Option<CommunicationSystem>>),
     /// As `LinkEach`, and [`IDLE_LINKS`] s_units are connected to the passive m_unit and do nothing.
     AmongIdle,
 }
+
+/// How long [`Cara::Spinning`] spins.
+const SPIN: Duration = Duration::from_micros(100);
 
 /// Most callers of one process.
 const CALLERS: u32 = 64;
@@ -123,10 +131,16 @@ impl Cara {
     /// Its keys from the folder that the server's address tells, or none.
     fn keyed<R>(&self, builder: Builder<(), R>, place: &Place, address: &str, identity: &Identity) -> Builder<(), R> {
         let builder = placed(builder, place);
-        match self {
-            Self::Secured => builder.key_file(Path::new(address).join(file_name(identity, Fleet(place.run)))),
-            _ => builder.insecure(),
+        let builder = if let Self::Spinning { .. } = self { builder.spin(SPIN) } else { builder };
+        if self.has_keys() {
+            builder.key_file(Path::new(address).join(file_name(identity, Fleet(place.run))))
+        } else {
+            builder.insecure()
         }
+    }
+
+    fn has_keys(&self) -> bool {
+        matches!(self, Self::Secured | Self::Spinning { secured: true })
     }
 
     fn system(&self, place: &Place, address: &str, name: &str, id: u32) -> Result<CommunicationSystem> {
@@ -157,7 +171,7 @@ fn look_at(view: &ParametersView, printer: Printer) -> Result<(), ServiceError> 
 
 impl Peer for Cara {
     fn start_server(&self, place: &Place) -> Result<Server> {
-        let keys = matches!(self, Self::Secured).then(|| draw_keys(place)).transpose()?;
+        let keys = self.has_keys().then(|| draw_keys(place)).transpose()?;
         let address = keys.as_ref().map_or("by discovery", |keys| keys.path().to_str().unwrap_or_default());
         let address = address.to_owned();
         let passive = self.system(place, &address, "passive", 1)?;

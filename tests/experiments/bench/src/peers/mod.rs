@@ -19,15 +19,21 @@ pub(crate) use outside::{Outside, OutsideReport, Selection};
 /// CARA with keys; in the rows it is `cara` in secured mode.
 pub(crate) const SECURED: &str = "cara_secured";
 
+/// Those whose both ends spin; in the rows they are `cara_spinning` in either mode.
+pub(crate) const SPINNING: &str = "cara_spinning";
+pub(crate) const SPINNING_SECURED: &str = "cara_spinning_secured";
+
 type Make = fn() -> Box<dyn Peer>;
 
 /// All peers that this program plays, in the order in which they take turns. The first is the one that the others are
 /// compared with.
-const PEERS: [(&str, Make); 6] = [
+const PEERS: [(&str, Make); 8] = [
     ("floor", || Box::new(floor::Floor)),
     ("floor_again", || Box::new(floor::Floor)),
     ("cara", || Box::new(cara::Cara::LinkEach)),
     (SECURED, || Box::new(cara::Cara::Secured)),
+    (SPINNING, || Box::new(cara::Cara::Spinning { secured: false })),
+    (SPINNING_SECURED, || Box::new(cara::Cara::Spinning { secured: true })),
     ("cara_one_link", || Box::new(cara::Cara::OneLink(Mutex::new(None)))),
     ("cara_among_1000_idle", || Box::new(cara::Cara::AmongIdle)),
 ];
@@ -63,6 +69,7 @@ impl Contender {
     pub(crate) fn name_and_mode(&self) -> (&str, Mode) {
         match self.name() {
             SECURED => ("cara", Mode::Secured),
+            SPINNING_SECURED => (SPINNING, Mode::Secured),
             name => (name, Mode::Plain),
         }
     }
