@@ -43,6 +43,8 @@ pub struct Manager {
     pub key_file: Option<PathBuf>,
     /// Where its claim and the records of the vehicles are kept.
     pub state_folder: PathBuf,
+    /// Where the records are, if other gateways share them: each speaks for the vehicles that are linked to it.
+    pub shared_records: Option<PathBuf>,
     /// Where metrics are served, on this host.
     pub metrics: Option<SocketAddr>,
     /// Only vehicles of this host.
@@ -173,7 +175,7 @@ impl Config {
         let Self { manager, broker, vda5050, .. } = &mut config;
         let files =
             [&mut broker.password_file, &mut broker.ca_file, &mut broker.certificate_file, &mut broker.key_file];
-        let files = files.into_iter().chain([&mut manager.key_file]).flatten();
+        let files = files.into_iter().chain([&mut manager.key_file, &mut manager.shared_records]).flatten();
         files.chain([&mut manager.state_folder, &mut vda5050.factsheet]).for_each(|path| *path = folder.join(&*path));
         config.check().with_context(|| file.display().to_string())?;
         Ok(config)
@@ -224,6 +226,12 @@ impl Config {
         ensure!(broker.certificate_file.is_none() || broker.ca_file.is_some(), "TLS needs ca_file");
         ensure!(broker.user.is_some() || broker.password_file.is_none(), "a password needs its user");
         Ok(())
+    }
+
+    /// Where the records of the vehicles are.
+    pub fn records(&self) -> PathBuf {
+        let Manager { state_folder, shared_records, .. } = &self.manager;
+        shared_records.clone().unwrap_or_else(|| state_folder.join("vda5050"))
     }
 
     /// How a vehicle is driven.

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, Result};
-use cara_std::{CommunicationSystem, Identity};
+use cara_std::{CommunicationSystem, Identity, Peer};
 use rumqttc::{Client, QoS};
 use serde::Serialize;
 
@@ -20,7 +20,7 @@ use crate::message::{
 };
 use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, Link, Place};
-use crate::record::Store;
+use crate::record::{RecordLock, Store};
 use crate::tls::Whose;
 use crate::vehicle::Linked;
 
@@ -46,7 +46,7 @@ pub struct End {
     pub is_silent: AtomicBool,
 }
 
-/// Runs one vehicle until `end`.
+/// Runs one vehicle until `end`. Where gateways share records, only while it is linked here and no other gateway speaks for it.
 pub fn run(
     config: &Config,
     vehicle: &config::Vehicle,
@@ -54,14 +54,34 @@ pub fn run(
     seen: &Arc<Seen>,
     end: &End,
 ) -> Result<()> {
+    let is_shared = config.manager.shared_records.is_some();
+    let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
+    let peer = system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;
     while !end.is_due.load(Ordering::SeqCst) {
-        let mut gateway = Gateway::start(config, vehicle, system, seen.clone())?;
-        while !end.is_due.load(Ordering::SeqCst) && !gateway.is_mended() {
+        // Released when nothing more is written or said.
+        let lock = match is_shared {
+            true if !peer.is_connected() => None,
+            true => RecordLock::take(&config.records(), &vehicle.serial_number)?,
+            false => None,
+        };
+        if is_shared && lock.is_none() {
+            std::thread::sleep(TURN);
+            continue;
+        }
+        let mut gateway = Gateway::start(config, vehicle, system, &peer, seen.clone(), lock)?;
+        let has_left = || is_shared && !peer.is_connected();
+        while !end.is_due.load(Ordering::SeqCst) && !gateway.is_mended() && !has_left() {
             let turn = Instant::now();
             gateway.turn();
             std::thread::sleep(TURN.saturating_sub(turn.elapsed()));
         }
-        gateway.stop(end.is_silent.load(Ordering::SeqCst));
+        let last = match end.is_due.load(Ordering::SeqCst) {
+            true => (!end.is_silent.load(Ordering::SeqCst)).then_some(ConnectionState::Offline),
+            false if has_left() => Some(ConnectionState::Broken),
+            false => Some(ConnectionState::Offline),
+        };
+        gateway.stop(last);
+        [&seen.linked, &seen.broker].iter().for_each(|is_there| is_there.store(false, Ordering::Relaxed));
     }
     Ok(())
 }
@@ -105,25 +125,25 @@ impl Gateway {
         config: &Config,
         vehicle: &config::Vehicle,
         system: &CommunicationSystem,
+        peer: &Peer,
         seen: Arc<Seen>,
+        lock: Option<RecordLock>,
     ) -> Result<Self> {
         let config = &Config { broker: config.broker.of(vehicle), ..config.clone() };
-        let identity = Identity::s_unit(&vehicle.name, vehicle.id)?;
-        let peer = system.node(&identity).with_context(|| format!("there are no keys for {}", vehicle.name))?;
-        let folder = config.manager.state_folder.join("vda5050");
+        let folder = config.records();
         let (store, machine) = match Store::open(&folder, &vehicle.serial_number) {
-            Ok((store, record)) => (store, Machine::new(record, config.policy(), Duration::ZERO)),
+            Ok((store, record)) => (store.locked(lock), Machine::new(record, config.policy(), Duration::ZERO)),
             Err(error) => {
                 eprintln!(
                     "{}: out of service until its record is mended or moved away: {error}",
                     vehicle.serial_number
                 );
                 let machine = Machine::out_of_service(&error.to_string(), config.policy(), Duration::ZERO);
-                (Store::nowhere(), machine)
+                (Store::nowhere().locked(lock), machine)
             }
         };
         let tried = machine.is_out_of_service().then(Instant::now);
-        let driver = Driver::new(machine, Linked::new(peer, system.heart(HEART)), store);
+        let driver = Driver::new(machine, Linked::new(peer.clone(), system.heart(HEART)), store);
         let prefix = config.prefix(vehicle);
         let will = Arc::new(AtomicU32::new(0));
         let (serial_number, shared, header_id) = (vehicle.serial_number.clone(), config.clone(), will.clone());
@@ -446,14 +466,15 @@ impl Gateway {
         client.try_publish(format!("{}/{topic}", self.prefix), quality, is_retained, json(message)).ok()
     }
 
-    /// Says OFFLINE and waits until that has arrived. What moves stops, as its heart goes.
-    fn stop(mut self, is_silent: bool) {
+    /// Says what `connection` is from now on, and waits until that has arrived. What moves stops, as its heart goes.
+    fn stop(mut self, last: Option<ConnectionState>) {
         self.link.end();
         let end = Instant::now() + LAST_WORDS;
         while !self.driver.keep(self.began.elapsed()).unwrap_or_default() && Instant::now() < end {
             std::thread::sleep(TURN);
         }
-        if !is_silent && self.driver.is_kept() && self.send_connection(ConnectionState::Offline).is_some() {
+        let is_kept = self.driver.is_kept();
+        if last.filter(|_| is_kept).is_some_and(|last| self.send_connection(last).is_some()) {
             let end = Instant::now() + LAST_WORDS;
             while let Ok(heard) = self.link.heard.recv_timeout(end.saturating_duration_since(Instant::now())) {
                 if matches!(heard, Heard::Acknowledged | Heard::Lost(_)) {
@@ -531,7 +552,7 @@ pub fn check(config: &Config) -> Result<()> {
     for vehicle in &config.vehicle {
         crate::tls::client(&config.broker.of(vehicle), &Arc::default())?;
     }
-    let folder = config.manager.state_folder.join("vda5050");
+    let folder = config.records();
     for vehicle in &config.vehicle {
         if folder.join(format!("{}.json", vehicle.serial_number)).exists() {
             Store::open(Path::new(&folder), &vehicle.serial_number)?;

@@ -1,8 +1,9 @@
 //! The record on disk: written before anything that follows from it is said to the vehicle or to the master.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 
 use crate::state::Record;
@@ -23,6 +24,8 @@ pub struct Store {
     file: Option<PathBuf>,
     /// From the first write on.
     writer: Option<Writer>,
+    /// Where gateways share it.
+    lock: Option<RecordLock>,
 }
 
 /// A thread that writes one text at a time.
@@ -44,12 +47,37 @@ impl Store {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Record::default(),
             Err(error) => return Err(error),
         };
-        Ok((Self { file: Some(file), writer: None }, record))
+        Ok((Self { file: Some(file), writer: None, lock: None }, record))
     }
 
     /// For a vehicle that is out of service, and has no record.
     pub const fn nowhere() -> Self {
-        Self { file: None, writer: None }
+        Self { file: None, writer: None, lock: None }
+    }
+
+    /// Holds this as long as anything may be written.
+    pub fn locked(self, lock: Option<RecordLock>) -> Self {
+        Self { lock, ..self }
+    }
+}
+
+/// The right to speak for a vehicle whose record several gateways share. The system takes it back from a process that ends, once no
+/// thread of that one can write any more.
+#[derive(Clone, Debug)]
+pub struct RecordLock(#[expect(dead_code, reason = "the lock ends with its file")] Arc<File>);
+
+impl RecordLock {
+    /// `None` while another gateway has it.
+    pub fn take(folder: &Path, serial_number: &str) -> io::Result<Option<Self>> {
+        std::fs::create_dir_all(folder)?;
+        // The record itself is replaced at each write, so that a lock on it would not last.
+        let file = folder.join(format!("{serial_number}.lock"));
+        let file = OpenOptions::new().write(true).create(true).truncate(false).open(file)?;
+        match file.try_lock() {
+            Ok(()) => Ok(Some(Self(Arc::new(file)))),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(error)) => Err(error),
+        }
     }
 }
 
@@ -59,7 +87,7 @@ impl Keep for Store {
         let text = serde_json::to_vec(record)?;
         let writer = match &mut self.writer {
             Some(writer) => writer,
-            none => none.insert(Writer::start(file.clone())?),
+            none => none.insert(Writer::start(file.clone(), self.lock.clone())?),
         };
         writer.texts.send(text).map_err(|_| io::Error::other("the record's thread has ended"))
     }
@@ -78,10 +106,12 @@ impl Keep for Store {
 }
 
 impl Writer {
-    fn start(file: PathBuf) -> io::Result<Self> {
+    fn start(file: PathBuf, lock: Option<RecordLock>) -> io::Result<Self> {
         let (texts, to_write) = sync_channel::<Vec<u8>>(1);
         let (done, results) = sync_channel(1);
         let run = move || {
+            // A write that hangs ends some time.
+            let _lock = lock;
             let mut written = to_write.iter().map(|text| replace(&file, &text));
             while written.next().is_some_and(|result| done.send(result).is_ok()) {}
         };

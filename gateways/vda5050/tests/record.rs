@@ -13,7 +13,7 @@ use cara_vda5050::driver::{Driver, Vehicle};
 use cara_vda5050::errors::{Kind, Refusal};
 use cara_vda5050::machine::{Machine, Topic};
 use cara_vda5050::message::Order;
-use cara_vda5050::record::{Keep, Store};
+use cara_vda5050::record::{Keep, RecordLock, Store};
 use cara_vda5050::state::{Command, Failure, Record, Status};
 use fake::{Fake, instant, order, policy};
 
@@ -216,6 +216,16 @@ fn a_damaged_record_is_not_overwritten() {
     std::fs::write(folder.path().join("0001.json"), "{\"order_id\": \"o").unwrap();
     let error = Store::open(folder.path(), "0001").unwrap_err();
     assert!(error.to_string().contains("is damaged"), "{error}");
+}
+
+#[test]
+fn one_gateway_speaks_for_a_vehicle() {
+    let folder = tempfile::tempdir().unwrap();
+    let take = |serial_number| RecordLock::take(folder.path(), serial_number).unwrap();
+    let first = take("0001");
+    assert!(first.is_some() && take("0001").is_none() && take("0002").is_some());
+    drop(first);
+    assert!(take("0001").is_some());
 }
 
 /// What a driver does, as it does it; the vehicle answers or not.
