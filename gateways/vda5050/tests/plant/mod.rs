@@ -218,12 +218,17 @@ impl Plant {
     }
 
     pub fn start_gateway(&mut self) {
+        self.gateway = Some(self.gateway_of(&self.file()));
+    }
+
+    /// One with this configuration.
+    pub fn gateway_of(&self, file: &Path) -> Process {
         let mut command = Command::new(env!("CARGO_BIN_EXE_cara-vda5050"));
-        command.arg(self.file()).env("CARA_KEYS", self.folder.path().join("keys"));
+        command.arg(file).env("CARA_KEYS", self.folder.path().join("keys"));
         command.env("XDG_RUNTIME_DIR", self.folder.path());
         let gateway = Process::start(&mut command);
         gateway.wait_for("up with");
-        self.gateway = Some(gateway);
+        gateway
     }
 
     pub fn kill_gateway(&mut self) -> Instant {
@@ -337,11 +342,11 @@ pub fn tls_port(port: u16, more_of_broker: &str) -> u16 {
 }
 
 pub fn keys(folder: &Path, fleet: u32, vehicles: u32) {
-    let manager = Identity::m_unit("vda5050", 1).unwrap();
+    let managers = [("vda5050", 1), ("yard", 2)].map(|(name, id)| Identity::m_unit(name, id).unwrap());
     let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
-    keys.add(&manager, &[]).unwrap();
+    managers.iter().for_each(|manager| keys.add(manager, &[]).unwrap());
     let vehicle = |number| Identity::s_unit(&format!("agv-{number}"), 100 + number).unwrap();
-    keys.add_all(&(1..=vehicles).map(vehicle).collect::<Vec<_>>(), &[manager]).unwrap();
+    keys.add_all(&(1..=vehicles).map(vehicle).collect::<Vec<_>>(), &managers).unwrap();
     std::fs::create_dir(folder.join("keys")).unwrap();
     Store::create(&folder.join("keys"), keys).unwrap();
 }
@@ -356,7 +361,12 @@ fn vehicles_from(folder: &Path, fleet: u32, number: u32, count: u32) -> Process 
     let mut command = Command::new(file);
     let (name, id) = (format!("agv-{number}"), (100 + number).to_string());
     command.args([&name, &id]).args(["--vehicles", &count.to_string(), "--speed", "2", "--fleet", &fleet.to_string()]);
-    Process::start(command.env("CARA_KEYS", folder.join("keys")).env("XDG_STATE_HOME", folder.join(name)))
+    Process::start(
+        command
+            .env("CARA_KEYS", folder.join("keys"))
+            .env("XDG_STATE_HOME", folder.join(&name))
+            .env("CARA_STATE", folder.join(name)),
+    )
 }
 
 pub fn broker(folder: &Path, port: u16, more: &str) -> Process {
