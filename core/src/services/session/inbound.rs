@@ -102,6 +102,11 @@ impl<'b> ReplyBlock<'b> {
 const EMERGENCY_BLOCK_BYTES: u32 = (EMERGENCY_BYTES - REQUEST_BYTES) as u32;
 
 impl<P: Port> Session<P> {
+    /// Whether the peer has joined and its list of functions, which may be empty, is complete. A node counts from then on.
+    pub const fn is_listed(&self) -> bool {
+        self.wire.joined && self.wire.listed
+    }
+
     /// Takes bytes that the port has read from the stream. Call it again with the rest, and finally with an empty slice, until
     /// it consumes nothing and returns no event.
     ///

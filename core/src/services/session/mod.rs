@@ -73,8 +73,7 @@ use wire::{Phase, Wire, close_code, close_reason};
 
 /// Longest frame body that an unauthenticated peer may send; with its header it needs no buffer of the pool.
 const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - HEADER_BYTES - 1;
-/// A challenge is one frame in the stream and this many datagrams: a single lost segment or datagram must not make a live peer
-/// look dead, or a duplicate of it would get its link.
+/// Datagrams of a challenge, beside a frame: one that is lost must not make a live peer look dead, and give a duplicate its link.
 const CHALLENGE_DATAGRAMS: usize = 3;
 /// Most bytes that framing adds to one chunk, without sealing.
 const FRAME_BYTES: usize = HEADER_BYTES + 6;
@@ -312,11 +311,6 @@ impl<P: Port> Session<P> {
     /// The peer's identity, once it has joined.
     pub fn peer(&self) -> Option<&Identity> {
         self.wire.identity().filter(|_| self.wire.joined)
-    }
-
-    /// Whether the peer has joined and its list of functions, which may be empty, is complete. A node counts from then on.
-    pub const fn is_listed(&self) -> bool {
-        self.wire.joined && self.wire.listed
     }
 
     /// The peer's boot epoch, once its hello has come.
