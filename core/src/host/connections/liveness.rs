@@ -65,7 +65,7 @@ pub struct Look {
 }
 
 /// How long after a sign of life a keep-alive counts as missed.
-pub(crate) fn missed_after(period: Duration) -> Duration {
+fn missed_after(period: Duration) -> Duration {
     period + period.divided_by(2)
 }
 
@@ -141,9 +141,9 @@ impl Liveness {
         self.is_heard
     }
 
-    /// Whether the peer hears nothing of this unit, as it reported last.
-    pub(crate) const fn is_missed(&self) -> bool {
-        self.is_missed
+    /// For how long at least the peer has heard nothing of this unit, which sends keep-alives with this period; `None` if it hears it.
+    pub(crate) fn missed_for(&self, period: Duration) -> Option<Duration> {
+        self.is_missed.then(|| missed_after(period))
     }
 
     /// Whether datagrams of the peer were waited for in vain for three keep-alives.

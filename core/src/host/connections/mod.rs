@@ -13,7 +13,6 @@ mod urgent;
 
 pub use counters::LinkCounter;
 pub use delivery::Report;
-pub(crate) use liveness::missed_after;
 pub use liveness::{Liveness, Look};
 
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};

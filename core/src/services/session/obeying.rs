@@ -9,7 +9,6 @@ use crate::distribution::claim::Claim;
 use crate::distribution::connection_handler::MayMove;
 use crate::distribution::hello::ClaimReport;
 use crate::distribution::message::Control;
-use crate::host::connections::missed_after;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
@@ -66,15 +65,13 @@ impl Obedience {
     /// Tells the hub when this unit and the peer last heard each other, once either misses a keep-alive: a standby that asks counts
     /// from then, and not from the end of the link. To be called as soon as either is heard again, before anything can end the link.
     pub(super) fn note_silence<P: Port>(&mut self, wire: &Wire<P>, cx: &mut Context<'_, P>) {
-        let (is_silent, is_missed) = (wire.liveness.is_silent(), wire.liveness.is_missed());
-        let is_cut_off = is_silent || is_missed;
-        if core::mem::replace(&mut self.is_cut_off, is_cut_off) != is_cut_off
+        let liveness = &wire.liveness;
+        let silent = liveness.is_silent().then(|| liveness.silent_for(cx.now));
+        let apart = silent.max(liveness.missed_for(wire.own_keep_alive()));
+        if core::mem::replace(&mut self.is_cut_off, apart.is_some()) != apart.is_some()
             && let Some(remote) = &wire.remote
         {
-            let silent = if is_silent { wire.liveness.silent_for(cx.now) } else { Duration::ZERO };
-            // It misses one when at least so much time has passed.
-            let missed = if is_missed { missed_after(wire.own_keep_alive()) } else { Duration::ZERO };
-            let heard = if is_cut_off { cx.now - silent.max(missed) } else { Instant::FAR_FUTURE };
+            let heard = apart.map_or(Instant::FAR_FUTURE, |apart| cx.now - apart);
             cx.hub.enter(&mut |hub| hub.node.manager_heard(heard, &remote.hello.identity));
         }
     }

@@ -1,6 +1,6 @@
 //! Streams between two ends: the newest value wins, ages, pace, limits, and that samples delay no call.
 
-use core::cell::RefCell;
+use core::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::vec;
 use std::vec::Vec;
@@ -20,9 +20,9 @@ use crate::services::access::{Functions, Rate, Rule, Verbs, Who};
 use crate::services::stream::{Newest, Source, Value};
 use crate::time::Duration;
 
-/// The values of a stream of a test.
+/// The values of a stream of a test, and how many of them were taken.
 #[derive(Clone)]
-pub(super) struct Values(Rc<RefCell<Newest<Vec<u8>>>>);
+pub(super) struct Values(Rc<RefCell<Newest<Vec<u8>>>>, Rc<Cell<u64>>);
 
 impl Source for Values {
     fn version(&self) -> u32 {
@@ -33,6 +33,10 @@ impl Source for Values {
         if let Some(value) = self.0.borrow().value() {
             look(&value);
         }
+    }
+
+    fn taken(&self) {
+        self.1.set(self.1.get() + 1);
     }
 }
 
@@ -47,7 +51,7 @@ impl Side {
     fn add_stream(&mut self, definition: &str, least: u16) -> Slot {
         let definition = Definition::stream(definition).unwrap();
         let attributes = Attributes { priority: Priority::Low, stream: Some(least), ..Attributes::default() };
-        let values = Values(Rc::new(RefCell::new(Newest::new(vec![0; 20_100]))));
+        let values = Values(Rc::new(RefCell::new(Newest::new(vec![0; 20_100]))), Rc::default());
         let mut handler = Handler::new(Run::Now(|_| Ok(())), None);
         handler.values = Some(values);
         self.functions.add_function(&definition, attributes, handler).unwrap()
@@ -111,7 +115,8 @@ fn values_go_to_a_subscriber_and_to_no_other() {
     pair.agv.put(pose, 5);
     pair.run(MS);
     assert_eq!((pair.manager.values(), pair.agv.session.subscriptions()), (vec![1, 2, 3, 4], 0));
-    assert_eq!(pair.agv.counter(LinkCounter::SamplesSent), 4);
+    let taken = pair.agv.functions.function(pose).unwrap().handler.values.as_ref().unwrap().1.get();
+    assert_eq!((pair.agv.counter(LinkCounter::SamplesSent), taken), (4, 4));
     assert_eq!(pair.manager.counter(LinkCounter::SamplesReceived), 4);
 }
 

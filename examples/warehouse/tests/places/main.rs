@@ -210,7 +210,7 @@ fn step(number: u32) -> Step {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 1_000, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig::with_cases(1_000))]
 
     #[test]
     fn no_two_vehicles_are_ever_in_one_place(steps in prop::collection::vec(any::<u32>(), 1..200)) {
