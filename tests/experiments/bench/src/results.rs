@@ -478,7 +478,9 @@ impl Results {
     /// What an earlier run wrote.
     pub(crate) fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
-        serde_json::from_str(&text).with_context(|| format!("{} is no complete file of a run", path.display()))
+        // Where another crate has it keep numbers as they are written, it reads none of a flattened member but through a value.
+        let rows = serde_json::from_str::<serde_json::Value>(&text).and_then(serde_json::from_value);
+        rows.with_context(|| format!("{} is no complete file of a run", path.display()))
     }
 
     /// Fails unless [`write`](Self::write) can write there.
