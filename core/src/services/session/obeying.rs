@@ -97,7 +97,10 @@ impl Obedience {
     pub(super) fn give_way<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
         let is_news = wire.phase == Phase::Live && !self.gives_way();
         if is_news {
-            self.gives_way = (now + CHALLENGE_TIMEOUT, now + wire.constraints.handover);
+            // One that says that it hears nothing of this unit cannot answer either.
+            let hears = wire.liveness.missed_for(wire.own_keep_alive()).is_none();
+            let answers_by = if hears { now + CHALLENGE_TIMEOUT } else { now };
+            self.gives_way = (answers_by, now + wire.constraints.handover);
             wire.due.set(Part::Claims, now + LOOK);
         }
         is_news

@@ -11,6 +11,7 @@ use super::side::{Side, context};
 use super::{none, text};
 use crate::config::Constraints;
 use crate::distribution::claim::{Claim, TaggedClaim};
+use crate::distribution::connection_handler::Directive;
 use crate::error::CloseReason;
 use crate::host::connections::LinkCounter;
 use crate::host::mailman::LinkId;
@@ -107,6 +108,26 @@ fn a_vehicle_that_its_manager_does_not_hear_counts_from_then() {
     pair.run(Duration::from_millis(500));
     assert_eq!(since(&pair), Some(0));
     assert!(pair.manager.session.is_live() && pair.agv.session.is_live());
+}
+
+/// It cannot answer, so a manager with a higher claim does not wait for that.
+#[test]
+fn a_manager_that_does_not_hear_its_vehicle_is_not_asked_to_show_life() {
+    for (silence, waits) in [(2_000, 100), (0, 400)] {
+        let mut pair = Pair::live();
+        pair.run(Duration::from_secs(10));
+        pair.agv.net.datagrams = Datagrams::Lost;
+        pair.agv.net.frozen = true;
+        pair.run(Duration::from_millis(silence));
+        pair.agv.session.direct(context!(pair.agv), Directive::Yield);
+        let restarted = Event::Closed(CloseReason::PeerRestarted);
+        if silence == 0 {
+            pair.run(Duration::from_millis(200));
+            assert!(!pair.agv.has(&restarted), "it may answer yet");
+        }
+        pair.run(Duration::from_millis(waits));
+        assert!(pair.agv.has(&restarted), "{silence}");
+    }
 }
 
 /// The frame may be the last thing that the link brings: nothing is polled between the two.
