@@ -64,7 +64,7 @@ pub struct Ticket {
     id: u32,
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "scheduling"))]
 impl Ticket {
     pub(crate) const fn of(index: u16, id: u32) -> Self {
         Self { index, id }
