@@ -173,7 +173,7 @@ mod tests {
         let fresh = filled(page).unwrap();
         assert!(fresh.starts_with("before\n<!-- bench one CPU -->\n| characters | 100 |"), "{fresh}");
         assert!(fresh.ends_with(" |\n<!-- end -->\nafter\n") && !fresh.contains("old"), "{fresh}");
-        assert!(fresh.contains("| **CARA** | 25 (165) · 1."), "{fresh}");
+        assert!(fresh.contains("| **CARA** | 16 (85) · 1."), "{fresh}");
         assert_eq!(filled(&fresh).unwrap(), fresh);
         assert!(filled(&page.replace("one CPU", "spinning")).unwrap().contains("plain sockets again"));
         assert!(filled(&page.replace("one CPU", "no CPU")).is_err());
@@ -188,6 +188,8 @@ mod tests {
         assert_eq!(names, ["run", "one CPU", "two CPUs", "spinning", "a second", "missed"]);
         assert_eq!(page.matches(END).count(), names.len());
         names.iter().for_each(|name| drop(table(name, &Results::default()).unwrap()));
+        let results = Results::read(&Path::new(ROOT).join("tests/experiments/plots/full.json")).unwrap();
+        assert_eq!(filled(&results, &page).unwrap(), page, "the page and the rows are of two runs");
     }
 
     #[test]
