@@ -114,7 +114,7 @@ pub enum Refusal {
     #[error("the peer has as many nodes as it may: raise its maximum_nodes")]
     Full,
     /// Another live node has the same name, id and role.
-    #[error("another live node has the same name and id: give each node its own")]
+    #[error("another live node has the same name and id: give each node its own, unless one stands by for the other")]
     DuplicateIdentity,
     /// Both ends are s_units.
     #[error("the two roles cannot be joined: make one of them an m_unit, which s_units join")]

@@ -155,8 +155,9 @@ impl<T: Send + 'static> Builder<T, MUnit> {
     /// vehicle has heard one for three keep-alives. Then it commands, and its s_units come to it. Where another one commands with a
     /// higher [claim](crate::Claim) it stands by again, in place of [`UnitEvent::Fenced`](crate::UnitEvent::Fenced). It
     /// takes nothing over by [`take_over`](Self::take_over). Two of them on two hosts, each with a [folder of
-    /// state](Self::state_folder) of its own and the same `keep_alive`, are one manager that outlives a host. It takes keys:
-    /// [`BuildError::StandbyWithoutKeys`] in plain mode.
+    /// state](Self::state_folder) of its own and the same `keep_alive`, are one manager that outlives a host. It has a
+    /// [control socket](crate::control) while it commands. It takes keys and such a folder: [`BuildError::StandbyWithoutKeys`] in
+    /// plain mode, [`BuildError::StandbyWithoutState`].
     ///
     /// ```no_run
     /// use cara_std::{CommunicationSystem, UnitEvent};
@@ -383,6 +384,9 @@ impl<T: Send + 'static, R> Builder<T, R> {
         if self.stands_by && keys.mode() == Mode::Plain {
             return Err(BuildError::StandbyWithoutKeys);
         }
+        if self.stands_by && self.state_folder.is_none() {
+            return Err(BuildError::StandbyWithoutState);
+        }
         if self.authority.is_some() && keys.mode() == Mode::Plain {
             return Err(BuildError::AuthorityWithoutKeys);
         }
@@ -474,6 +478,11 @@ pub enum BuildError {
     /// A standby in plain mode, in which nobody can prove that the manager is there.
     #[error("a standby needs keys: in plain mode anybody could keep it waiting, or answer in its manager's name")]
     StandbyWithoutKeys,
+    /// A standby that cannot store its claim: after a restart it could not be sure to claim more than it did before.
+    #[error(
+        "a standby needs a folder of state, in which it stores its claim: set CARA_STATE, or --state of `cara node`"
+    )]
+    StandbyWithoutState,
     /// A manager with an authority in plain mode, in which vehicles refuse nobody.
     #[error("an authority needs keys: in plain mode no vehicle refuses the claim of another manager")]
     AuthorityWithoutKeys,

@@ -107,7 +107,9 @@ pub enum StartError {
         identity: Identity,
     },
     /// An m_unit cannot store its claim, which it must before it speaks with it.
-    #[error("the claim of this manager cannot be stored: {0}; name another folder of state (CARA_STATE), or none")]
+    #[error(
+        "the claim of this manager cannot be stored: {0}; make space there, or name another folder of state (CARA_STATE)"
+    )]
     Claim(String),
     /// The manager's authority has not given it the key, without which it may not claim.
     #[error(

@@ -103,9 +103,9 @@ pub(crate) struct Owner<T: Send + 'static> {
 /// A unit that stops waits so long for the last lines of its audit log.
 #[cfg(feature = "control")]
 const LAST_LINES: std::time::Duration = std::time::Duration::from_secs(1);
-/// A standby looks so often whether the control socket of its host is free.
+/// A standby looks so often whether it commands, and has the control socket then.
 #[cfg(feature = "control")]
-const BETWEEN_LOOKS: std::time::Duration = std::time::Duration::from_secs(1);
+const BETWEEN_LOOKS: std::time::Duration = std::time::Duration::from_millis(200);
 /// One that takes over waits so long for the control socket of one on this host that steps down.
 #[cfg(feature = "control")]
 const STEPPING_DOWN: std::time::Duration = std::time::Duration::from_secs(3);
@@ -169,25 +169,34 @@ impl<T: Send + 'static> Owner<T> {
         }
     }
 
-    /// Opens the socket of a standby once the manager on this host that has it is gone.
-    fn await_control(owner: Weak<Self>) -> Result<(), StartError> {
+    /// Gives a standby the control socket of its host while it commands, and only then: whoever waits knows no vehicle, and would
+    /// answer an operator that all are absent.
+    fn keep_control_while_commanding(owner: Weak<Self>) -> Result<(), StartError> {
         let thread = std::thread::Builder::new().name("cara-socket".into());
-        let wait = move || {
+        let keep = move || {
             while let Some(owner) = owner.upgrade().filter(|owner| !owner.engine.is_stopping()) {
-                let (identity, fleet) = owner.engine.hub.lock().identity();
-                let is_free = || control::held(&owner.control, &identity, fleet).is_none();
-                if is_free() {
-                    owner.open_control();
-                    // Another standby may have been quicker.
-                    if lock(&owner.server).is_some() || is_free() {
-                        return;
-                    }
+                if owner.engine.hub.lock().hub.node.is_standby() {
+                    let server = lock(&owner.server).take();
+                    server.inspect(Server::stop);
+                } else if lock(&owner.server).is_none() {
+                    owner.take_control();
                 }
                 drop(owner);
                 std::thread::sleep(BETWEEN_LOOKS);
             }
         };
-        thread.spawn(wait).map(drop).map_err(|error| crate::error::system_refused(error).into())
+        thread.spawn(keep).map(drop).map_err(|error| crate::error::system_refused(error).into())
+    }
+
+    /// Opens the socket unless another process has it. One that does not answer was replaced by this unit and hangs: it loses it.
+    fn take_control(&self) {
+        let (identity, fleet) = self.engine.hub.lock().identity();
+        if let Some(path) = control::held(&self.control, &identity, fleet)
+            && !control::free_silent(&path)
+        {
+            return;
+        }
+        self.open_control();
     }
 }
 
@@ -255,10 +264,10 @@ impl<T: Send + 'static, R> Handle<T, R> {
                 // The one that steps down has the socket until it ends.
                 wait_until(STEPPING_DOWN, || held().is_none());
             }
-            self.owner.open_control();
-            if self.engine().claims.stands_by() && lock(&self.owner.server).is_none() && held().is_some() {
-                Owner::await_control(Arc::downgrade(&self.owner))?;
+            if self.engine().claims.stands_by() {
+                return Owner::keep_control_while_commanding(Arc::downgrade(&self.owner));
             }
+            self.owner.open_control();
         }
         Ok(())
     }

@@ -53,12 +53,17 @@ pub(crate) fn connected(operator: &mut Operator, meant: &str) -> anyhow::Result<
 /// The node that is meant, connected or not.
 pub(crate) fn known(operator: &mut Operator, meant: &str) -> anyhow::Result<Chosen> {
     let nodes = all(operator, None)?;
-    match choose(&nodes, meant) {
-        Choice::One(node) => Ok(Chosen::among(&nodes, node)),
+    among(&nodes, meant)?.ok_or_else(|| Ended::failed("NotConnected", not_there(&nodes, meant, &operator.waited())))
+}
+
+/// The same of these; `None` if none is meant.
+pub(crate) fn among(nodes: &[NodeInfo], meant: &str) -> anyhow::Result<Option<Chosen>> {
+    match choose(nodes, meant) {
+        Choice::One(node) => Ok(Some(Chosen::among(nodes, node))),
         Choice::Several(names) => {
             Err(Ended::usage(format!("several nodes are called `{meant}`: write {}", names.join(" or "))))
         }
-        Choice::None => Err(Ended::failed("NotConnected", not_there(&nodes, meant, &operator.waited()))),
+        Choice::None => Ok(None),
     }
 }
 

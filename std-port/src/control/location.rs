@@ -305,6 +305,12 @@ pub(super) fn is_held(path: &Path) -> bool {
     is_own && dial(path).map_or_else(|error| error.kind() == io::ErrorKind::WouldBlock, |_| true)
 }
 
+/// Removes a socket whose process hangs.
+pub(super) fn free(path: &Path) -> bool {
+    let Ok(directory) = parent(path).and_then(|directory| enter(directory, EnteredBy::Group)) else { return false };
+    lock(&directory).is_ok_and(|_lock| std::fs::remove_file(path).is_ok())
+}
+
 fn listen_at(path: &Path, directory: &OwnedFd) -> io::Result<UnixListener> {
     let socket = unix_socket()?;
     bind(&socket, &address(path, directory)?)?;

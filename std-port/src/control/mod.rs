@@ -95,6 +95,11 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
     is_its_own.then_some(path)
 }
 
+/// Removes a socket at which nobody answers; `false` where somebody does.
+pub(crate) fn free_silent(path: &std::path::Path) -> bool {
+    matches!(Client::connect(path), Err(ControlError::Silent { .. })) && location::free(path)
+}
+
 /// Opens the socket of a unit that has been started. A unit that cannot have one runs without it, with a warning in the
 /// log.
 pub(crate) fn open<T: Send + 'static>(

@@ -258,7 +258,14 @@ impl<T: Send + 'static> Engine<T> {
         if self.claims.step_down(true) {
             return;
         }
-        tracing::error!(%claim, "another manager of this name and id commands with a higher claim: this one steps down");
+        match self.claims.stands_by() {
+            true => {
+                tracing::warn!(%claim, "another manager of this name and id commands with a higher claim: this one stands by again")
+            }
+            false => {
+                tracing::error!(%claim, "another manager of this name and id commands with a higher claim: this one steps down")
+            }
+        }
         let Some(me) = self.me.upgrade() else { return };
         // A thread of the unit would wait for itself.
         let stop = move || {

@@ -139,6 +139,10 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Another live unit has this one's identity.
     pub(super) fn duplicate_heard(&self, address: SocketAddr) {
+        if self.claims.stands_by() {
+            // As where two of them start at once.
+            return tracing::info!(%address, "another manager of this name and id commands too: the one with the lower claim stands by next");
+        }
         let refusal = Refusal::DuplicateIdentity;
         let own = self.hub.lock().hub.node.identity().clone();
         warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");

@@ -70,11 +70,16 @@ fn manager(operator: &mut Operator, meant: &str) -> anyhow::Result<String> {
     if meant.parse::<NameAndId>().is_ok() {
         return Ok(meant.to_owned());
     }
-    let Chosen { node, .. } = nodes::known(operator, meant)?;
-    match node.role.as_str() {
-        "m_unit" => Ok(full_name(&node)),
-        _ => Err(Ended::usage(format!("{} is no manager: name one with `--to NAME/ID`", full_name(&node)))),
-    }
+    let nodes = nodes::all(operator, None)?;
+    Err(Ended::usage(match nodes::among(&nodes, meant)? {
+        Some(Chosen { node, .. }) if node.role == "m_unit" => return Ok(full_name(&node)),
+        Some(Chosen { node, .. }) => format!("{} is no manager: name one with `--to NAME/ID`", full_name(&node)),
+        None => {
+            let managers: Vec<_> = nodes.iter().filter(|node| node.role == "m_unit").map(full_name).collect();
+            let known = if managers.is_empty() { "none".to_owned() } else { managers.join(", ") };
+            format!("no manager `{}` is known here (known: {known}): name it with `--to NAME/ID`", Shown(meant))
+        }
+    }))
 }
 
 /// The vehicles that are meant, all if none is named.

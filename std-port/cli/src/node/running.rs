@@ -103,7 +103,7 @@ fn not_built(error: BuildError, settings: &Settings) -> anyhow::Error {
     match error {
         BuildError::Unit(error) => not_made(error, settings),
         BuildError::Keys(error) => cara_tools::keys::failed(error),
-        BuildError::StandbyWithoutKeys => Ended::usage(error.to_string()),
+        BuildError::StandbyWithoutKeys | BuildError::StandbyWithoutState => Ended::usage(error.to_string()),
         other => Ended::failed("Failed", other.to_string()),
     }
 }

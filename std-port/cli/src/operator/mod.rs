@@ -94,7 +94,10 @@ fn none_runs(global: &Global, ways: &str) -> anyhow::Error {
     if others.is_empty() && !of_others.is_empty() {
         return Ended::no_unit(of_others);
     }
-    Ended::no_unit(format!("no such m_unit runs on this host{others} (looked in {}). {ways}", running::looked_in()))
+    Ended::no_unit(format!(
+        "no such m_unit runs on this host, unless one stands by{others} (looked in {}). {ways}",
+        running::looked_in()
+    ))
 }
 
 impl Operator {

@@ -129,6 +129,9 @@ fn vehicles_go_over_to_another_manager_and_stay_there() {
         .says("NoKey")
         .says("not moved, or not known: agv-1/11");
     plant.ends(2, HERE, &["hand-over", "agv-1", "--to", "agv-2"]).says("agv-2/12 is no manager");
+    plant
+        .ends(2, HERE, &["hand-over", "agv-1", "--to", "nobody"])
+        .says("no manager `nobody` is known here (known: other/2)");
     plant.ends(2, HERE, &["hand-over", "other", "--to", "other"]).says("other/2 is an m_unit");
     plant.ends(1, HERE, &to(&["agv-9"], &[])).says("no node `agv-9`");
     let moved = plant.ends(0, HERE, &to(&["agv-1", "#12", "agv-1/11"], &["--json"])).lines();

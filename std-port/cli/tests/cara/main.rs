@@ -18,6 +18,7 @@ mod recording;
 mod roles;
 mod scanning;
 mod screens;
+mod standing_by;
 mod stopping;
 mod streaming;
 mod support;
