@@ -15,6 +15,8 @@ use cara_std::control::{Client, Closer, Role, execute, execute_while};
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 
+pub(crate) use self::running::of_others;
+
 /// What a command is about: as a manager of its own it waits until that is there.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Need<'n> {

@@ -60,7 +60,7 @@ pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option
 
 /// Units of this host, or those of the unit and the fleet that are wanted, whose sockets are in other folders, such as another
 /// user's, and how they are asked; empty if there are none.
-pub(super) fn of_others(wanted: Option<&str>, fleet: Option<u32>) -> String {
+pub(crate) fn of_others(wanted: Option<&str>, fleet: Option<u32>) -> String {
     let is_wanted = |unit: &Elsewhere| {
         wanted.is_none_or(|wanted| wanted == unit.unit) && fleet.is_none_or(|fleet| fleet == unit.fleet)
     };

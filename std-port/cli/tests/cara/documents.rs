@@ -148,6 +148,7 @@ fn the_reference_has_every_key_of_the_json() {
     let runs: &[&[&str]] = &[
         &["scan"],
         &["scan", "--survey", "--listen", "3s"],
+        &["scan", "--all-managers", "--listen", "1s"],
         &["functions", "agv-1"],
         &["call", "agv-1", "go_to(position: [1, 2])"],
         &["call", "agv-1", "fail"],

@@ -9,7 +9,9 @@ use cara_std::control::Control;
 use cara_std::keys::{FleetKeys, Store, location};
 use cara_std::{Fleet, Identity, Interfaces, Unit};
 
-use crate::support::{Ran, Stage};
+use serde_json::{Value, json};
+
+use crate::support::{Ran, Stage, agv, until};
 
 #[test]
 fn a_scan_shows_who_is_there() {
@@ -71,6 +73,102 @@ fn a_survey_can_be_had_beside_a_manager() {
     let stage = Stage::with(&[]);
     let reported = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json"]).json();
     assert!(reported["heard"].as_array().unwrap().iter().any(|heard| heard["name"] == "manager"), "{reported}");
+}
+
+/// `manager/1` has `agv-1`, `other/2` has `agv-2`, and `far/3`, without a control socket, has `agv-3`. `agv-4` is away, and
+/// `agv-5` looks for a manager that is not there.
+fn three_managers() -> (Stage, [cara_std::CommunicationSystem; 2], Vec<Unit>) {
+    let mut stage = Stage::empty();
+    stage.know_all(&["far/3@m_unit", "nobody/9@m_unit"]);
+    stage.know_all(&["agv-1/11", "agv-2/12", "agv-3/13", "agv-4/14", "agv-5/15"]);
+    stage.start_manager();
+    let socket = stage.control().join(format!("other-2-{}.sock", stage.fleet));
+    let managers = [stage.m_unit("other", 2).control(Control::Path(socket)), stage.m_unit("far", 3)];
+    let managers = managers.map(|manager| manager.build().unwrap());
+    managers.iter().for_each(|manager| manager.start().unwrap());
+    let vehicles = [("agv-1", 11, "manager", 1), ("agv-2", 12, "other", 2), ("agv-3", 13, "far", 3)];
+    let vehicles = vehicles.into_iter().chain([("agv-5", 15, "nobody", 9)]);
+    let vehicles: Vec<_> = vehicles.map(|(name, id, of, number)| agv(stage.vehicle_of(name, id, of, number))).collect();
+    until("three are connected", || vehicles.iter().filter(|vehicle| vehicle.is_connected()).count() == 3);
+    until("all are linked", || {
+        let links =
+            |manager: &cara_std::CommunicationSystem| (manager.number_of_m_units(), manager.number_of_s_units());
+        managers.iter().all(|manager| links(manager) == (2, 1))
+            && stage.cara(&["functions", "agv-1", "--unit", "manager/1"]).code == 0
+    });
+    (stage, managers, vehicles)
+}
+
+/// What `list` has of that name.
+fn called<'l>(list: &'l Value, key: &str, name: &str) -> &'l Value {
+    list.as_array().unwrap().iter().find(|entry| entry[key] == name).unwrap_or_else(|| panic!("no {name} in {list}"))
+}
+
+const ALL_MANAGERS: [&str; 4] = ["scan", "--all-managers", "--listen", "2s"];
+
+/// Until its datagrams have shown `far/3` and whom `agv-5` looks for.
+fn scan_all(stage: &Stage, more: &[&str]) -> Ran {
+    let mut ran = None;
+    until("they are heard", || {
+        let scan = ran.insert(stage.ends(0, &[&ALL_MANAGERS, more].concat()));
+        scan.out.contains("far/3") && scan.out.contains("nobody/9")
+    });
+    ran.unwrap()
+}
+
+#[test]
+fn all_managers_show_their_vehicles_and_what_is_not_known() {
+    let (stage, _managers, _vehicles) = three_managers();
+    let shown = scan_all(&stage, &[]);
+    let row = |text: &str| {
+        let row =
+            shown.out.lines().find(|line| line.contains(text)).unwrap_or_else(|| panic!("{}", shown.everything()));
+        row.split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    let fleet = stage.fleet;
+    assert_eq!(row("agv-1/11"), format!("manager/1 {fleet} agv-1/11 connected"));
+    assert_eq!(row("agv-2/12"), format!("other/2 {fleet} agv-2/12 connected"));
+    assert!(row("far/3").starts_with(&format!("far/3 {fleet} not known not asked: heard from 127.0.0.1:")));
+    // The first is at far/3, which was not asked.
+    for s_unit in ["agv-3/13", "agv-4/14"] {
+        let state = "at no m_unit that was asked; missed by manager/1; missed by other/2";
+        assert_eq!(row(s_unit), format!("- {fleet} {s_unit} {state}"));
+    }
+    assert!(row("agv-5/15").contains("; looks for nobody/9, heard from 127.0.0.1:"), "{}", shown.out);
+    let empty = crate::support::private_folder();
+    let without = Ran::of(stage.command(&ALL_MANAGERS).env("CARA_KEYS", empty.path()).output().unwrap());
+    without.says(&format!("there are no keys of fleet {fleet} here")).says("agv-1/11");
+    // One that hangs was not asked, and holds up no other one.
+    stage.freeze_manager();
+    let frozen = stage.ends(0, &[&ALL_MANAGERS[..], &["--json"]].concat()).json();
+    let hangs = frozen["managers"].as_array().unwrap().iter().find(|manager| !manager["not_asked"].is_null()).unwrap();
+    assert!(hangs["manager"] == "manager/1" && hangs["s_units"].is_null(), "{hangs}");
+    assert_eq!(called(&frozen["managers"], "manager", "other/2")["s_units"], json!(["agv-2/12"]));
+    assert!(called(&frozen["without_manager"], "s_unit", "agv-1/11")["missed_by"].get("other/2").is_some());
+}
+
+#[test]
+fn all_managers_as_json() {
+    let (stage, managers, _vehicles) = three_managers();
+    let shown = scan_all(&stage, &["--json"]).json();
+    let names: Vec<_> = shown["managers"].as_array().unwrap().iter().map(|manager| &manager["manager"]).collect();
+    assert_eq!(names, ["far/3", "manager/1", "other/2"], "each once: {shown}");
+    let [far, other] = ["far/3", "other/2"].map(|name| called(&shown["managers"], "manager", name));
+    let socket = stage.control().join(format!("other-2-{}.sock", stage.fleet));
+    assert_eq!((&other["s_units"], &other["socket"]), (&json!(["agv-2/12"]), &json!(socket)));
+    let heard = &far["heard"];
+    assert_eq!(heard[0], json!({ "source": heard[0]["source"], "proof": "fleet", "looks_for": null }));
+    let expected = json!({
+        "manager": "far/3", "fleet": stage.fleet, "epoch": format!("{:016x}", managers[1].epoch().0), "socket": null,
+        "not_asked": null, "s_units": null, "heard": heard, "linked_to": ["manager/1", "other/2"]
+    });
+    assert_eq!(far, &expected);
+    let [away, lost] = ["agv-4/14", "agv-5/15"].map(|name| called(&shown["without_manager"], "s_unit", name));
+    let missed = json!({ "manager/1": null, "other/2": null });
+    assert_eq!(away, &json!({ "s_unit": "agv-4/14", "fleet": stage.fleet, "missed_by": missed, "heard": [] }));
+    assert_eq!(lost["heard"][0]["looks_for"], "nobody/9");
+    let rest = ["not_looked", "fleets_without_keys", "key_files_refused"].map(|key| &shown[key]);
+    assert_eq!(rest, [&json!([]), &json!([]), &json!([])]);
 }
 
 #[test]

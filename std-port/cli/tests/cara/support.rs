@@ -123,7 +123,12 @@ impl Stage {
 
     /// The builder of an s_unit that is [known](Self::know).
     pub(crate) fn vehicle(&self, name: &str, id: u32) -> Builder<(), SUnit> {
-        let builder = Unit::builder(name, id, "manager", 1).unwrap().fleet(self.fleet);
+        self.vehicle_of(name, id, "manager", 1)
+    }
+
+    /// Likewise, of another manager.
+    pub(crate) fn vehicle_of(&self, name: &str, id: u32, manager: &str, manager_id: u32) -> Builder<(), SUnit> {
+        let builder = Unit::builder(name, id, manager, manager_id).unwrap().fleet(self.fleet);
         let file = self.keys.file(&Identity::s_unit(name, id).unwrap()).unwrap();
         builder.interfaces(Interfaces::Loopback).key_file(file)
     }

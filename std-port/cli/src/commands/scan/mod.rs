@@ -1,5 +1,6 @@
 //! `cara scan`: the nodes on the network, and the ones that were refused and why.
 
+mod all_managers;
 mod survey;
 
 use std::process::ExitCode;
@@ -34,13 +35,20 @@ pub(crate) struct Arguments {
     /// Survey the network, also where an m_unit runs on this host.
     #[arg(long, conflicts_with_all = ["unit", "socket", "act_as", "offering"])]
     survey: bool,
+    /// Which manager has which s_unit, as far as the m_units of this host that can be asked and a survey show.
+    #[arg(long, conflicts_with_all = ["unit", "socket", "act_as", "offering", "search", "survey"])]
+    all_managers: bool,
     /// How long a survey listens, and what is found by --search is waited for.
     #[arg(long, value_name = "TIME", default_value = "2s", value_parser = parse_time)]
     listen: Duration,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let Arguments { offering, search, survey, listen } = arguments;
+    let Arguments { offering, search, survey, all_managers, listen } = arguments;
+    if all_managers {
+        all_managers::show(listen, global)?;
+        return Ok(Exit::Done.into());
+    }
     let operator = if survey { None } else { Operator::open_if_any(global, &Need::Everybody)? };
     match (operator, offering) {
         (Some(mut operator), offering) => {

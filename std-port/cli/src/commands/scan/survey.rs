@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+use anstyle::Style;
 use cara_std::Fleet;
 use cara_std::survey::{Heard, Reach, Standing, Survey};
 use serde_json::{Value, json};
@@ -14,16 +15,24 @@ use cara_tools::output::{self, BAD, FAINT, PLAIN, Rows};
 /// How often a survey asks while it listens: one broadcast may be lost.
 const QUESTIONS: u32 = 2;
 
-pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
+/// A survey that has asked the fleets that are meant and `more`, and listened; and those of them whose keys should be here.
+pub(super) fn listen(span: Duration, more: &[Fleet], global: &Global) -> anyhow::Result<(Survey, Vec<Fleet>)> {
     let keys = listening::keys(global)?;
-    let fleets = listening::fleets(global, &keys);
+    let mut fleets = listening::fleets(global, &keys);
+    let meant = if global.fleet.is_some() || keys.fleets().is_empty() { fleets.clone() } else { Vec::new() };
+    fleets.extend(more.iter().filter(|fleet| !fleets.contains(fleet)).collect::<Vec<_>>());
     let mut survey = listening::open(global, keys)?;
     for _ in 0..QUESTIONS {
         for fleet in &fleets {
             survey.ask(*fleet);
         }
-        survey.listen(listen / QUESTIONS);
+        survey.listen(span / QUESTIONS);
     }
+    Ok((survey, meant))
+}
+
+pub(super) fn show(span: Duration, global: &Global) -> anyhow::Result<()> {
+    let (survey, meant) = listen(span, &[], global)?;
     let heard: Vec<_> = survey.heard().iter().filter(|heard| !heard.is_survey()).collect();
     if global.json {
         let heard: Vec<_> = heard.iter().map(|heard| as_json(heard)).collect();
@@ -40,7 +49,7 @@ pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
     }
     table(&heard).print()?;
     about_fleets(&heard)?;
-    about_keys(&survey, &heard, &fleets, global)?;
+    about_keys(&survey, &heard, &meant, global)?;
     output::line(
         "\nA survey hears m_units, and s_units that look for their manager. S_units that have joined are silent: their \
          manager shows them (`cara scan` on its host).",
@@ -62,7 +71,7 @@ fn about_fleets(heard: &[&Heard]) -> std::io::Result<()> {
 }
 
 /// What could not be asked or checked, and how it can be.
-fn about_keys(survey: &Survey, heard: &[&Heard], asked: &[Fleet], global: &Global) -> std::io::Result<()> {
+pub(super) fn about_keys(survey: &Survey, heard: &[&Heard], meant: &[Fleet], global: &Global) -> std::io::Result<()> {
     for refused in survey.keys().refused() {
         output::line(format_args!("\n{BAD}keys were not taken{BAD:#}: {refused}"))?;
     }
@@ -72,22 +81,32 @@ fn about_keys(survey: &Survey, heard: &[&Heard], asked: &[Fleet], global: &Globa
              a generation that is over, or somebody speaks in their name",
         )?;
     }
-    // Plain mode needs no keys.
-    if global.insecure {
-        return Ok(());
-    }
-    let unchecked = heard.iter().filter(|heard| heard.standing == Standing::Unchecked).map(|heard| heard.fleet);
-    let of_asked = asked.iter().copied().filter(|_| global.fleet.is_some() || survey.keys().fleets().is_empty());
-    let without: BTreeSet<Fleet> = unchecked.chain(of_asked).filter(|fleet| !survey.keys().has(*fleet)).collect();
-    for fleet in without {
+    for fleet in without_keys(survey, heard, meant, global) {
         output::line(format_args!(
-            "\nthere are no keys of fleet {} here, so its secured units were not asked, and nothing shows that those which \
-             were heard belong to it: {}",
+            "\nthere are no keys of fleet {} here, so the survey did not ask its secured units, and nothing shows that those \
+             which were heard belong to it: {}",
             fleet.0,
             listening::how_to_get_keys(fleet)
         ))?;
     }
     Ok(())
+}
+
+/// Fleets whose secured units were not asked. Plain mode needs no keys.
+pub(super) fn without_keys(survey: &Survey, heard: &[&Heard], meant: &[Fleet], global: &Global) -> BTreeSet<Fleet> {
+    let unchecked = heard.iter().filter(|heard| heard.standing == Standing::Unchecked).map(|heard| heard.fleet);
+    let all = unchecked.chain(meant.iter().copied()).filter(|fleet| !survey.keys().has(*fleet));
+    all.filter(|_| !global.insecure).collect()
+}
+
+/// How far a datagram can be believed, for people.
+pub(super) const fn proof(standing: Standing) -> (Style, &'static str) {
+    match standing {
+        Standing::Plain => (PLAIN, "plain"),
+        Standing::Proven { .. } => (PLAIN, "secured, of the fleet"),
+        Standing::OtherKeys => (BAD, "secured, other keys"),
+        Standing::Unchecked => (FAINT, "secured, not checked"),
+    }
 }
 
 fn table(heard: &[&Heard]) -> Rows {
@@ -96,12 +115,7 @@ fn table(heard: &[&Heard]) -> Rows {
     for heard in heard {
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".into());
         let identity = heard.identity.as_ref();
-        let (style, mode) = match heard.standing {
-            Standing::Plain => (PLAIN, "plain"),
-            Standing::Proven { .. } => (PLAIN, "secured, of the fleet"),
-            Standing::OtherKeys => (BAD, "secured, other keys"),
-            Standing::Unchecked => (FAINT, "secured, not checked"),
-        };
+        let (style, mode) = proof(heard.standing);
         rows.add(
             style,
             [
@@ -121,7 +135,7 @@ fn table(heard: &[&Heard]) -> Rows {
 }
 
 /// Where broadcasts go, and what became of them.
-fn target(reach: &Reach) -> Value {
+pub(super) fn target(reach: &Reach) -> Value {
     json!({
         "interface": reach.interface.name,
         "address": reach.interface.address.to_string(),
