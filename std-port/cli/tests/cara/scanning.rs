@@ -138,6 +138,8 @@ fn all_managers_show_their_vehicles_and_what_is_not_known() {
     let empty = crate::support::private_folder();
     let without = Ran::of(stage.command(&ALL_MANAGERS).env("CARA_KEYS", empty.path()).output().unwrap());
     without.says(&format!("there are no keys of fleet {fleet} here")).says("agv-1/11");
+    let both = [&["--unit", "other/2"], &ALL_MANAGERS[..]].concat();
+    stage.ends(2, &both).says("leave --unit, --socket and --as away");
     // One that hangs was not asked, and holds up no other one.
     stage.freeze_manager();
     let frozen = stage.ends(0, &[&ALL_MANAGERS[..], &["--json"]].concat()).json();
@@ -151,8 +153,9 @@ fn all_managers_show_their_vehicles_and_what_is_not_known() {
 fn all_managers_as_json() {
     let (stage, managers, _vehicles) = three_managers();
     let shown = scan_all(&stage, &["--json"]).json();
-    let names: Vec<_> = shown["managers"].as_array().unwrap().iter().map(|manager| &manager["manager"]).collect();
-    assert_eq!(names, ["far/3", "manager/1", "other/2"], "each once: {shown}");
+    let names = |list, key| shown[list].as_array().unwrap().iter().map(|entry| &entry[key]).collect::<Vec<_>>();
+    assert_eq!(names("managers", "manager"), ["far/3", "manager/1", "other/2"], "each once: {shown}");
+    assert_eq!(names("without_manager", "s_unit"), ["agv-3/13", "agv-4/14", "agv-5/15"]);
     let [far, other] = ["far/3", "other/2"].map(|name| called(&shown["managers"], "manager", name));
     let socket = stage.control().join(format!("other-2-{}.sock", stage.fleet));
     assert_eq!((&other["s_units"], &other["socket"]), (&json!(["agv-2/12"]), &json!(socket)));

@@ -45,6 +45,11 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let Arguments { offering, search, survey, all_managers, listen } = arguments;
+    // Before the verb clap takes them together.
+    if (survey || all_managers) && (global.unit.is_some() || global.socket.is_some() || global.act_as.is_some()) {
+        let text = "--survey and --all-managers ask no single unit: leave --unit, --socket and --as away";
+        return Err(Ended::usage(text));
+    }
     if all_managers {
         all_managers::show(listen, global)?;
         return Ok(Exit::Done.into());

@@ -19,7 +19,8 @@ const QUESTIONS: u32 = 2;
 pub(super) fn listen(span: Duration, more: &[Fleet], global: &Global) -> anyhow::Result<(Survey, Vec<Fleet>)> {
     let keys = listening::keys(global)?;
     let mut fleets = listening::fleets(global, &keys);
-    let meant = if global.fleet.is_some() || keys.fleets().is_empty() { fleets.clone() } else { Vec::new() };
+    let is_meant = global.fleet.is_some() || keys.fleets().is_empty() && more.is_empty();
+    let meant = if is_meant { fleets.clone() } else { Vec::new() };
     fleets.extend(more.iter().filter(|fleet| !fleets.contains(fleet)).collect::<Vec<_>>());
     let mut survey = listening::open(global, keys)?;
     for _ in 0..QUESTIONS {
