@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first, but for those side by side, of which the longest begins.
-pub(crate) const GROUPS: [Group; 40] = [
+pub(crate) const GROUPS: [Group; 41] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -348,6 +348,18 @@ pub(crate) const GROUPS: [Group; 40] = [
         by_default: false,
         waits: true,
         run: |_| firmware::hand_over(),
+    },
+    Group {
+        name: "deny",
+        what: "cargo-deny: licences, sources and version requirements of every workspace, with all features; lists duplicates",
+        budget: 300,
+        quick: None,
+        by_default: false,
+        waits: false,
+        run: |_| {
+            install::crate_program("cargo-deny", "0.20.2")
+                .map_or_else(Outcome::Skipped, |tool| licences::deny(&tool).into())
+        },
     },
     Group {
         name: "etcd",

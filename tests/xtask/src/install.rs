@@ -1,6 +1,9 @@
 //! Gets what a check needs and the machine lacks, without asking. What cannot be had is a reason to skip.
 
+use std::path::PathBuf;
+
 use crate::command::{Run, exists};
+use crate::workspace;
 
 /// A rustup target; `Err` is the reason why it cannot be had.
 pub(crate) fn rust_target(target: &str) -> Result<(), String> {
@@ -17,6 +20,15 @@ pub(crate) fn rust_component(component: &str, program: &str) -> Result<(), Strin
         return Ok(());
     }
     rustup(&["component", "add", component]).map(drop)
+}
+
+/// A program from crates.io, in a folder of the project's; the first time it is built, which takes minutes.
+pub(crate) fn crate_program(name: &str, version: &str) -> Result<PathBuf, String> {
+    let folder = workspace::target().join("tools");
+    let package = format!("{name}@{version}");
+    let install = Run::cargo().args(["install", "--quiet", "--locked", &package, "--root"]).args([&folder]);
+    install.stream().map_err(|error| format!("{name} is missing: {error:#}"))?;
+    Ok(folder.join("bin").join(name))
 }
 
 /// A program from a Debian package, installed only where this runs as root.

@@ -3,9 +3,10 @@
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use anyhow::{Result, bail};
+use anyhow::{Result, bail, ensure};
 use serde_json::Value;
 
+use crate::command::Run;
 use crate::workspace;
 
 /// Licences that MIT OR Apache-2.0 software may be linked with.
@@ -45,6 +46,20 @@ pub(crate) fn check() -> Result<()> {
     }
     wrong.iter().for_each(|line| eprintln!("{line}"));
     bail!("{} packages may not be used", wrong.len())
+}
+
+/// Asks cargo-deny about every workspace of the repository, with all features; deny.toml says what is allowed.
+pub(crate) fn deny(tool: &Path) -> Result<()> {
+    let mut failed = Vec::new();
+    for lock in workspace::files()?.iter().filter(|file| file.ends_with("Cargo.lock")) {
+        let deny = Run::new(&tool.to_string_lossy()).args(["--locked", "--config", "deny.toml", "--manifest-path"]);
+        let check = deny.args([lock.with_file_name("Cargo.toml")]).args(["check", "--hide-inclusion-graph"]);
+        if check.args(["licenses", "bans", "sources"]).stream().is_err() {
+            failed.push(lock.display().to_string());
+        }
+    }
+    ensure!(failed.is_empty(), "cargo-deny objects to {}", failed.join(", "));
+    Ok(())
 }
 
 /// Everything that is linked into a crate outside `tests`.

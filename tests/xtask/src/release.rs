@@ -4,7 +4,7 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Error, Result, ensure};
 
 use crate::command::Run;
 use crate::install;
@@ -173,14 +173,7 @@ fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
 
 /// CycloneDX lists of what is in the programs and in the firmware.
 fn components(folder: &Path) -> Result<()> {
-    let tools = workspace::target().join("tools");
-    if !tools.join("bin/cargo-cyclonedx").is_file() {
-        Run::cargo()
-            .args(["install", "--quiet", "--locked", "cargo-cyclonedx@0.5.9", "--root"])
-            .args([&tools])
-            .stream()?;
-    }
-    let tool = tools.join("bin/cargo-cyclonedx");
+    let tool = install::crate_program("cargo-cyclonedx", "0.5.9").map_err(Error::msg)?;
     let images = fs::read_dir(workspace::root().join("examples/firmware"))?.collect::<Result<Vec<_>, _>>()?;
     let images = images.into_iter().map(|image| image.path().join("Cargo.toml")).filter(|path| path.is_file());
     let images = images.filter(|path| path.with_file_name("Cargo.lock").is_file());
