@@ -9,6 +9,7 @@ dpkg --install /cara.deb
 cara --version
 cara-vda5050 --version
 man --where cara cara-node cara-vda5050 > /dev/null
+[ -f /usr/share/doc/cara/book/index.html ] && [ -f /usr/share/doc/cara/book/searchindex.js ]
 [ "$(stat --format=%U:%G:%a /etc/cara)" = root:cara:750 ]
 systemd-analyze verify --man=no cara@plant.service cara-standby@plant.service cara-vda5050.service
 

@@ -10,6 +10,7 @@ mod alerts;
 mod bad_input;
 mod bench;
 mod binaries;
+mod book;
 mod chaos;
 mod claims;
 mod command;
@@ -109,6 +110,8 @@ enum Task {
     },
     /// Makes Debian packages, static archives, checksums and lists of components in target/release-files.
     Release,
+    /// Makes a book of the documents, with a search, in target/book.
+    Book,
     /// Counts what there is to read and to learn: lines, ways to call, public items, conditions, circles, words.
     House {
         /// Also writes the figures here.
@@ -182,6 +185,7 @@ fn main() -> ExitCode {
         Task::Versions { revisions } => later::versions(&revisions).map(|()| ExitCode::SUCCESS),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Release => release::make().map(|_| ExitCode::SUCCESS),
+        Task::Book => book::make().map(|_| ExitCode::SUCCESS),
         Task::House { json } => house::run(json.as_deref()),
         Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),

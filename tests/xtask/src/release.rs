@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Error, Result, ensure};
 
+use crate::book;
 use crate::command::Run;
 use crate::install;
 use crate::workspace;
@@ -55,10 +56,11 @@ pub(crate) fn make() -> Result<PathBuf> {
     empty(&folder)?;
     let native = PROCESSORS.iter().find(|processor| processor.target.starts_with(std::env::consts::ARCH));
     let native = build(*native.context("releases are made on amd64 or arm64")?)?;
+    let book = book::make()?;
     for processor in PROCESSORS {
         let programs = build(processor)?;
         let tree = folder.join(processor.debian);
-        stage(&tree.join("usr"), &programs, &native.join("cara"))?;
+        stage(&tree.join("usr"), &programs, &native.join("cara"), &book)?;
         archive(&folder, &tree, processor)?;
         package(&folder, &tree, processor)?;
         fs::remove_dir_all(&tree)?;
@@ -96,7 +98,7 @@ fn build(processor: Processor) -> Result<PathBuf> {
 }
 
 /// Puts what is installed under `usr`. The program of this host prints the texts.
-fn stage(usr: &Path, programs: &Path, native: &Path) -> Result<()> {
+fn stage(usr: &Path, programs: &Path, native: &Path, book: &Path) -> Result<()> {
     for (program, _) in PROGRAMS {
         place(&fs::read(programs.join(program))?, &usr.join("bin").join(program), 0o755)?;
     }
@@ -114,6 +116,7 @@ fn stage(usr: &Path, programs: &Path, native: &Path) -> Result<()> {
     for file in ["README.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"] {
         copy(file, &documents.join(file))?;
     }
+    Run::new("cp").args(["--recursive"]).args([book, &documents.join("book")]).stream()?;
     copy("gateways/vda5050/example.toml", &documents.join("vda5050.toml"))?;
     copy("gateways/vda5050/example-factsheet.json", &documents.join("example-factsheet.json"))?;
     let example = Run::new(&native).args(["node", "--example"]).text()?;
