@@ -20,9 +20,9 @@ pub(crate) fn footprint(path: &Path) -> Result<Footprint> {
     let file = object::File::parse(&*bytes).with_context(|| format!("{} is no ELF file", path.display()))?;
     let mut sum = Footprint::default();
     for section in file.sections() {
-        let SectionFlags::Elf { sh_flags } = section.flags() else { continue };
-        let loaded = sh_flags & u64::from(elf::SHF_ALLOC) != 0;
-        let is_variable = sh_flags & u64::from(elf::SHF_WRITE) != 0;
+        let SectionFlags::Elf { sh_flags, .. } = section.flags() else { continue };
+        let loaded = sh_flags.contains(elf::SHF_ALLOC);
+        let is_variable = sh_flags.contains(elf::SHF_WRITE);
         let in_file = !matches!(section.kind(), SectionKind::UninitializedData);
         sum.flash += if loaded && in_file { section.size() } else { 0 };
         sum.static_ram += if loaded && is_variable { section.size() } else { 0 };
