@@ -174,12 +174,14 @@ impl<T: Send + 'static> Owner<T> {
     fn keep_control_while_commanding(owner: Weak<Self>) -> Result<(), StartError> {
         let thread = std::thread::Builder::new().name("cara-socket".into());
         let keep = move || {
+            let mut has_tried = false;
             while let Some(owner) = owner.upgrade().filter(|owner| !owner.engine.is_stopping()) {
                 if owner.engine.hub.lock().hub.node.is_standby() {
+                    has_tried = false;
                     let server = lock(&owner.server).take();
                     server.inspect(Server::stop);
-                } else if lock(&owner.server).is_none() {
-                    owner.take_control();
+                } else if !has_tried {
+                    has_tried = owner.take_control();
                 }
                 drop(owner);
                 std::thread::sleep(BETWEEN_LOOKS);
@@ -188,15 +190,17 @@ impl<T: Send + 'static> Owner<T> {
         thread.spawn(keep).map(drop).map_err(|error| crate::error::system_refused(error).into())
     }
 
-    /// Opens the socket unless another process has it. One that does not answer was replaced by this unit and hangs: it loses it.
-    fn take_control(&self) {
+    /// Opens the socket, as far as that is possible; `false` where another process has it. One that does not answer was replaced by
+    /// this unit and hangs: it loses it.
+    fn take_control(&self) -> bool {
         let (identity, fleet) = self.engine.hub.lock().identity();
         if let Some(path) = control::held(&self.control, &identity, fleet)
             && !control::free_silent(&path)
         {
-            return;
+            return false;
         }
         self.open_control();
+        true
     }
 }
 

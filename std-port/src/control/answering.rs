@@ -157,7 +157,10 @@ fn nodes<T: Send + 'static>(
         let peer = finding.identity.as_ref().and_then(|identity| system.node(identity));
         peer.and_then(|peer| peer.connected_for()).is_some_and(|connected| connected < system.age(finding))
     };
-    let is_over = |finding: &Finding| system.age(finding) > REFUSED || has_joined_since(finding);
+    // Managers that stand by for each other meet now and then, and settle it.
+    let (own, stands_by) = (system.identity(), system.engine().claims.stands_by());
+    let is_of_pair = |finding: &Finding| stands_by && finding.identity.as_ref() == Some(&own);
+    let is_over = |finding: &Finding| system.age(finding) > REFUSED || has_joined_since(finding) || is_of_pair(finding);
     for finding in system.findings().into_iter().filter(|finding| !is_over(finding)) {
         send(sink, Answer::Refused(describe::refused(&finding, system.age(&finding))))?;
     }

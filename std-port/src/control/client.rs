@@ -11,13 +11,16 @@ use std::time::{Duration, Instant};
 use rustix::net::SendFlags;
 
 use super::lines::{Line, Lines};
-use super::location::{self, LocationError, directories, own_uid, peer_uid};
+use super::location::{self, LocationError, directories, own_uid, peer_pid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
 use super::server::{FULL, full};
 use crate::sys::epoll::wait_readable;
 
 /// How long a unit may take to introduce itself.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
+/// A unit that has answered nothing for so long is looked at, and after growing pauses again.
+const FIRST_LOOK: Duration = Duration::from_secs(2);
+const LONGEST_LOOK: Duration = Duration::from_secs(30);
 /// Between two looks at a queue of connections that is full.
 const DIAL_PAUSE: Duration = Duration::from_millis(20);
 
@@ -123,7 +126,8 @@ pub enum ControlError {
     },
     /// The unit holds its socket and does not answer.
     #[error(
-        "the control socket of {unit} is open ({path}) and does not answer: the process hangs or is stopped; restart it"
+        "the control socket of {unit} is open ({path}) and does not answer: the process hangs or is stopped; restart it, or ask its standby \
+         once that commands"
     )]
     Silent {
         /// Its `NAME/ID`.
@@ -338,24 +342,47 @@ impl Client {
         Ok(Answers { client: self })
     }
 
-    /// Sends heartbeats until an answer arrives.
-    fn beat_until_answered(&mut self) {
-        while let Some(beaten) = self.beaten
-            && !self.lines.has_more()
-        {
-            let left = BEAT.saturating_sub(beaten.elapsed());
-            if left.is_zero() {
+    /// Sends heartbeats until an answer arrives. Without any, looks now and then whether the unit lives, since the answer of one that
+    /// hangs never comes. Not while beats are due: a look may wait for longer than a held call lasts.
+    fn await_answer(&mut self) -> Result<(), ControlError> {
+        let (mut pause, mut due) = (FIRST_LOOK, Instant::now() + FIRST_LOOK);
+        while !self.lines.has_more() {
+            let left = match self.beaten {
+                Some(beaten) => BEAT.saturating_sub(beaten.elapsed()),
+                None => due.saturating_duration_since(Instant::now()),
+            };
+            if !left.is_zero() {
                 // What is wrong with the connection is told when it is read.
+                if wait_readable(self.lines.source().as_fd(), left.into()).unwrap_or(true) {
+                    return Ok(());
+                }
+            } else if self.beaten.is_some() {
                 let _ = self.lines.source().write_all(b"\n");
                 self.beaten = Some(Instant::now());
-            } else if wait_readable(self.lines.source().as_fd(), left.into()).unwrap_or(true) {
-                return;
+            } else {
+                self.look()?;
+                pause = (pause * 2).min(LONGEST_LOOK);
+                due = Instant::now() + pause;
             }
+        }
+        Ok(())
+    }
+
+    /// An error where the unit hangs: it introduces itself to nobody, or another process has its socket by now.
+    fn look(&self) -> Result<(), ControlError> {
+        let RunningUnit { unit, path, .. } = &self.unit;
+        let pid = |client: &Self| peer_pid(client.lines.source()).ok();
+        match Self::connect_to_stop(path) {
+            Ok(other) if pid(&other) == pid(self) => Ok(()),
+            Ok(_) | Err(ControlError::Silent { .. }) => {
+                Err(ControlError::Silent { unit: unit.clone(), path: path.clone() })
+            }
+            Err(_) => Ok(()),
         }
     }
 
     fn next_answer(&mut self) -> Result<Option<Answer>, ControlError> {
-        self.beat_until_answered();
+        self.await_answer()?;
         let answer = read(&mut self.lines);
         self.open = matches!(answer, Ok(ref answer) if !matches!(answer, Answer::Done | Answer::Failed(_)));
         match answer? {

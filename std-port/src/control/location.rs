@@ -358,6 +358,11 @@ pub(super) fn peer_uid(stream: &UnixStream) -> io::Result<u32> {
     Ok(sockopt::socket_peercred(stream.as_fd())?.uid.as_raw())
 }
 
+/// The process at the other end of a connection.
+pub(super) fn peer_pid(stream: &UnixStream) -> io::Result<rustix::process::Pid> {
+    Ok(sockopt::socket_peercred(stream.as_fd())?.pid)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -57,6 +57,8 @@ pub struct Heard {
     pub epoch: Option<Epoch>,
     /// The manager that it looks for.
     pub wanted: Option<Manager>,
+    /// It is an m_unit that stands by and commands nobody, as it said last.
+    pub stands_by: bool,
     /// Where it takes connections, at the source's address.
     pub tcp_port: Option<u16>,
     /// How many more nodes it takes, as it said last.
@@ -115,6 +117,7 @@ impl Heard {
             identity: news.identity.cloned(),
             epoch: news.epoch,
             wanted: None,
+            stands_by: false,
             tcp_port: None,
             room: None,
             claim: None,
@@ -136,10 +139,13 @@ impl Heard {
             Some(Datagram::WhoHas(search)) => {
                 self.searches = self.searches.saturating_add(1);
                 self.wanted.clone_from(&search.wanted);
+                self.stands_by = search.standby;
                 self.tcp_port = Some(search.tcp_port).filter(|port| *port > 0);
             }
             Some(Datagram::Announce(answer)) => {
                 self.answers = self.answers.saturating_add(1);
+                // A standby answers nobody.
+                self.stands_by = false;
                 self.tcp_port = Some(answer.tcp_port).filter(|port| *port > 0);
                 self.room = Some(answer.room);
                 self.claim = answer.claim.map(|report| report.claim());

@@ -208,8 +208,13 @@ pub(crate) fn missing_manager(seen: &Evidence, node: &str, wanted: &Manager) -> 
 
 /// That none was heard is known, and that none runs is not.
 pub(crate) fn no_manager(seen: &Evidence) -> String {
+    let standbys = seen.standbys();
+    let standbys = match standbys.is_empty() {
+        true => String::new(),
+        false => format!(" ({} stands by, and does not command yet: its log says why)", standbys.join(", ")),
+    };
     format!(
-        "no manager of fleet {} was heard in {:.0} s, and none runs on this host",
+        "no manager of fleet {} was heard in {:.0} s, and none runs on this host{standbys}",
         seen.fleet.0,
         seen.listened.as_secs_f32()
     )
@@ -297,6 +302,18 @@ mod tests {
         let mut untold = Evidence { heard: vec![said(1, 4), said(2, 5)], ..evidence() };
         untold.heard[0].claim = None;
         assert_eq!(duplicate_managers(&untold)[0].id, Id::Duplicate);
+    }
+
+    #[test]
+    fn a_standby_is_no_second_manager_and_no_manager() {
+        let standby =
+            Heard { epoch: Some(Epoch(2)), last: Duration::from_secs(3), stands_by: true, ..answering("boss", 1) };
+        let boss = Heard { epoch: Some(Epoch(1)), last: Duration::from_secs(3), ..answering("boss", 1) };
+        let mut seen = Evidence { heard: vec![boss, standby], ..evidence() };
+        assert_eq!((duplicate_managers(&seen), seen.managers().len()), (Vec::new(), 1));
+        seen.heard.remove(0);
+        assert!(seen.managers().is_empty());
+        assert!(no_manager(&seen).contains("boss/1 at 10.0.0.9:5000 stands by, and does not command yet"));
     }
 
     #[test]

@@ -76,9 +76,15 @@ pub(crate) struct Life {
 }
 
 impl Evidence {
-    /// Units of our fleet and version, and, as far as that is known, of our mode and keys.
+    /// Units of our fleet and version, and, as far as that is known, of our mode and keys; without standbys, which do nothing yet.
     pub(crate) fn ours(&self) -> impl Iterator<Item = (&Heard, &Identity)> {
-        self.units().filter(|(heard, _)| self.is_ours(heard))
+        self.units().filter(|(heard, _)| self.is_ours(heard) && !heard.stands_by)
+    }
+
+    /// M_units of our fleet that stand by and command nobody, and where they were heard.
+    pub(crate) fn standbys(&self) -> Vec<String> {
+        let standbys = self.units().filter(|(heard, _)| self.is_ours(heard) && heard.stands_by);
+        standbys.map(|(heard, identity)| format!("{identity} at {}", heard.source)).collect()
     }
 
     pub(crate) fn is_ours(&self, heard: &Heard) -> bool {

@@ -71,6 +71,16 @@ fn hung_file(path: &Path) -> File {
 }
 
 #[test]
+fn a_command_whose_manager_stops_answering_ends() {
+    let stage = Stage::with(&["agv-1"]);
+    let mut ping = Running::start(stage.command(&["ping", "agv-1", "--count", "400", "--interval", "100ms"]));
+    ping.expect("agv-1");
+    stage.freeze_manager();
+    until("the ping ends", || ping.has_ended());
+    assert_eq!(ping.end(), 1);
+}
+
+#[test]
 fn an_audit_log_on_a_disk_that_hangs_holds_nothing_up() {
     let mut stage = Stage::empty();
     let audit = stage.control().join("audit");

@@ -330,6 +330,10 @@ impl Running {
         self.child.wait().unwrap();
     }
 
+    pub(crate) fn has_ended(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_some()
+    }
+
     /// Waits for its end.
     pub(crate) fn end(mut self) -> i32 {
         self.child.wait().unwrap().code().unwrap_or(-1)

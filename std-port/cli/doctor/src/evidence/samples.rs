@@ -76,6 +76,7 @@ fn heard(identity: Identity, wanted: Option<Manager>) -> Heard {
         identity: Some(identity),
         epoch: Some(Epoch(1)),
         wanted,
+        stands_by: false,
         tcp_port: None,
         room: None,
         claim: None,
