@@ -103,9 +103,12 @@ pub(crate) struct Owner<T: Send + 'static> {
 /// A unit that stops waits so long for the last lines of its audit log.
 #[cfg(feature = "control")]
 const LAST_LINES: std::time::Duration = std::time::Duration::from_secs(1);
-/// A standby looks so often whether it commands, and has the control socket then.
+/// A standby looks so often whether it commands, which opens its control socket.
 #[cfg(feature = "control")]
 const BETWEEN_LOOKS: std::time::Duration = std::time::Duration::from_millis(200);
+/// One that could not open it tries again after so long.
+#[cfg(feature = "control")]
+const BETWEEN_TRIES: std::time::Duration = std::time::Duration::from_secs(30);
 /// One that takes over waits so long for the control socket of one on this host that steps down.
 #[cfg(feature = "control")]
 const STEPPING_DOWN: std::time::Duration = std::time::Duration::from_secs(3);
@@ -174,14 +177,14 @@ impl<T: Send + 'static> Owner<T> {
     fn keep_control_while_commanding(owner: Weak<Self>) -> Result<(), StartError> {
         let thread = std::thread::Builder::new().name("cara-socket".into());
         let keep = move || {
-            let mut has_tried = false;
+            let mut due = std::time::Instant::now();
             while let Some(owner) = owner.upgrade().filter(|owner| !owner.engine.is_stopping()) {
                 if owner.engine.hub.lock().hub.node.is_standby() {
-                    has_tried = false;
+                    due = std::time::Instant::now();
                     let server = lock(&owner.server).take();
                     server.inspect(Server::stop);
-                } else if !has_tried {
-                    has_tried = owner.take_control();
+                } else if lock(&owner.server).is_none() && due <= std::time::Instant::now() && owner.take_control() {
+                    due = std::time::Instant::now() + BETWEEN_TRIES;
                 }
                 drop(owner);
                 std::thread::sleep(BETWEEN_LOOKS);
@@ -190,12 +193,12 @@ impl<T: Send + 'static> Owner<T> {
         thread.spawn(keep).map(drop).map_err(|error| crate::error::system_refused(error).into())
     }
 
-    /// Opens the socket, as far as that is possible; `false` where another process has it. One that does not answer was replaced by
-    /// this unit and hangs: it loses it.
+    /// Opens the socket if that is possible; `false` where another process has it. A process that does not answer is the manager which
+    /// this unit has replaced, and hangs: its socket is removed.
     fn take_control(&self) -> bool {
         let (identity, fleet) = self.engine.hub.lock().identity();
         if let Some(path) = control::held(&self.control, &identity, fleet)
-            && !control::free_silent(&path)
+            && !control::free_silent(&self.control, &path)
         {
             return false;
         }
@@ -263,13 +266,15 @@ impl<T: Send + 'static, R> Handle<T, R> {
         #[cfg(feature = "control")]
         {
             let held = || control::held(&self.owner.control, &self.identity(), self.fleet());
+            let ran = self.engine().driver.unit_number().is_some();
             self.engine().start_unless(held)?;
             if self.engine().claims.takes_over() {
                 // The one that steps down has the socket until it ends.
                 wait_until(STEPPING_DOWN, || held().is_none());
             }
             if self.engine().claims.stands_by() {
-                return Owner::keep_control_while_commanding(Arc::downgrade(&self.owner));
+                let owner = Arc::downgrade(&self.owner);
+                return if ran { Ok(()) } else { Owner::keep_control_while_commanding(owner) };
             }
             self.owner.open_control();
         }

@@ -345,7 +345,7 @@ impl Client {
     /// Sends heartbeats until an answer arrives. Without any, looks now and then whether the unit lives, since the answer of one that
     /// hangs never comes. Not while beats are due: a look may wait for longer than a held call lasts.
     fn await_answer(&mut self) -> Result<(), ControlError> {
-        let (mut pause, mut due) = (FIRST_LOOK, Instant::now() + FIRST_LOOK);
+        let (mut pause, mut due, mut was_silent) = (FIRST_LOOK, Instant::now() + FIRST_LOOK, false);
         while !self.lines.has_more() {
             let left = match self.beaten {
                 Some(beaten) => BEAT.saturating_sub(beaten.elapsed()),
@@ -360,8 +360,19 @@ impl Client {
                 let _ = self.lines.source().write_all(b"\n");
                 self.beaten = Some(Instant::now());
             } else {
-                self.look()?;
-                pause = (pause * 2).min(LONGEST_LOOK);
+                let looked = self.look();
+                if wait_readable(self.lines.source().as_fd(), BEAT.into()).unwrap_or(true) {
+                    return Ok(());
+                }
+                match looked {
+                    Ok(()) => (pause, was_silent) = ((pause * 2).min(LONGEST_LOOK), false),
+                    Err(error) if was_silent => {
+                        self.open = false;
+                        return Err(error);
+                    }
+                    // Once may be a busy host.
+                    Err(_) => (pause, was_silent) = (Duration::ZERO, true),
+                }
                 due = Instant::now() + pause;
             }
         }

@@ -200,9 +200,9 @@ enum EnteredBy {
 }
 
 /// Device and number of a file, which may be used again, and the time of its last change.
-type Mark = (u64, u64, i64, i64);
+pub(super) type Mark = (u64, u64, i64, i64);
 
-fn mark(path: &Path) -> io::Result<Mark> {
+pub(super) fn mark(path: &Path) -> io::Result<Mark> {
     let file = path.symlink_metadata()?;
     Ok((file.dev(), file.ino(), file.ctime(), file.ctime_nsec()))
 }
@@ -305,10 +305,11 @@ pub(super) fn is_held(path: &Path) -> bool {
     is_own && dial(path).map_or_else(|error| error.kind() == io::ErrorKind::WouldBlock, |_| true)
 }
 
-/// Removes a socket whose process hangs.
-pub(super) fn free(path: &Path) -> bool {
+/// Removes a socket whose process hangs, unless another one is there by now.
+pub(super) fn free(path: &Path, file: Mark) -> bool {
     let Ok(directory) = parent(path).and_then(|directory| enter(directory, EnteredBy::Group)) else { return false };
-    lock(&directory).is_ok_and(|_lock| std::fs::remove_file(path).is_ok())
+    let Ok(_lock) = lock(&directory) else { return false };
+    mark(path).is_ok_and(|found| found == file) && std::fs::remove_file(path).is_ok()
 }
 
 fn listen_at(path: &Path, directory: &OwnedFd) -> io::Result<UnixListener> {

@@ -95,9 +95,11 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
     is_its_own.then_some(path)
 }
 
-/// Removes a socket at which nobody answers; `false` where somebody does.
-pub(crate) fn free_silent(path: &std::path::Path) -> bool {
-    matches!(Client::connect(path), Err(ControlError::Silent { .. })) && location::free(path)
+/// Removes the socket of a unit's own place at which nobody answers; `false` where somebody does, or it may be another unit's.
+pub(crate) fn free_silent(control: &Control, path: &std::path::Path) -> bool {
+    let Ok(file) = location::mark(path) else { return false };
+    let is_its_own = *control == Control::Default;
+    is_its_own && matches!(Client::connect(path), Err(ControlError::Silent { .. })) && location::free(path, file)
 }
 
 /// Opens the socket of a unit that has been started. A unit that cannot have one runs without it, with a warning in the

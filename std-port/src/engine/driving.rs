@@ -78,7 +78,7 @@ impl Driver {
         self.threads.thread_pool()
     }
 
-    pub(super) fn unit_number(&self) -> Option<u16> {
+    pub(crate) fn unit_number(&self) -> Option<u16> {
         self.unit_number.get().copied()
     }
 
