@@ -2,6 +2,7 @@
 
 use std::io::ErrorKind;
 use std::process::ExitCode;
+use std::time::{Duration, Instant};
 
 use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Failure, Question};
@@ -14,9 +15,17 @@ use cara_tools::global::Global;
 use cara_tools::output::{self, BAD};
 use cara_tools::units::show_micros;
 
+/// How long a stop whose manager dies or hangs is asked again of the one that takes over. A standby commands after 3 s, and the control
+/// socket of a manager that hangs is its own 2 s later.
+const TAKING_OVER: Duration = Duration::from_secs(15);
+/// Likewise, where no manager ran to begin with: one may have died just before.
+const APPEARING: Duration = Duration::from_secs(4);
+const PAUSE: Duration = Duration::from_millis(500);
+
 /// Calls each function with the attribute `stop`, at once and as an emergency: what they stop stands until a reset.
 ///
-/// Ends with 0 only if every s_unit of the roster has acknowledged. Not a substitute for a certified emergency stop.
+/// Ends with 0 only if every s_unit of the roster has acknowledged. A manager that dies or hangs meanwhile, or does not run, may have a
+/// standby: the stop is asked again for 15 s, or 4 s, with a warning. Not a substitute for a certified emergency stop.
 #[derive(clap::Args)]
 pub(crate) struct Stop {
     #[command(flatten)]
@@ -51,24 +60,50 @@ impl Of {
 
 pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCode> {
     of.check("stop")?;
-    run(of, Operator::open_to_stop, |node| Question::Stop { node }, global)
+    let mut until = None;
+    loop {
+        let ended = run(&of, Operator::open_to_stop, |node| Question::Stop { node }, global);
+        if until.is_none()
+            && let Err(error) = &ended
+            && let Some(span) = is_asked_again_for(error)
+        {
+            until = Some(Instant::now() + span);
+            if !global.json {
+                let span = span.as_secs();
+                output::warning(format_args!("{error:#}. Asking again for {span} s, should a standby take over"));
+            }
+        }
+        if matches!(ended, Ok(Exit::Done)) || until.is_none_or(|until| until < Instant::now()) {
+            return ended.map(Into::into);
+        }
+        std::thread::sleep(PAUSE);
+    }
+}
+
+/// How long a standby may take over from the manager that is missed, if one is.
+fn is_asked_again_for(error: &anyhow::Error) -> Option<Duration> {
+    match error.downcast_ref::<Ended>()?.name.as_str() {
+        "Silent" | "Broken" => Some(TAKING_OVER),
+        "NoUnit" => Some(APPEARING),
+        _ => None,
+    }
 }
 
 pub(crate) fn reset(Reset { of }: Reset, global: &Global) -> anyhow::Result<ExitCode> {
     of.check("reset")?;
-    run(of, Operator::open, |node| Question::Reset { node }, global)
+    run(&of, Operator::open, |node| Question::Reset { node }, global).map(Into::into)
 }
 
 fn run(
-    of: Of,
+    of: &Of,
     open: fn(&Global, &Need<'_>) -> anyhow::Result<Operator>,
     question: impl FnOnce(Option<String>) -> Question,
     global: &Global,
-) -> anyhow::Result<ExitCode> {
+) -> anyhow::Result<Exit> {
     let need = of.node.as_deref().map_or(Need::Everybody, Need::Node);
     let mut operator = open(global, &need)?;
-    let node = match of.node {
-        Some(node) => Some(nodes::known(&mut operator, &node)?.selector),
+    let node = match &of.node {
+        Some(node) => Some(nodes::known(&mut operator, node)?.selector),
         None => None,
     };
     let mut sum = Sum::default();
@@ -88,7 +123,7 @@ fn run(
     unshown = unshown.or(sum.show(global).err()).filter(|error| error.kind() != ErrorKind::BrokenPipe);
     let unshown = unshown.map(|error| format!("standard output: {error}; {sum}"));
     match (asked, unshown) {
-        (Ok(()), None) => Ok(if sum.missing.is_empty() { Exit::Done } else { Exit::Failed }.into()),
+        (Ok(()), None) => Ok(if sum.missing.is_empty() { Exit::Done } else { Exit::Failed }),
         (Ok(()), Some(text)) => Err(Ended::failed("Output", text)),
         (Err(error), None) if sum.nodes == 0 => Err(error),
         (Err(error), text) => Err(error.context(text.unwrap_or_else(|| sum.to_string()))),

@@ -158,9 +158,9 @@ fn error(error: ControlError) -> anyhow::Error {
                 "no unit answers at {paths}: start it, or be the manager with --as NAME/ID"
             ));
         }
-        ControlError::NotRunning { .. } | ControlError::NotAllowed { .. } | ControlError::Version { .. } => {
-            (Exit::NoUnit, "NoUnit")
-        }
+        ControlError::NotRunning { .. } => (Exit::NoUnit, "NoUnit"),
+        ControlError::NotAllowed { .. } => (Exit::NoUnit, "NotAllowed"),
+        ControlError::Version { .. } => (Exit::NoUnit, "Version"),
         ControlError::Broken(io) if io.kind() == std::io::ErrorKind::UnexpectedEof => {
             return Ended::failed("Broken", "the unit has ended, or closed the connection");
         }

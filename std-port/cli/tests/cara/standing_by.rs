@@ -3,7 +3,7 @@
 use std::fs::{File, read_to_string};
 use std::path::PathBuf;
 
-use cara_std::Unit;
+use cara_std::{Definition, ParametersView, Served, ServiceError, ServiceOptions, Unit};
 use tempfile::TempDir;
 
 use crate::support::{Running, Stage, agv, private_folder, until};
@@ -109,4 +109,31 @@ fn a_standby_without_a_folder_of_state_does_not_start() {
     let ran = crate::support::Ran::of(command.output().unwrap());
     assert_eq!(ran.code, 2, "{}", ran.everything());
     ran.says("a standby needs a folder of state").says("--state");
+}
+
+/// It finds nobody who commands, then the new manager without its vehicle, then the vehicle.
+#[test]
+fn a_stop_reaches_the_vehicle_through_the_standby() {
+    let host = Host::new();
+    let functions = host.vehicle.my_function_list();
+    let wheels = functions.actuator(|| ()).unwrap();
+    let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    functions
+        .add_service(&Definition::parse("halt()").unwrap(), ServiceOptions::new().stops(&wheels), nothing)
+        .unwrap();
+    host.vehicle.publish_my_function_list().unwrap();
+    let mut first = host.start(0);
+    until("it commands", || host.is_led_above(0));
+    let second = host.start(1);
+    until("the other one waits", || host.says(1, "stands by"));
+    first.kill();
+    let stopped = host.stage.ends(0, &["stop", "--all"]);
+    stopped.says("should a standby take over").says("1 of 1 acknowledged");
+    until("it commands", || host.commands(1));
+    // Of one that hangs it is heard no sooner than it is asked.
+    let _first = host.start(0);
+    until("the other one waits", || host.says(0, "stands by"));
+    second.freeze();
+    let stopped = host.stage.ends(0, &["stop", "--all"]);
+    stopped.says("does not answer").says("1 of 1 acknowledged");
 }
