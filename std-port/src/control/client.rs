@@ -342,54 +342,29 @@ impl Client {
         Ok(Answers { client: self })
     }
 
-    /// Sends heartbeats until an answer arrives. Without any, looks now and then whether the unit lives, since the answer of one that
-    /// hangs never comes. Not while beats are due: a look may wait for longer than a held call lasts.
+    /// Sends heartbeats, if they are due, until an answer arrives. An error where the unit hangs: its answer never comes.
     fn await_answer(&mut self) -> Result<(), ControlError> {
-        let (mut pause, mut due, mut was_silent) = (FIRST_LOOK, Instant::now() + FIRST_LOOK, false);
+        let mut look = Look::new();
         while !self.lines.has_more() {
-            let left = match self.beaten {
-                Some(beaten) => BEAT.saturating_sub(beaten.elapsed()),
-                None => due.saturating_duration_since(Instant::now()),
-            };
-            if !left.is_zero() {
-                // What is wrong with the connection is told when it is read.
-                if wait_readable(self.lines.source().as_fd(), left.into()).unwrap_or(true) {
-                    return Ok(());
-                }
-            } else if self.beaten.is_some() {
+            let mut left = look.due.saturating_duration_since(Instant::now());
+            if let Some(beaten) = self.beaten {
+                left = left.min(BEAT.saturating_sub(beaten.elapsed()));
+            }
+            // What is wrong with the connection is told when it is read.
+            if wait_readable(self.lines.source().as_fd(), left.into()).unwrap_or(true) {
+                return Ok(());
+            }
+            if self.beaten.is_some_and(|beaten| beaten.elapsed() >= BEAT) {
                 let _ = self.lines.source().write_all(b"\n");
                 self.beaten = Some(Instant::now());
-            } else {
-                let looked = self.look();
-                if wait_readable(self.lines.source().as_fd(), BEAT.into()).unwrap_or(true) {
-                    return Ok(());
-                }
-                match looked {
-                    Ok(()) => (pause, was_silent) = ((pause * 2).min(LONGEST_LOOK), false),
-                    Err(error) if was_silent => {
-                        self.open = false;
-                        return Err(error);
-                    }
-                    // Once may be a busy host.
-                    Err(_) => (pause, was_silent) = (Duration::ZERO, true),
-                }
-                due = Instant::now() + pause;
+            }
+            if look.due <= Instant::now() && look.finds_silence(self.lines.source(), &self.unit.path) {
+                self.open = false;
+                let RunningUnit { unit, path, .. } = self.unit.clone();
+                return Err(ControlError::Silent { unit, path });
             }
         }
         Ok(())
-    }
-
-    /// An error where the unit hangs: it introduces itself to nobody, or another process has its socket by now.
-    fn look(&self) -> Result<(), ControlError> {
-        let RunningUnit { unit, path, .. } = &self.unit;
-        let pid = |client: &Self| peer_pid(client.lines.source()).ok();
-        match Self::connect_to_stop(path) {
-            Ok(other) if pid(&other) == pid(self) => Ok(()),
-            Ok(_) | Err(ControlError::Silent { .. }) => {
-                Err(ControlError::Silent { unit: unit.clone(), path: path.clone() })
-            }
-            Err(_) => Ok(()),
-        }
     }
 
     fn next_answer(&mut self) -> Result<Option<Answer>, ControlError> {
@@ -401,6 +376,51 @@ impl Client {
             Answer::Failed(failure) => Err(ControlError::Failed(failure)),
             answer => Ok(Some(answer)),
         }
+    }
+}
+
+/// Looks now and then, on a connection of its own, whether a unit that has not answered for a while still introduces itself.
+struct Look {
+    due: Instant,
+    /// Until the next one.
+    pause: Duration,
+    /// Since when it is waited for, once that has begun.
+    since: Option<Instant>,
+    stream: Option<UnixStream>,
+    was_silent: bool,
+}
+
+impl Look {
+    fn new() -> Self {
+        let (due, pause) = (Instant::now() + FIRST_LOOK, FIRST_LOOK);
+        Self { due, pause, since: None, stream: None, was_silent: false }
+    }
+
+    /// Whether the unit was silent twice, or another process has its socket by now. Waits for nothing.
+    fn finds_silence(&mut self, asked: &UnixStream, path: &Path) -> bool {
+        let since = *self.since.get_or_insert_with(Instant::now);
+        let (mut lives, mut replaced) = (false, false);
+        if self.stream.is_none() {
+            match location::dial(path) {
+                Ok(stream) => self.stream = Some(stream),
+                Err(error) => lives = error.kind() != io::ErrorKind::WouldBlock,
+            }
+        }
+        if let Some(stream) = &self.stream {
+            replaced = peer_pid(stream).ok() != peer_pid(asked).ok();
+            lives = !replaced && wait_readable(stream.as_fd(), Duration::ZERO.into()).unwrap_or(true);
+        }
+        if !lives && !replaced && since.elapsed() < HELLO_TIMEOUT {
+            self.due = Instant::now() + BEAT;
+            return false;
+        }
+        // Once may be a busy host.
+        let twice = !lives && self.was_silent;
+        self.was_silent = !lives;
+        self.pause = if lives { (self.pause * 2).min(LONGEST_LOOK) } else { BEAT };
+        self.due = Instant::now() + self.pause;
+        (self.since, self.stream) = (None, None);
+        twice
     }
 }
 

@@ -22,7 +22,7 @@ struct Vehicle {
 }
 
 impl Vehicle {
-    fn join(stage: &Stage) -> Self {
+    fn start(stage: &Stage) -> Self {
         stage.know("agv", 21);
         let unit = stage.vehicle("agv", 21).build().unwrap();
         let made_safe = Arc::<AtomicU32>::default();
@@ -75,9 +75,14 @@ fn a_command_whose_manager_stops_answering_ends() {
     let stage = Stage::with(&["agv-1"]);
     let mut ping = Running::start(stage.command(&["ping", "agv-1", "--count", "400", "--interval", "100ms"]));
     ping.expect("agv-1");
+    let vehicle = Vehicle::start(&stage);
+    let mut held = Running::start(stage.command(&["call", "agv", "--hold", "go"]));
+    until("it moves", || vehicle.lease.is_live());
     stage.freeze_manager();
     until("the ping ends", || ping.has_ended());
-    assert_eq!(ping.end(), 1);
+    until("the hold ends", || held.has_ended());
+    assert!(!vehicle.lease.is_live());
+    assert_eq!((ping.end(), held.end()), (1, 1));
 }
 
 #[test]
@@ -89,7 +94,7 @@ fn an_audit_log_on_a_disk_that_hangs_holds_nothing_up() {
     let text = format!("name = \"manager\"\nid = 1\nfleet = {}\n[control]\naudit = {audit:?}\n", stage.fleet);
     std::fs::write(&file, text).unwrap();
     stage.start_manager_with(&[file.to_str().unwrap()]);
-    Vehicle::join(&stage).is_let_go_and_stopped(&stage);
+    Vehicle::start(&stage).is_let_go_and_stopped(&stage);
 }
 
 #[test]
@@ -101,6 +106,6 @@ fn a_log_that_nobody_reads_holds_nothing_up() {
     let mut command = stage.command(&["node", "--name", "manager", "--id", "1", "--log", "trace"]);
     command.stdout(Stdio::null()).stderr(stderr);
     stage.adopt_manager(&mut command);
-    Vehicle::join(&stage).is_let_go_and_stopped(&stage);
+    Vehicle::start(&stage).is_let_go_and_stopped(&stage);
     drop(unread);
 }
