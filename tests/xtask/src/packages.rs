@@ -3,6 +3,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 
@@ -51,10 +52,14 @@ fn build_program(names: &[String]) -> Result<()> {
     // The versions of others' crates are those that the project is tested with.
     fs::copy(workspace::root().join("Cargo.lock"), program.join("Cargo.lock"))?;
     let target = folder.join("target");
+    let start = Instant::now();
     let printed = Run::cargo().args(["run", "--quiet"]).env("CARGO_TARGET_DIR", &target.to_string_lossy());
     let printed = printed.within(&program).text()?;
     ensure!(printed.trim() == ANSWER, "the program printed {printed:?}");
-    println!("a program of the packages alone printed {ANSWER}");
+    println!(
+        "a program of the packages alone printed {ANSWER}, {:.0} s after `cargo run`",
+        start.elapsed().as_secs_f64()
+    );
     Ok(())
 }
 
