@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::message::{Action, ActionState, ActionStatus, BlockingType};
+use crate::message::{Action, ActionState, ActionStatus};
 
 /// Where an action stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -107,15 +107,15 @@ pub fn startable(entries: &[Entry], at_once: usize) -> Option<usize> {
         if !entry.is_triggered || entry.status.has_ended() {
             continue;
         }
-        let is_hard = entry.action.blocking_type == BlockingType::Hard;
+        let is_alone = entry.action.blocking_type.is_alone();
         if entry.number == 0 {
-            // One that is hard waits for those before it, and those behind it wait for it.
-            let may = runs < at_once && (!is_hard || running == 0 && runs == 0);
+            // One that runs alone waits for those before it, and those behind it wait for it.
+            let may = runs < at_once && (!is_alone || running == 0 && runs == 0);
             if may {
                 return Some(index);
             }
         }
-        if is_hard {
+        if is_alone {
             return None;
         }
         running += 1;
@@ -126,5 +126,5 @@ pub fn startable(entries: &[Entry], at_once: usize) -> Option<usize> {
 /// Whether the vehicle stands still for an action that runs or is due.
 pub fn block_driving(entries: &[Entry]) -> bool {
     let blocks = |entry: &&Entry| entry.is_triggered && !entry.status.has_ended();
-    entries.iter().filter(blocks).any(|entry| entry.action.blocking_type != BlockingType::None)
+    entries.iter().filter(blocks).any(|entry| entry.action.blocking_type.blocks_driving())
 }

@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use serde::Deserialize;
 
-use crate::machine::OWN_ACTIONS;
-use crate::message::{ActionScope, AgvAction, Factsheet, OptionalParameter, Support};
+use crate::machine::INSTANT_ACTIONS;
+use crate::message::{self, ActionScope, AgvAction, Factsheet, OptionalParameter, Support};
 use crate::order::{Capabilities, ID_BYTES};
 use crate::state::{OnBrokerLoss, Policy};
+use crate::version::Version;
 
 /// All of it.
 #[derive(Clone, Debug, Deserialize)]
@@ -99,7 +100,7 @@ const fn probe_timeout() -> u64 {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vda5050 {
-    /// Whole version, as in messages: 2.0.x or 2.1.x.
+    /// Whole version, as in messages: 2.0.x, 2.1.x or, as a preview, 3.0.x.
     pub version: String,
     /// First level of the topics.
     #[serde(default = "interface_name")]
@@ -183,8 +184,8 @@ impl Config {
 
     fn check(&self) -> Result<()> {
         let Self { broker, vda5050, vehicle, .. } = self;
-        let is_known = ["2.0.", "2.1."].iter().any(|version| vda5050.version.starts_with(version));
-        ensure!(is_known, "version {} is not 2.0.x or 2.1.x", vda5050.version);
+        let is_known = ["2.0.", "2.1.", "3.0."].iter().any(|version| vda5050.version.starts_with(version));
+        ensure!(is_known, "version {} is not 2.0.x, 2.1.x or 3.0.x", vda5050.version);
         for level in [&vda5050.interface_name, &vda5050.manufacturer] {
             ensure!(is_level(level, false), "{level:?} cannot be a level of a topic");
         }
@@ -206,6 +207,8 @@ impl Config {
             names.into_iter().all(|name| name.len() <= ID_BYTES),
             "names of actions and maps have 64 bytes at most"
         );
+        let scopes = self.capabilities.actions.values().flat_map(|kind| &kind.scopes);
+        ensure!(!scopes.into_iter().any(|scope| *scope == ActionScope::Zone), "no vehicle has zones");
         let seconds = [vda5050.state_every, vda5050.state_interval, vda5050.visualization_every, vda5050.oldest];
         ensure!(seconds.iter().all(|seconds| (0.0..1e6).contains(seconds)), "intervals are from 0 to 1,000,000 s");
         ensure!((1.0..=30.0).contains(&vda5050.state_every), "state_every is from 1 to 30 s (6.10)");
@@ -234,9 +237,15 @@ impl Config {
         shared_records.clone().unwrap_or_else(|| state_folder.join("vda5050"))
     }
 
+    /// What the vehicles speak.
+    pub fn version(&self) -> Version {
+        Version::of(&self.vda5050.version).unwrap_or_default()
+    }
+
     /// How a vehicle is driven.
     pub fn policy(&self) -> Policy {
         Policy {
+            version: self.version(),
             can: self.capabilities.clone(),
             on_broker_loss: self.vda5050.on_broker_loss,
             resumes_by_itself: self.vda5050.resumes_by_itself,
@@ -257,8 +266,11 @@ impl Config {
         for name in ["manufacturer", "serialNumber"] {
             object.insert(name.into(), "".into());
         }
-        let mut factsheet: Factsheet = serde_json::from_value(value).with_context(|| file.display().to_string())?;
+        let mut factsheet = message::factsheet(value).with_context(|| file.display().to_string())?;
         self.complete(&mut factsheet);
+        if self.version() == Version::V3 {
+            self.complete_third(&mut factsheet).with_context(|| file.display().to_string())?;
+        }
         Ok(factsheet)
     }
 
@@ -275,20 +287,25 @@ impl Config {
         limits.timing.min_state_interval = self.vda5050.state_interval;
         limits.timing.default_state_interval = Some(self.vda5050.state_every);
         let position = if can.needs_positions { Support::Required } else { Support::Supported };
+        let max_speed = match self.version() {
+            Version::V2 => "order.edges.maxSpeed",
+            Version::V3 => "order.edges.maximumSpeed",
+        };
         let known = [
             ("order.nodes.nodePosition", position),
             ("order.nodes.nodePosition.theta", Support::Supported),
             ("order.nodes.nodePosition.allowedDeviationXY", Support::Supported),
             ("order.nodes.nodePosition.allowedDeviationTheta", Support::Supported),
-            ("order.edges.maxSpeed", Support::Supported),
+            (max_speed, Support::Supported),
         ];
         let features = &mut factsheet.protocol_features;
         features.optional_parameters = known
             .map(|(parameter, support)| OptionalParameter { parameter: parameter.into(), support, description: None })
             .into();
-        let own = OWN_ACTIONS.map(|name| (name, vec![ActionScope::Instant]));
+        let own_actions = self.version().rules().own_actions;
+        let own = own_actions.iter().map(|name| (*name, vec![ActionScope::Instant]));
         let of_vehicle = can.actions.iter().map(|(name, kind)| (name.as_str(), kind.scopes.clone()));
-        for (action_type, action_scopes) in own.into_iter().chain(of_vehicle) {
+        for (action_type, action_scopes) in own.chain(of_vehicle) {
             match features.agv_actions.iter_mut().find(|action| action.action_type == action_type) {
                 Some(action) => action.action_scopes = action_scopes,
                 None => {
@@ -298,15 +315,39 @@ impl Config {
             }
         }
         let is_there = |action: &AgvAction| {
-            OWN_ACTIONS.contains(&action.action_type.as_str()) || can.actions.contains_key(&action.action_type)
+            own_actions.contains(&action.action_type.as_str()) || can.actions.contains_key(&action.action_type)
         };
         features.agv_actions.retain(is_there);
+    }
+
+    /// What 3.0 asks beside that: no zones, and what becomes of an action under a pause and a cancelled order.
+    fn complete_third(&self, factsheet: &mut Factsheet) -> Result<()> {
+        ensure!(
+            factsheet.physical_parameters.height_min.is_some(),
+            "3.0 needs physicalParameters.minimumHeight (in 2.x heightMin)"
+        );
+        let specification = &mut factsheet.type_specification;
+        // The names of the model: both may be in the file.
+        ensure!(
+            !specification.navigation_types.iter().any(|kind| kind == "AUTONOMOUS"),
+            "a FREELY_NAVIGATING vehicle reports its planned path in 3.0 (6.8), which the gateway does not know"
+        );
+        specification.supported_zones = Some(Vec::new());
+        let lens = &mut factsheet.protocol_limits.max_array_lens;
+        lens.state_instant_action_states =
+            Some(u32::try_from(self.capabilities.max_actions.saturating_add(INSTANT_ACTIONS)).unwrap_or(u32::MAX));
+        for action in &mut factsheet.protocol_features.agv_actions {
+            let kind = self.capabilities.actions.get(&action.action_type);
+            action.pause_allowed = Some(false);
+            action.cancel_allowed = Some(kind.is_some_and(|kind| kind.can_be_cancelled));
+        }
+        Ok(())
     }
 
     /// The topics of a vehicle, up to its own name.
     pub fn prefix(&self, vehicle: &Vehicle) -> String {
         let Vda5050 { interface_name, manufacturer, .. } = &self.vda5050;
-        format!("{interface_name}/v2/{manufacturer}/{}", vehicle.serial_number)
+        format!("{interface_name}/{}/{manufacturer}/{}", self.version().rules().root, vehicle.serial_number)
     }
 }
 

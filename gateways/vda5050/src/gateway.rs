@@ -13,16 +13,17 @@ use serde::Serialize;
 use crate::config::{self, Config};
 use crate::driver::Driver;
 use crate::errors::{Kind, Refusal};
-use crate::machine::{Machine, Topic};
+use crate::machine::{ERRORS, Machine, Topic};
 use crate::message::{
-    Action, BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, State,
-    Visualization, read,
+    Action, BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, Response,
+    Responses, State, Visualization, ZoneSetMessage, read, write,
 };
 use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, Link, Place};
 use crate::record::{RecordLock, Store};
 use crate::tls::Whose;
 use crate::vehicle::Linked;
+use crate::version::Version;
 
 /// The loop comes round so often.
 const TURN: Duration = Duration::from_millis(20);
@@ -99,6 +100,8 @@ struct Gateway {
     /// When a probe was sent, and when the last one was sent that came back.
     probed: [Instant; 2],
     is_broker_there: bool,
+    /// Header id of the last state.
+    stated: u32,
     /// What topic `connection` says.
     shown: Option<ConnectionState>,
     /// The header id of that, and whether it has come back.
@@ -149,7 +152,7 @@ impl Gateway {
         let (serial_number, shared, header_id) = (vehicle.serial_number.clone(), config.clone(), will.clone());
         let last_words = move || {
             let header = header(&shared, &serial_number, header_id.load(Ordering::SeqCst));
-            json(&Connection { header, connection_state: ConnectionState::Broken })
+            write(shared.version(), &Connection { header, connection_state: ConnectionState::Broken })
         };
         let client_id = format!("{}-{}", config.vda5050.manufacturer, vehicle.serial_number);
         let link = Link::start(Place {
@@ -171,6 +174,7 @@ impl Gateway {
             began: now,
             probed: [now; 2],
             is_broker_there: false,
+            stated: 0,
             shown: None,
             said: 0,
             is_echoed: false,
@@ -254,8 +258,8 @@ impl Gateway {
     fn hear(&mut self, heard: Heard) {
         match heard {
             Heard::Connected(client) => {
-                let topics = ["order", "instantActions", "connection", "cara-probe"];
-                for topic in topics {
+                let of_master = self.config.version().rules().topics;
+                for topic in of_master.iter().chain(&["connection", "cara-probe"]) {
                     let _ = client.try_subscribe(format!("{}/{topic}", self.prefix), QoS::AtMostOnce);
                 }
                 self.client = Some(client);
@@ -282,6 +286,15 @@ impl Gateway {
                     Ok(message) => self.at_once(message),
                     Err(refusal) => self.refuse(&refusal),
                 },
+                "zoneSet" | "responses" => {
+                    let refusals = match topic.as_str() {
+                        "zoneSet" => {
+                            self.checked("zoneSet", is_retained, &bytes).map(|message| unwanted_zones(&message))
+                        }
+                        _ => self.checked("responses", is_retained, &bytes).map(|message| unwanted_responses(&message)),
+                    };
+                    refusals.unwrap_or_else(|refusal| vec![refusal]).iter().for_each(|refusal| self.refuse(refusal));
+                }
                 "connection" => self.hear_connection(&bytes),
                 _ => self.hear_probe(&bytes),
             },
@@ -307,7 +320,7 @@ impl Gateway {
 
     /// What the gateway has said last comes back. Behind that, the last will of an earlier client may come, and is contradicted.
     fn hear_connection(&mut self, bytes: &[u8]) {
-        let Ok(Connection { header, connection_state }) = read(bytes) else { return };
+        let Ok(Connection { header, connection_state }) = read(self.config.version(), bytes) else { return };
         if (header.header_id, Some(connection_state)) == (self.said, self.shown) {
             self.is_echoed = true;
         } else if self.is_echoed {
@@ -327,14 +340,14 @@ impl Gateway {
         if is_retained {
             return Err(refused("a retained message is not of now".into()));
         }
-        let message: T = read(bytes).map_err(|error| refused(error.to_string()))?;
+        let message: T = read(self.config.version(), bytes).map_err(|error| refused(error.to_string()))?;
         let Header { header_id, timestamp, version, manufacturer, serial_number } = message.header();
         let refused = |text: &str| Err(refused(text.to_owned()).about("headerId", header_id));
         if (manufacturer, serial_number) != (&self.config.vda5050.manufacturer, &self.serial_number) {
             return refused("the message is for another vehicle");
         }
-        if !version.starts_with("2.") {
-            return refused("the version is not 2.x");
+        if Version::of(version) != Some(self.config.version()) {
+            return refused("the message is of another version");
         }
         if self.config.vda5050.oldest > 0.0 {
             let Ok(sent) = humantime::parse_rfc3339_weak(timestamp) else {
@@ -439,6 +452,7 @@ impl Gateway {
             return Some(());
         }
         let header = self.header(Topic::State);
+        self.stated = header.header_id;
         self.send("state", QoS::AtMostOnce, false, &State { header, report: report.clone() })?;
         self.reported = Some((report, Instant::now()));
         Some(())
@@ -452,7 +466,8 @@ impl Gateway {
         let Some(Report { agv_position: Some(at), velocity, .. }) = self.driver.machine.report() else { return };
         let header = self.header(Topic::Visualization);
         self.visualized = Instant::now();
-        let message = Visualization { header, agv_position: Some(at), velocity };
+        let reference_state_header_id = (self.config.version() == Version::V3).then_some(self.stated);
+        let message = Visualization { header, reference_state_header_id, agv_position: Some(at), velocity };
         let _ = self.send("visualization", QoS::AtMostOnce, false, &message);
     }
 
@@ -463,7 +478,14 @@ impl Gateway {
     fn send(&self, topic: &str, quality: QoS, is_retained: bool, message: &impl Serialize) -> Option<()> {
         let client = self.client.as_ref()?;
         self.seen.sent.fetch_add(1, Ordering::Relaxed);
-        client.try_publish(format!("{}/{topic}", self.prefix), quality, is_retained, json(message)).ok()
+        client
+            .try_publish(
+                format!("{}/{topic}", self.prefix),
+                quality,
+                is_retained,
+                write(self.config.version(), message),
+            )
+            .ok()
     }
 
     /// Says what `connection` is from now on, and waits until that has arrived. What moves stops, as its heart goes.
@@ -499,10 +521,6 @@ fn lasting(report: &Report) -> Report {
     report
 }
 
-fn json(message: &impl Serialize) -> Vec<u8> {
-    serde_json::to_vec(message).unwrap_or_default()
-}
-
 fn header(config: &Config, serial_number: &str, header_id: u32) -> Header {
     Header {
         header_id,
@@ -518,21 +536,35 @@ fn late(topic: &str, header: &Header) -> Refusal {
     refusal.about("topic", topic).about("headerId", header.header_id)
 }
 
+/// No vehicle has zones: `supportedZones` of the factsheet is empty.
+fn unwanted_zones(message: &ZoneSetMessage) -> Vec<Refusal> {
+    let refusal = Refusal::new(Kind::Unsupported, "the vehicle has no zones").about("topic", "zoneSet");
+    let refusal = refusal.about("headerId", message.header.header_id);
+    vec![refusal.about("zoneSetId", &message.zone_set.zone_set_id).about("zoneSet", "zoneSet")]
+}
+
+/// No vehicle requests anything, so that there is nothing to grant.
+fn unwanted_responses(message: &Responses) -> Vec<Refusal> {
+    let refused = |response: &Response| {
+        let refusal = Refusal::new(Kind::Unsupported, "the vehicle has requested nothing").about("topic", "responses");
+        refusal.about("headerId", message.header.header_id).about("requestId", &response.request_id)
+    };
+    // As many errors as are kept.
+    message.responses.iter().take(ERRORS).map(refused).collect()
+}
+
 trait HasHeader {
     fn header(&self) -> &Header;
 }
 
-impl HasHeader for Order {
-    fn header(&self) -> &Header {
-        &self.header
-    }
+macro_rules! has_header {
+    ($($message:ty),*) => { $(impl HasHeader for $message {
+        fn header(&self) -> &Header {
+            &self.header
+        }
+    })* };
 }
-
-impl HasHeader for InstantActions {
-    fn header(&self) -> &Header {
-        &self.header
-    }
-}
+has_header!(Order, InstantActions, ZoneSetMessage, Responses);
 
 /// The m_unit whose vehicles these are, not started yet.
 pub fn system(config: &Config) -> Result<CommunicationSystem> {

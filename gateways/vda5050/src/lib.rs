@@ -1,7 +1,7 @@
-//! Vehicles of CARA under VDA 5050 2.0 and 2.1.
+//! Vehicles of CARA under VDA 5050 2.0, 2.1 and, as a preview, 3.0.
 //!
 //! [`machine`] decides, and has no I/O: orders ([`order`]), actions ([`actions`]), errors ([`errors`]) and the state that is reported
-//! ([`state`]). [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`], [`stretch`]), [`mqtt`] and [`tls`] are the broker, [`gateway`] joins
+//! ([`state`]), by the rules of a [`version`]. [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`], [`stretch`]), [`mqtt`] and [`tls`] are the broker, [`gateway`] joins
 //! them, [`config`] is its file, [`metrics`] is for Prometheus. `docs/vda5050.md` says what of the standard is there.
 
 pub mod actions;
@@ -19,3 +19,4 @@ pub mod state;
 pub mod stretch;
 pub mod tls;
 pub mod vehicle;
+pub mod version;

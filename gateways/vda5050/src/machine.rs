@@ -9,18 +9,16 @@ use std::time::Duration;
 
 use crate::actions::{Entry, Place, block_driving, startable};
 use crate::errors::{Kind, Refusal};
-use crate::message::{Action, ActionStatus, BlockingType, EStop, Edge, Node, OperatingMode, Order, Report};
+use crate::message::{Action, ActionStatus, EStop, Edge, Header, Node, OperatingMode, Order, Report};
 use crate::order::{Held, Verdict, judge};
 use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status};
 use crate::stretch::{LEGS, fits};
+use crate::version::Version;
 
 /// Most errors that are reported at a time; the oldest go.
 pub const ERRORS: usize = 16;
 /// Most actions at once that are remembered after they have ended; the oldest go.
 pub const INSTANT_ACTIONS: usize = 64;
-/// Actions at once that the gateway itself does.
-pub const OWN_ACTIONS: [&str; 6] =
-    ["startPause", "stopPause", "cancelOrder", "stateRequest", "factsheetRequest", "initPosition"];
 /// How long the vehicle is left alone after it has refused something.
 const BACK_OFF: Duration = Duration::from_millis(500);
 
@@ -159,7 +157,7 @@ impl Machine {
 
     /// A message that cannot be read, or is not for now.
     pub fn refuse(&mut self, refusal: &Refusal) {
-        let error = refusal.error();
+        let error = refusal.error(self.policy.version);
         self.has_changed = true;
         self.is_report_due = true;
         self.record.errors.retain(|known| *known != error);
@@ -185,10 +183,10 @@ impl Machine {
 
     fn judge(&self, order: &Order) -> Result<Verdict, Refusal> {
         let record = &self.record;
-        let refused = |text: &str| Err(Refusal::new(Kind::Order, text));
-        let Some(status) = &self.status else { return refused("the vehicle is not connected") };
+        let refused = |kind: Kind, text: &str| Err(Refusal::new(kind, text));
+        let Some(status) = &self.status else { return refused(Kind::NotAvailable, "the vehicle is not connected") };
         if !is_controlled(status.mode) {
-            return refused("the vehicle is not in an automatic mode");
+            return refused(Kind::NotAvailable, "the vehicle is not in an automatic mode");
         }
         let base = record.nodes.iter().take_while(|node| node.released).last();
         let last_node = (record.last_node_id.as_str(), record.last_node_sequence_id);
@@ -200,11 +198,12 @@ impl Machine {
             is_executing: self.is_executing(),
             decision_point: Some(base.map_or(last_node, |node| (&node.node_id, node.sequence_id))),
             last_node,
+            is_same_content: record.content.is_none_or(|content| content == content_of(order)),
             position: status.position.as_ref().map(|at| (at.x, at.y, at.map_id.as_str())),
         };
-        let verdict = judge(order, &held, &self.policy.can)?;
+        let verdict = judge(order, &held, &self.policy.can, self.policy.version)?;
         if verdict == Verdict::New && record.spent.contains(&order.order_id) {
-            return refused("the order was replaced by a later one");
+            return refused(Kind::Replaced, "the order was replaced by a later one");
         }
         if verdict != Verdict::Duplicate {
             self.has_space(order, verdict)?;
@@ -218,18 +217,22 @@ impl Machine {
         let base = self.record.nodes.iter().filter(|node| node.released && verdict == Verdict::Update).count();
         let nodes = base + order.nodes.len() - skipped;
         if nodes > self.policy.can.max_nodes {
-            return Err(Refusal::new(Kind::Order, "too many nodes with those that are left").about("nodes", nodes));
+            return Err(Refusal::new(Kind::Space, "too many nodes with those that are left").about("nodes", nodes));
         }
         let nodes = order.nodes.iter().skip(skipped).flat_map(|node| &node.actions);
         let sent: Vec<&Action> = nodes.chain(order.edges.iter().flat_map(|edge| &edge.actions)).collect();
-        let stays = |entry: &&Entry| verdict == Verdict::Update && !self.is_in_horizon(entry.place);
+        let keeps_instant = self.policy.version.rules().lists_instant_actions;
+        let stays = |entry: &&Entry| match verdict {
+            Verdict::Update => !self.is_in_horizon(entry.place),
+            _ => keeps_instant && !entry.is_of_order(),
+        };
         let kept: Vec<&Entry> = self.record.actions.iter().filter(stays).collect();
         if let Some(twice) = sent.iter().find(|sent| kept.iter().any(|kept| kept.action.action_id == sent.action_id)) {
             let text = "an action of this id is here";
             return Err(Refusal::new(Kind::Validation, text).about("actionId", &twice.action_id));
         }
         if sent.len() + kept.len() > self.policy.can.max_actions {
-            return Err(Refusal::new(Kind::Order, "too many actions").about("actions", sent.len() + kept.len()));
+            return Err(Refusal::new(Kind::Space, "too many actions").about("actions", sent.len() + kept.len()));
         }
         Ok(())
     }
@@ -246,12 +249,17 @@ impl Machine {
 
     /// Takes an order that was judged: box 9.
     fn take(&mut self, order: Order, verdict: Verdict) {
+        let content = Some(content_of(&order));
         let Order { order_id, order_update_id, zone_set_id, mut nodes, edges, .. } = order;
+        let keeps_instant = self.policy.version.rules().lists_instant_actions;
         if verdict == Verdict::New {
             let number = self.record.number;
-            let old = std::mem::take(&mut self.record);
-            let Record { last_node_id, last_node_sequence_id, is_paused, header_ids, spent, .. } = old;
+            let mut old = std::mem::take(&mut self.record);
+            // That of an instant action lasts until the next one.
+            old.errors.retain(|error| keeps_instant && Kind::is_of_instant_action(error));
+            let Record { errors, last_node_id, last_node_sequence_id, is_paused, header_ids, spent, .. } = old;
             self.record = Record {
+                errors,
                 spent,
                 last_node_id,
                 last_node_sequence_id,
@@ -262,9 +270,13 @@ impl Machine {
                 zone_set_id,
                 ..Record::default()
             };
-            let instant = old.actions.into_iter().filter(|entry| !entry.is_of_order());
+            let (instant, _): (Vec<_>, Vec<_>) = old.actions.into_iter().partition(|entry| !entry.is_of_order());
             self.record.spend(old.order_id);
-            instant.for_each(|entry| self.record.spend_action(entry));
+            if keeps_instant {
+                self.record.actions = instant;
+            } else {
+                instant.into_iter().for_each(|entry| self.record.spend_action(entry));
+            }
         } else {
             let horizon: Vec<Place> = self.record.actions.iter().map(|entry| entry.place).collect();
             let mut stays = horizon.iter().map(|place| !self.is_in_horizon(*place)).collect::<Vec<_>>().into_iter();
@@ -273,10 +285,9 @@ impl Machine {
             self.record.edges.retain(|edge| edge.released);
             // The node at which it is joined is here, and stays as it was sent first.
             nodes.remove(0);
-            let errors = [Kind::Validation, Kind::Order, Kind::OrderUpdate, Kind::NoOrderToCancel].map(Kind::name);
-            self.record.errors.retain(|error| !errors.contains(&error.error_type.as_str()));
+            self.record.errors.retain(|error| !Kind::ends_with_an_order(error));
         }
-        self.record.order_update_id = order_update_id;
+        (self.record.order_update_id, self.record.content) = (order_update_id, content);
         let mut at_edges = edges.iter().map(|edge| (edge.sequence_id, Place::Edge(edge.sequence_id), &edge.actions));
         let mut actions: Vec<_> =
             nodes.iter().map(|node| (node.sequence_id, Place::Node(node.sequence_id), &node.actions)).collect();
@@ -380,6 +391,7 @@ impl Machine {
         if self.status.is_none() {
             self.fail_what_is_late();
         }
+        self.enter(status.mode);
         let floor = status.drive.max(status.action);
         if floor > self.record.number {
             // The record is older than what the vehicle has been told.
@@ -393,6 +405,24 @@ impl Machine {
         }
         self.status = Some(status);
         self.settle();
+    }
+
+    /// What a mode does by itself, beside ending an order.
+    fn enter(&mut self, mode: OperatingMode) {
+        let was_controlled = self.status.as_ref().is_none_or(|status| is_controlled(status.mode));
+        let known = self.record.errors.len();
+        if is_controlled(mode) && !was_controlled {
+            // In 2.x this is one of the errors that last until an order is taken.
+            let name = Kind::NotAvailable.name(Version::V3);
+            self.record.errors.retain(|error| error.error_type != name);
+        }
+        let forgets = self.policy.version.rules().service_forgets_node
+            && matches!(mode, OperatingMode::Service | OperatingMode::Teachin)
+            && !self.record.last_node_id.is_empty();
+        if forgets {
+            self.record.last_node_id.clear();
+        }
+        self.has_changed |= forgets || self.record.errors.len() != known;
     }
 
     /// How many of the nodes that it was told of the vehicle has passed, the one at which it stands included.
@@ -585,7 +615,7 @@ impl Machine {
         }
         let index = startable(&self.record.actions, self.policy.actions_at_once)?;
         let moves = self.is_drive_sent || self.status.as_ref().is_none_or(|status| status.is_driving);
-        if moves && self.record.actions[index].action.blocking_type != BlockingType::None {
+        if moves && self.record.actions[index].action.blocking_type.blocks_driving() {
             // The vehicle stops for it first.
             return None;
         }
@@ -607,7 +637,7 @@ impl Machine {
             }
             let map = |node: &Node| node.node_position.as_ref().map(|at| at.map_id.clone());
             let stands = |(before, at): &(Edge, Node)| {
-                let blocks = at.actions.iter().any(|action| action.blocking_type != BlockingType::None);
+                let blocks = at.actions.iter().any(|action| action.blocking_type.blocks_driving());
                 blocks || !before.actions.is_empty() || !edge.actions.is_empty() || map(at) != map(node)
             };
             if legs.last().is_some_and(stands) || !fits(&legs, edge, node) {
@@ -688,13 +718,21 @@ impl Machine {
     /// The state without its header; `None` while the vehicle is not linked, as nothing is known then.
     pub fn report(&self) -> Option<Report> {
         let status = self.status.as_ref()?;
-        let mut report = self.record.report(status, &self.policy.can.maps, self.is_held);
+        let mut report = self.record.report(status, &self.policy.can.maps, self.policy.version, self.is_held);
         let since = self.driven_at_node.map(|driven| status.driven - driven);
         report.distance_since_last_node = since.filter(|metres| metres.is_finite() && *metres >= 0.0);
-        report.errors.extend(self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why).error()));
-        report.errors.extend(self.alarms.iter().map(Refusal::error));
+        let out_of_service = self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why));
+        report
+            .errors
+            .extend(out_of_service.iter().chain(&self.alarms).map(|refusal| refusal.error(self.policy.version)));
         Some(report)
     }
+}
+
+/// A digest of an order without its header, to see whether the same update comes with other content: FNV-1a, 64 bits.
+fn content_of(order: &Order) -> u64 {
+    let text = serde_json::to_vec(&Order { header: Header::default(), ..order.clone() }).unwrap_or_default();
+    text.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
 }
 
 /// Whether the master's orders count in a mode.

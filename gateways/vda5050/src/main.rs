@@ -15,7 +15,7 @@ use cara_vda5050::gateway::{self, End};
 use cara_vda5050::metrics::{self, Seen};
 use clap::Parser;
 
-/// Vehicles of CARA under VDA 5050 2.0 and 2.1, over an MQTT broker.
+/// Vehicles of CARA under VDA 5050 2.0, 2.1 and, as a preview, 3.0, over an MQTT broker.
 #[derive(Parser)]
 #[command(version)]
 struct Options {

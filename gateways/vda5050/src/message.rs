@@ -1,16 +1,21 @@
-//! The messages of VDA 5050 2.0 and 2.1 (clauses 6.4 to 6.15), as their schemas and the document have them.
+//! The messages of VDA 5050 2.0 and 2.1 (clauses 6.4 to 6.15), as their schemas and the document have them, and those of 3.0.
 //!
-//! One set of structs serves both versions: 2.1 only adds members. Where a schema and its document differ, the document counts:
-//! 2.0's schemas have `allowedDeviationXy` and `actionName`, which are read and never written.
+//! One set of structs serves all versions: 2.1 only adds members to 2.0, and what 3.0 calls otherwise is translated when a message is
+//! [`read`] or [written](write). Where a schema and its document differ, the document counts: 2.0's schemas have `allowedDeviationXy`
+//! and `actionName`, which are read and never written.
 // The members are the standard's, with its names and its meanings.
 #![allow(missing_docs)]
 
 mod factsheet;
+mod third;
 
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 pub use factsheet::*;
+
+use crate::version::Version;
 
 /// A struct of a JSON object: members that must be there; those that may be absent, or null when read.
 macro_rules! object {
@@ -40,7 +45,8 @@ object! {
     /// Topic `order` (6.6.6).
     Order {
         #[serde(flatten)] header: Header,
-        order_id: String, order_update_id: u32, nodes: Vec<Node>, edges: Vec<Edge>; zone_set_id: String
+        order_id: String, order_update_id: u32, nodes: Vec<Node>, edges: Vec<Edge>;
+        zone_set_id: String, order_description: String
     }
     Node {
         node_id: String, sequence_id: u32, released: bool, actions: Vec<Action>;
@@ -48,20 +54,23 @@ object! {
     }
     NodePosition {
         x: f64, y: f64, map_id: String;
-        theta: f64, #[serde(rename = "allowedDeviationXY")] allowed_deviation_xy: f64, allowed_deviation_theta: f64,
+        theta: f64, #[serde(rename = "allowedDeviationXY")] allowed_deviation_xy: Deviation, allowed_deviation_theta: f64,
         map_description: String
     }
     Edge {
         edge_id: String, sequence_id: u32, released: bool, start_node_id: String, end_node_id: String, actions: Vec<Action>;
         edge_description: String, max_speed: f64, max_height: f64, min_height: f64, orientation: f64, orientation_type: String,
-        direction: String, rotation_allowed: bool, max_rotation_speed: f64, length: f64, trajectory: Trajectory, corridor: Corridor
+        direction: String, rotation_allowed: bool, reach_orientation_before_entering: bool, max_rotation_speed: f64, length: f64, trajectory: Trajectory, corridor: Corridor
     }
     Trajectory { degree: i64, knot_vector: Vec<f64>, control_points: Vec<ControlPoint> }
     ControlPoint { x: f64, y: f64; weight: f64 }
-    Corridor { left_width: f64, right_width: f64; corridor_ref_point: CorridorRefPoint }
+    Corridor {
+        left_width: f64, right_width: f64;
+        corridor_ref_point: CorridorRefPoint, release_required: bool, release_loss_behavior: String
+    }
     Action {
         action_type: String, action_id: String, blocking_type: BlockingType;
-        action_description: String, action_parameters: Vec<ActionParameter>
+        action_description: String, action_parameters: Vec<ActionParameter>, retriable: bool
     }
     ActionParameter { key: String, value: Value }
     /// Topic `instantActions` (6.9).
@@ -69,14 +78,20 @@ object! {
     InstantActions { #[serde(flatten)] header: Header, #[serde(alias = "instantActions")] actions: Vec<Action> }
     /// Topic `connection` (6.14).
     Connection { #[serde(flatten)] header: Header, connection_state: ConnectionState }
-    /// Topic `visualization` (6.13).
-    Visualization { #[serde(flatten)] header: Header; agv_position: AgvPosition, velocity: Velocity }
+    /// Topic `visualization` (6.13). The reference is of 3.0, and needed there.
+    Visualization { #[serde(flatten)] header: Header; reference_state_header_id: u32, agv_position: AgvPosition, velocity: Velocity }
+    /// Topic `zoneSet` of 3.0, which is read to be refused.
+    ZoneSetMessage { #[serde(flatten)] header: Header, zone_set: ZoneSet }
+    ZoneSet { zone_set_id: String, map_id: String }
+    /// Topic `responses` of 3.0. Nothing is ever requested.
+    Responses { #[serde(flatten)] header: Header, responses: Vec<Response> }
+    Response { request_id: String, grant_type: GrantType; lease_expiry: String }
     /// Topic `state` (6.10.6), without its header: what is compared to see whether there is news.
     Report {
         order_id: String, order_update_id: u32, last_node_id: String, last_node_sequence_id: u32, driving: bool,
         operating_mode: OperatingMode, node_states: Vec<NodeState>, edge_states: Vec<EdgeState>, action_states: Vec<ActionState>,
         battery_state: BatteryState, errors: Vec<Error>, safety_state: SafetyState;
-        maps: Vec<MapState>, zone_set_id: String, paused: bool, new_base_request: bool, distance_since_last_node: f64,
+        instant_action_states: Vec<ActionState>, maps: Vec<MapState>, zone_set_id: String, paused: bool, new_base_request: bool, distance_since_last_node: f64,
         agv_position: AgvPosition, velocity: Velocity, loads: Vec<Load>, information: Vec<Information>
     }
     /// Topic `state`.
@@ -98,7 +113,7 @@ object! {
     ActionState {
         action_id: String, action_status: ActionStatus; action_type: String, action_description: String, result_description: String
     }
-    BatteryState { battery_charge: f64, charging: bool; battery_voltage: f64, battery_health: f64, reach: f64 }
+    BatteryState { battery_charge: f64, charging: bool; battery_voltage: f64, battery_current: f64, battery_health: f64, reach: f64 }
     Error {
         error_type: String, error_level: ErrorLevel;
         error_references: Vec<Reference>, error_description: String, error_hint: String
@@ -109,21 +124,65 @@ object! {
 }
 
 words! {
-    BlockingType { #[default] None = "NONE", Soft = "SOFT", Hard = "HARD" }
+    /// `SINGLE` is of 3.0: beside driving, and beside no other action.
+    BlockingType { #[default] None = "NONE", Single = "SINGLE", Soft = "SOFT", Hard = "HARD" }
     CorridorRefPoint { #[default] KinematicCenter = "KINEMATICCENTER", Contour = "CONTOUR" }
-    ConnectionState { #[default] Online = "ONLINE", Offline = "OFFLINE", Broken = "CONNECTIONBROKEN" }
+    /// `HIBERNATING` is of 3.0, and never written.
+    ConnectionState {
+        #[default] Online = "ONLINE", Offline = "OFFLINE", Hibernating = "HIBERNATING", Broken = "CONNECTIONBROKEN",
+    }
+    /// `STARTUP` and `INTERVENED` are of 3.0, and never written.
     OperatingMode {
+        Startup = "STARTUP", Intervened = "INTERVENED",
         #[default] Automatic = "AUTOMATIC", Semiautomatic = "SEMIAUTOMATIC", Manual = "MANUAL", Service = "SERVICE", Teachin = "TEACHIN",
     }
     MapStatus { #[default] Enabled = "ENABLED", Disabled = "DISABLED" }
-    /// `PAUSED` is in the documents (6.11) and absent from both schemas; it is never written.
+    /// `PAUSED` is in the documents of 2.x (6.11) and absent from their schemas, `RETRIABLE` is of 3.0; neither is ever written.
     ActionStatus {
         #[default] Waiting = "WAITING", Initializing = "INITIALIZING", Running = "RUNNING", Paused = "PAUSED",
+        Retriable = "RETRIABLE",
         Finished = "FINISHED", Failed = "FAILED",
     }
-    ErrorLevel { #[default] Warning = "WARNING", Fatal = "FATAL" }
+    /// The two in the middle are of 3.0.
+    ErrorLevel { #[default] Warning = "WARNING", Urgent = "URGENT", Critical = "CRITICAL", Fatal = "FATAL" }
+    GrantType { #[default] Granted = "GRANTED", Queued = "QUEUED", Revoked = "REVOKED", Rejected = "REJECTED" }
     InfoLevel { #[default] Info = "INFO", Debug = "DEBUG" }
     EStop { #[default] None = "NONE", AutoAck = "AUTOACK", Manual = "MANUAL", Remote = "REMOTE" }
+}
+
+/// How far from a node's place a vehicle may be: a circle in 2.x, an ellipse in 3.0 (6.6.2.1).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Deviation {
+    /// In metres.
+    Radius(f64),
+    /// In metres, and the angle from the map's x axis to that of `a`.
+    Ellipse { a: f64, b: f64, theta: f64 },
+}
+
+impl Deviation {
+    /// Of the largest circle in it.
+    pub const fn radius(self) -> f64 {
+        match self {
+            Self::Radius(radius) => radius,
+            Self::Ellipse { a, b, .. } => a.min(b),
+        }
+    }
+
+    /// Whether it has a place that is so far from its middle. One without any size has none.
+    pub fn contains(self, x: f64, y: f64) -> bool {
+        let (a, b, theta) = match self {
+            Self::Radius(radius) => return radius > 0.0 && x.hypot(y) <= radius,
+            Self::Ellipse { a, b, theta } => (a, b, theta),
+        };
+        let (along, across) = (x * theta.cos() + y * theta.sin(), y * theta.cos() - x * theta.sin());
+        a > 0.0 && b > 0.0 && (along / a).hypot(across / b) <= 1.0
+    }
+
+    /// Whether it allows anything.
+    pub fn is_some(self) -> bool {
+        self.radius() > 0.0
+    }
 }
 
 impl ActionStatus {
@@ -136,21 +195,61 @@ impl ActionStatus {
 /// The most bytes of a text in a message, but for the values of an action's parameters.
 const TEXT_BYTES: usize = 1_024;
 
-/// Reads a message, with the names that 2.0's schemas have instead of the document's. Texts of it are kept and reported: their length
-/// is bounded.
-pub fn read<T: DeserializeOwned>(text: &[u8]) -> Result<T, serde_json::Error> {
+/// Reads a message of a version, with the names that 2.0's schemas have instead of the document's. Texts of it are kept and reported:
+/// their length is bounded.
+pub fn read<T: DeserializeOwned>(version: Version, text: &[u8]) -> Result<T, serde_json::Error> {
+    let wrong = <serde_json::Error as serde::de::Error>::custom;
     let mut value: Value = serde_json::from_slice(text)?;
     if has_long_text(&value) {
-        return Err(serde::de::Error::custom("a text is longer than 1,024 bytes"));
+        return Err(wrong("a text is longer than 1,024 bytes".to_owned()));
     }
-    each_object(&mut value, &mut |object| {
+    match version {
+        Version::V2 => read_second(&mut value),
+        Version::V3 => third::read(&mut value),
+    }
+    .map_err(wrong)?;
+    serde_json::from_value(value)
+}
+
+/// A message as a version has it.
+pub fn write(version: Version, message: &impl Serialize) -> Vec<u8> {
+    let written = match version {
+        Version::V2 => serde_json::to_vec(message),
+        Version::V3 => serde_json::to_value(message).and_then(|mut value| {
+            third::write(&mut value, "");
+            serde_json::to_vec(&value)
+        }),
+    };
+    written.unwrap_or_default()
+}
+
+/// The factsheet of a file, with the names of 2.x or of 3.0.
+pub fn factsheet(mut value: Value) -> Result<Factsheet, serde_json::Error> {
+    third::read_any(&mut value);
+    serde_json::from_value(value)
+}
+
+/// Members that 3.0 has added to orders and instant actions: in 2.x they say nothing.
+const ADDED: [&str; 5] =
+    ["retriable", "reachOrientationBeforeEntering", "releaseRequired", "releaseLossBehavior", "orderDescription"];
+
+fn read_second(value: &mut Value) -> Result<(), String> {
+    let mut wrong = None;
+    each_object(value, &mut |object| {
         for (schema, document) in [("actionName", "actionType"), ("allowedDeviationXy", "allowedDeviationXY")] {
             if let Some(old) = object.remove(schema) {
                 object.entry(document).or_insert(old);
             }
         }
+        ADDED.iter().for_each(|name| drop(object.remove(*name)));
+        if object.get("blockingType").is_some_and(|word| word == "SINGLE") {
+            wrong = Some("blockingType SINGLE is of 3.0");
+        }
+        if object.get("allowedDeviationXY").is_some_and(Value::is_object) {
+            wrong = Some("allowedDeviationXY is a number in 2.x");
+        }
     });
-    serde_json::from_value(value)
+    wrong.map_or(Ok(()), |why| Err(why.to_owned()))
 }
 
 fn has_long_text(value: &Value) -> bool {

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::errors::{Kind, Refusal};
 use crate::message::{Action, ActionScope, Edge, Node, NodePosition, Order};
+use crate::version::{Rules, Version};
 
 /// The most bytes of a text that goes to the vehicle: identifiers, and the names of actions and maps.
 pub const ID_BYTES: usize = 64;
@@ -69,6 +70,8 @@ pub struct Held<'a> {
     pub decision_point: Option<(&'a str, u32)>,
     /// The last node that was traversed (box 8).
     pub last_node: (&'a str, u32),
+    /// Whether a message with the same ids has the same content.
+    pub is_same_content: bool,
     /// Where it is, if it knows: x, y and map.
     pub position: Option<(f64, f64, &'a str)>,
 }
@@ -84,33 +87,37 @@ pub enum Verdict {
     Update,
 }
 
-/// Judges an order by the boxes of figure 8.
-pub fn judge(order: &Order, held: &Held<'_>, can: &Capabilities) -> Result<Verdict, Refusal> {
+/// Judges an order by the boxes of figure 8, with the numbers of 2.x.
+pub fn judge(order: &Order, held: &Held<'_>, can: &Capabilities, version: Version) -> Result<Verdict, Refusal> {
+    let rules = version.rules();
     // Box 1.
     validate(order)?;
     // Box 2.
     if order.order_id != held.order_id {
-        new(order, held, can)?;
+        new(order, held, can, rules)?;
         executable(order, can)?;
         return Ok(Verdict::New);
     }
-    let verdict = update(order, held)?;
+    let verdict = update(order, held, rules)?;
     if verdict == Verdict::Update {
         executable(order, can)?;
     }
     Ok(verdict)
 }
 
-/// Boxes 3 and 4.
-fn new(order: &Order, held: &Held<'_>, can: &Capabilities) -> Result<(), Refusal> {
+/// Boxes 3 and 4; in 3.0 box 5 as well, as its box 4 is new.
+fn new(order: &Order, held: &Held<'_>, can: &Capabilities, rules: &Rules) -> Result<(), Refusal> {
     if held.is_executing {
-        return Err(Refusal::new(Kind::Order, format!("order {} is still being executed", held.order_id)));
+        return Err(Refusal::new(Kind::OtherOrder, format!("order {} is still being executed", held.order_id)));
+    }
+    if rules.begins_with_update_0 && order.order_update_id != 0 {
+        return Err(Refusal::new(Kind::Replaced, "a new order begins with update 0"));
     }
     let first = &order.nodes[0];
     if is_reachable(first, held, can) {
         return Ok(());
     }
-    Err(Refusal::new(Kind::Order, "the vehicle is not at the first node").about("nodeId", &first.node_id))
+    Err(Refusal::new(Kind::OutOfRange, "the vehicle is not at the first node").about("nodeId", &first.node_id))
 }
 
 /// The vehicle stands on the node, or within its deviation (6.6.1). Where it is counts more than where it was last.
@@ -120,28 +127,28 @@ fn is_reachable(node: &Node, held: &Held<'_>, can: &Capabilities) -> bool {
         // A cancelled order may have ended between two nodes.
         return is_last && !held.is_cancelled;
     };
-    let deviation = at.allowed_deviation_xy.unwrap_or(0.0);
-    let allowed = if is_last {
-        deviation.max(can.tolerance)
-    } else if deviation > 0.0 {
-        deviation
-    } else {
-        can.tolerance
-    };
-    at.map_id == map && (at.x - x).hypot(at.y - y) <= allowed
+    let (x, y) = (x - at.x, y - at.y);
+    let deviation = at.allowed_deviation_xy.filter(|deviation| deviation.is_some());
+    let is_near = x.hypot(y) <= can.tolerance && (is_last || deviation.is_none());
+    at.map_id == map && (is_near || deviation.is_some_and(|deviation| deviation.contains(x, y)))
 }
 
-/// Boxes 5, 6, 3, 7 and 8.
-fn update(order: &Order, held: &Held<'_>) -> Result<Verdict, Refusal> {
-    let wrong = |text: String| Err(Refusal::new(Kind::OrderUpdate, text));
+/// Boxes 5, 6, 3, 7 and 8; in 3.0 6 to 10.
+fn update(order: &Order, held: &Held<'_>, rules: &Rules) -> Result<Verdict, Refusal> {
+    let refused = |kind: Kind, text: &str| Err(Refusal::new(kind, text));
+    let wrong = |text: String| refused(Kind::NoContinuation, &text);
     if order.order_update_id < held.order_update_id {
-        return wrong(format!("update {} has been taken", held.order_update_id));
+        return refused(Kind::Outdated, &format!("update {} has been taken", held.order_update_id));
     }
-    if order.order_update_id == held.order_update_id {
+    let is_same = order.order_update_id == held.order_update_id;
+    if held.is_cancelled && (!is_same || rules.compares_content) {
+        return refused(Kind::Cancelled, "the order was cancelled");
+    }
+    if is_same && rules.compares_content && !held.is_same_content {
+        return refused(Kind::SameUpdate, "this update was sent before, with other content");
+    }
+    if is_same {
         return Ok(Verdict::Duplicate);
-    }
-    if held.is_cancelled {
-        return wrong("the order was cancelled".into());
     }
     if order.zone_set_id.as_deref() != held.zone_set_id {
         return wrong("an update does not change the zone set".into());
@@ -190,9 +197,8 @@ fn validate(order: &Order) -> Result<(), Refusal> {
 
 /// What this vehicle can do (6.6.4.2). Members that change what it does and that it cannot use are refused (6.1.1).
 fn executable(order: &Order, can: &Capabilities) -> Result<(), Refusal> {
-    let wrong = |text: &str| Refusal::new(Kind::Order, text);
     if order.nodes.len() > can.max_nodes {
-        return Err(wrong("too many nodes").about("nodes", order.nodes.len()));
+        return Err(Refusal::new(Kind::Space, "too many nodes").about("nodes", order.nodes.len()));
     }
     for id in [&order.order_id].into_iter().chain(&order.zone_set_id) {
         fits(id)?;
@@ -203,26 +209,32 @@ fn executable(order: &Order, can: &Capabilities) -> Result<(), Refusal> {
     }
     for edge in &order.edges {
         if let Some(member) = unusable(edge) {
-            return Err(wrong("the vehicle cannot use this").about("edgeId", &edge.edge_id).about(member, member));
+            let refusal = Refusal::new(Kind::Unsupported, "the vehicle cannot use this");
+            return Err(refusal.about("edgeId", &edge.edge_id).about(member, member));
         }
         fits(&edge.edge_id).map_err(|refusal| refusal.about("edgeId", &edge.edge_id))?;
     }
     for (action, scope) in actions(order) {
         performable(action, scope, can)?;
+        if action.retriable == Some(true) {
+            let refusal = Refusal::new(Kind::Unsupported, "the vehicle does not try an action again");
+            return Err(refusal.about("actionId", &action.action_id).about("retriable", "retriable"));
+        }
     }
     Ok(())
 }
 
 /// Whether the vehicle has an action where it is asked for.
 pub fn performable<'c>(action: &Action, scope: ActionScope, can: &'c Capabilities) -> Result<&'c ActionKind, Refusal> {
-    let wrong = |text: &str| {
-        Refusal::new(Kind::Order, text).about("actionId", &action.action_id).about("actionType", &action.action_type)
+    let unknown = if scope == ActionScope::Instant { Kind::InstantAction } else { Kind::OrderAction };
+    let wrong = |kind: Kind, text: &str| {
+        Refusal::new(kind, text).about("actionId", &action.action_id).about("actionType", &action.action_type)
     };
     let kind = can.actions.get(&action.action_type).filter(|kind| kind.scopes.contains(&scope));
-    let kind = kind.ok_or_else(|| wrong("the vehicle does not have this action here"))?;
-    fits(&action.action_id).map_err(|_| wrong("the action's id is too long"))?;
+    let kind = kind.ok_or_else(|| wrong(unknown, "the vehicle does not have this action here"))?;
+    fits(&action.action_id).map_err(|_| wrong(Kind::Text, "the action's id is too long"))?;
     if parameters(action).len() > PARAMETER_BYTES {
-        return Err(wrong("the action's parameters are too long"));
+        return Err(wrong(Kind::Text, "the action's parameters are too long"));
     }
     Ok(kind)
 }
@@ -246,15 +258,15 @@ fn fits(id: &str) -> Result<(), Refusal> {
     // Those of a stretch go to the vehicle as lines.
     let fits = id.len() <= ID_BYTES && !id.contains(char::is_control);
     fits.then_some(())
-        .ok_or_else(|| Refusal::new(Kind::Order, "an identifier has 64 bytes at most, and no control characters"))
+        .ok_or_else(|| Refusal::new(Kind::Text, "an identifier has 64 bytes at most, and no control characters"))
 }
 
 fn positioned(node: &Node, can: &Capabilities) -> Result<(), Refusal> {
-    let wrong = |text: &str| Err(Refusal::new(Kind::Order, text));
+    let wrong = |kind: Kind, text: &str| Err(Refusal::new(kind, text));
     match &node.node_position {
-        None if can.needs_positions => wrong("the vehicle needs the node's position"),
+        None if can.needs_positions => wrong(Kind::NoWay, "the vehicle needs the node's position"),
         Some(NodePosition { map_id, .. }) if !can.maps.is_empty() && !can.maps.contains(map_id) => {
-            wrong("the vehicle does not have this map")
+            wrong(Kind::UnknownMap, "the vehicle does not have this map")
         }
         Some(NodePosition { map_id, .. }) => fits(map_id),
         None => Ok(()),
@@ -272,6 +284,7 @@ fn unusable(edge: &Edge) -> Option<&'static str> {
         ("orientation", orientation.is_some()),
         ("direction", direction.is_some()),
         ("rotationAllowed", *rotation_allowed == Some(false)),
+        ("reachOrientationBeforeEntering", edge.reach_orientation_before_entering == Some(true)),
         ("maxRotationSpeed", max_rotation_speed.is_some()),
         ("trajectory", edge.trajectory.is_some()),
         ("corridor", edge.corridor.is_some()),

@@ -9,6 +9,7 @@ use crate::message::{
     OperatingMode, Report, SafetyState, Velocity,
 };
 use crate::order::Capabilities;
+use crate::version::Version;
 
 /// What outlives the program.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -18,6 +19,8 @@ pub struct Record {
     pub order_id: String,
     /// Its last update.
     pub order_update_id: u32,
+    /// A digest of that message; none in a record of a gateway that did not compare.
+    pub content: Option<u64>,
     /// Its zones.
     pub zone_set_id: Option<String>,
     /// It was cancelled, or is being.
@@ -149,6 +152,8 @@ pub enum OnBrokerLoss {
 /// How a gateway behaves.
 #[derive(Clone, Debug)]
 pub struct Policy {
+    /// What it speaks.
+    pub version: Version,
     /// What the vehicle can do.
     pub can: Capabilities,
     /// Without a broker.
@@ -203,13 +208,13 @@ impl Record {
     }
 
     /// What the state says; `is_held` where the vehicle stands because the broker is away.
-    pub fn report(&self, status: &Status, maps: &[String], is_held: bool) -> Report {
+    pub fn report(&self, status: &Status, maps: &[String], version: Version, is_held: bool) -> Report {
         let node = |node: &Node| NodeState {
             node_id: node.node_id.clone(),
             sequence_id: node.sequence_id,
             released: node.released,
             node_description: node.node_description.clone(),
-            node_position: node.node_position.clone(),
+            node_position: node.node_position.clone().map(|at| at.reported(version)),
         };
         let edge = |edge: &Edge| EdgeState {
             edge_id: edge.edge_id.clone(),
@@ -219,10 +224,18 @@ impl Record {
             trajectory: edge.trajectory.clone(),
         };
         let mut errors = self.errors.clone();
-        errors.extend(status.stopped.as_ref().map(|why| Refusal::new(Kind::VehicleStopped, why).error()));
+        errors.extend(status.stopped.as_ref().map(|why| Refusal::new(Kind::VehicleStopped, why).error(version)));
         let has_horizon = self.nodes.iter().any(|node| !node.released);
         let base = self.nodes.iter().filter(|node| node.released).count();
         let map = |id: &String| MapState { map_id: id.clone(), map_version: "1".into(), ..MapState::default() };
+        // Those at once are behind those of the order.
+        let (of_order, at_once): (Vec<&Entry>, Vec<&Entry>) =
+            self.actions.iter().partition(|entry| entry.is_of_order());
+        let states = |entries: &[&Entry]| entries.iter().map(|entry| entry.state()).collect::<Vec<_>>();
+        let (mut action_states, mut instant_action_states) = (states(&of_order), Some(states(&at_once)));
+        if !version.rules().lists_instant_actions {
+            action_states.extend(instant_action_states.take().into_iter().flatten());
+        }
         Report {
             order_id: self.order_id.clone(),
             order_update_id: self.order_update_id,
@@ -233,10 +246,12 @@ impl Record {
             operating_mode: status.mode,
             node_states: self.nodes.iter().map(node).collect(),
             edge_states: self.edges.iter().map(edge).collect(),
-            action_states: self.actions.iter().map(Entry::state).collect(),
+            action_states,
+            instant_action_states,
             battery_state: status.battery.clone(),
             errors,
-            safety_state: SafetyState { e_stop: status.e_stop, field_violation: status.field_violation },
+            safety_state: SafetyState { e_stop: status.e_stop, field_violation: status.field_violation }
+                .reported(version),
             maps: (!maps.is_empty()).then(|| maps.iter().map(map).collect()),
             paused: Some(self.is_paused || is_held),
             new_base_request: Some(has_horizon && base <= 1 && !self.is_cancelled),

@@ -1,6 +1,6 @@
 //! The stretch of an order's released base that the vehicle has at a time, as the flat variables of `vda_drive`.
 
-use crate::message::{Edge, Node};
+use crate::message::{Deviation, Edge, Node};
 
 /// Most edges of a stretch.
 pub const LEGS: usize = 8;
@@ -98,7 +98,8 @@ pub(crate) fn of_order(number: i64, legs: &[(Edge, Node)]) -> (Stretch<'static>,
         map = &at.map_id;
         stretch.positions[3 * index..][..3].copy_from_slice(&[at.x, at.y, at.theta.unwrap_or(0.0)]);
         stretch.given[2 * index..][..2].copy_from_slice(&[true, at.theta.is_some()]);
-        let deviation = [at.allowed_deviation_xy, at.allowed_deviation_theta].map(Option::unwrap_or_default);
+        let radius = at.allowed_deviation_xy.map(Deviation::radius);
+        let deviation = [radius, at.allowed_deviation_theta].map(Option::unwrap_or_default);
         stretch.deviations[2 * index..][..2].copy_from_slice(&deviation);
     }
     let names = |name: fn(&(Edge, Node)) -> &str| legs.iter().map(name).collect::<Vec<_>>().join("\n");

@@ -436,6 +436,7 @@ mod tests {
 
     use super::{Condition, Equipment, answered, status};
     use crate::message::Load;
+    use crate::version::Version;
 
     /// The answer comes once the loop has beaten a few times, and nothing else wakes it.
     #[test]
@@ -460,7 +461,7 @@ mod tests {
         let mut status = status(condition);
         Equipment { load_weights: [nothing; 8], loads: 99, ..Equipment::default() }.report(&mut status);
         let record = crate::state::Record::default();
-        let text = serde_json::to_string(&record.report(&status, &[], false)).unwrap();
+        let text = serde_json::to_string(&record.report(&status, &[], Version::V2, false)).unwrap();
         assert!(!text.contains("null") && status.position.is_none(), "{text}");
         assert_eq!(status.loads.map(|loads| loads.len()), Some(8));
     }

@@ -15,8 +15,9 @@ use std::time::{Duration, Instant};
 
 use cara_processes::network;
 use cara_vda5050::config::Config;
-use cara_vda5050::message::{ActionParameter, Connection, ConnectionState};
+use cara_vda5050::message::{ActionParameter, Connection, ConnectionState, Header, write};
 use cara_vda5050::vehicle::LEASE_MS;
+use cara_vda5050::version::Version;
 use fake::{instant, order};
 use plant::{Messages, Plant, check_messages, master_named, until, vehicle};
 use rumqttc::QoS;
@@ -56,6 +57,66 @@ fn a_master_drives_a_vehicle() {
         assert_eq!([plant.count("act "), plant.count("drive ")], [2, 4], "{:?}", plant.vehicle.lines());
         check_messages(&plant);
     }
+}
+
+/// 3.0, a preview: the same, with its names, its lists and what it offers and the gateway refuses.
+#[test]
+fn a_master_of_3_drives_a_vehicle() {
+    let mut plant = Plant::with("{ do = \"stop\" }", "3.0.0", |_| Default::default());
+    let (factsheet, is_retained) = plant.last("factsheet");
+    assert_eq!(factsheet["typeSpecification"]["mobileRobotKinematics"], "DIFFERENTIAL");
+    assert_eq!(factsheet["typeSpecification"]["supportedZones"], serde_json::json!([]));
+    assert!(!is_retained, "the master heard it as it was sent");
+    let sent = plant.order("o1", 0, 0, "a!:beep=HARD b! c");
+    plant.wait_for("the horizon is left", |plant| {
+        plant.state()["lastNodeId"] == "b" && plant.state()["driving"] == false
+    });
+    assert_eq!((plant.action("o1-a0n-beep"), plant.state()["newBaseRequest"] == true), ("FINISHED".into(), true));
+    plant.publish("order", false, &sent);
+    let mut other = sent.clone();
+    other.nodes[2].node_id = "d".into();
+    other.edges[1].end_node_id = "d".into();
+    plant.publish("order", false, &other);
+    plant.wait_for("it is other", |plant| plant.has_error("SAME_ORDER_UPDATE_ID"));
+    plant.order("o1", 1, 2, "b! c!:pick=HARD d!");
+    plant.wait_for("it picks", |plant| plant.action("o1-c4n-pick") == "RUNNING");
+    plant.instant("startPause", "p1");
+    plant.wait_for("it is paused", |plant| plant.action("p1") == "FINISHED" && plant.state()["paused"] == true);
+    plant.wait_for("it has picked", |plant| plant.action("o1-c4n-pick") == "FINISHED");
+    plant.instant("stopPause", "p2");
+    plant.wait_for_end("o1", "d");
+    let header = &sent.header;
+    let zones = serde_json::json!({"zoneSetId": "s1", "mapId": "hall", "zones": []});
+    plant.publish("zoneSet", false, &with_header(header, "zoneSet", zones));
+    plant.wait_for("there are no zones", |plant| plant.has_error("UNSUPPORTED_PARAMETER"));
+    plant.order("o2", 0, 0, "d! a!");
+    plant.wait_for("it drives", |plant| {
+        plant.state()["driving"] == true && plant.state()["errors"] == Value::Array([].into())
+    });
+    let granted = serde_json::json!([{"requestId": "r1", "grantType": "GRANTED"}]);
+    plant.publish("responses", false, &with_header(header, "responses", granted));
+    plant.wait_for("nothing was requested", |plant| plant.has_error("UNSUPPORTED_PARAMETER"));
+    plant.instant("cancelOrder", "c2");
+    plant.wait_for("it is cancelled", |plant| plant.action("c2") == "FINISHED" && plant.state()["driving"] == false);
+    plant.publish("order", false, &order("o3", 0, 0, "a! b!"));
+    plant.wait_for("an order of 2.1 is refused", |plant| plant.has_error("VALIDATION_FAILURE"));
+    assert_eq!([plant.count("act "), plant.count("drive ")], [2, 4], "{:?}", plant.vehicle.lines());
+    check_messages(&plant);
+    let mut check = std::process::Command::new(env!("CARGO_BIN_EXE_cara-vda5050"));
+    let check = check.arg("--check").arg(plant.file()).env("CARA_KEYS", plant.folder.path().join("keys")).output();
+    assert_eq!(String::from_utf8_lossy(&check.unwrap().stdout), "1 vehicles, VDA 5050 3.0.0\n");
+    // The last will, and what a master that comes later hears.
+    plant.kill_gateway();
+    plant.wait_for("the last will", |plant| plant.connection() == "CONNECTION_BROKEN");
+    let later = Messages::default();
+    let _client = master_named("later", plant.port, later.clone());
+    until("the factsheet is retained", || later.lock().unwrap().get("factsheet").is_some_and(|heard| heard[0].1));
+}
+
+fn with_header(header: &Header, name: &str, value: Value) -> Value {
+    let mut message = serde_json::to_value(header).unwrap();
+    message[name] = value;
+    message
 }
 
 /// Nodes are passed without standing at them, and what the vehicle carries is in its state.
@@ -477,7 +538,8 @@ fn the_example_is_checked_and_mistakes_are_named() {
     std::fs::write(&file, &text).unwrap();
     Config::read(&file).unwrap();
     for (from, to, named) in [
-        ("version = \"2.1.0\"", "version = \"3.0.0\"", "is not 2.0.x or 2.1.x"),
+        ("version = \"2.1.0\"", "version = \"4.0.0\"", "is not 2.0.x, 2.1.x or 3.0.x"),
+        ("scopes = [\"NODE\"]", "scopes = [\"ZONE\"]", "no vehicle has zones"),
         ("manufacturer = \"KIT\"", "manufacturer = \"KIT/1\"", "level of a topic"),
         ("serial_number = \"0001\"", "serial_number = \"../1\"", "serial number"),
         (
@@ -495,5 +557,41 @@ fn the_example_is_checked_and_mistakes_are_named() {
         std::fs::write(&file, text.replace(from, to)).unwrap();
         let error = format!("{:#}", Config::read(&file).unwrap_err());
         assert!(error.contains(named), "{to}: {error}");
+    }
+}
+
+/// One file serves all versions, with the names of 2.x or of 3.0, and `--check` says what 3.0 needs beside that.
+#[test]
+fn the_factsheet_of_3_is_checked() {
+    let (folder, example) = (tempfile::tempdir().unwrap(), Path::new(env!("CARGO_MANIFEST_DIR")));
+    let [config, factsheet] =
+        ["example.toml", "example-factsheet.json"].map(|name| std::fs::read_to_string(example.join(name)).unwrap());
+    let file = folder.path().join("vda5050.toml");
+    let of = |version: &str, factsheet: &str| {
+        std::fs::write(&file, config.replace("2.1.0", version)).unwrap();
+        std::fs::write(folder.path().join("example-factsheet.json"), factsheet).unwrap();
+        Config::read(&file).unwrap().factsheet().map_err(|error| format!("{error:#}"))
+    };
+    for (version, schemas) in [("2.1.0", "2.1.0"), ("3.0.0", "main-0b2ae43")] {
+        let schema = std::fs::read(example.join(format!("schemas/{schemas}/factsheet.schema"))).unwrap();
+        let validator = jsonschema::validator_for(&serde_json::from_slice(&schema).unwrap()).unwrap();
+        let version_of = Version::of(version).unwrap();
+        let mut sent = of(version, &factsheet).unwrap();
+        sent.header = fake::header(version);
+        let text = write(version_of, &sent);
+        validator
+            .validate(&serde_json::from_slice(&text).unwrap())
+            .unwrap_or_else(|error| panic!("{version}: {error}"));
+        let again = of(version, std::str::from_utf8(&text).unwrap()).unwrap();
+        assert_eq!((again.agv_geometry, again.physical_parameters), (sent.agv_geometry, sent.physical_parameters));
+        assert_eq!(again.type_specification, sent.type_specification);
+    }
+    let refused = [("\"heightMin\": 0.4,", "", "minimumHeight"), ("VIRTUAL_LINE_GUIDED", "AUTONOMOUS", "planned path")];
+    for (from, to, named) in refused {
+        assert!(factsheet.contains(from));
+        let spoilt = factsheet.replace(from, to);
+        assert!(of("2.1.0", &spoilt).is_ok());
+        let error = of("3.0.0", &spoilt).unwrap_err();
+        assert!(error.contains(named) && error.contains("example-factsheet.json"), "{error}");
     }
 }

@@ -1,13 +1,14 @@
 //! Random sequences of orders, updates, cancels, pauses, modes, losses, restarts, duplicates and late messages: 2,000 by default,
-//! and as many as `CARA_TEST_SEQUENCES` says.
+//! and as many as `CARA_TEST_SEQUENCES` says; with the rules of 3.0 a quarter of them.
 
 mod fake;
 
 use std::collections::BTreeMap;
 
 use cara_vda5050::machine::Machine;
-use cara_vda5050::message::{Action, ActionStatus, BlockingType, InstantActions, OperatingMode, Order, read};
+use cara_vda5050::message::{Action, ActionStatus, BlockingType, InstantActions, OperatingMode, Order, read, write};
 use cara_vda5050::state::{OnBrokerLoss, Policy, Record};
+use cara_vda5050::version::Version;
 use fake::{Pair, instant, order, policy};
 use serde_json::{Value, json};
 
@@ -30,13 +31,13 @@ struct World {
 }
 
 impl World {
-    fn new(seed: u64) -> Self {
+    fn new(seed: u64, version: Version) -> Self {
         let mut rng = fastrand::Rng::with_seed(seed);
         let on_broker_loss = match rng.bool() {
             true => OnBrokerLoss::Stop,
             false => OnBrokerLoss::FinishBase { seconds: 1.0, metres: 3.0 },
         };
-        let policy = Policy { on_broker_loss, resumes_by_itself: rng.bool(), ..policy() };
+        let policy = Policy { version, on_broker_loss, resumes_by_itself: rng.bool(), ..policy() };
         let (sent, released, order_of_drive) = Default::default();
         Self { rng, pair: Pair::with("a", policy.clone()), policy, sent, names: 0, released, order_of_drive }
     }
@@ -47,9 +48,10 @@ impl World {
         let mut way = format!("{from}!");
         for index in 0..base + horizon {
             let node = self.rng.choice(["a", "b", "c", "d"]).unwrap();
-            let actions = ["", "", "", ":pick=HARD", ":beep", ":drop=SOFT", "/beep", "/pick=SOFT"];
+            let actions = ["", "", "", ":pick=HARD", ":beep", ":drop=SOFT", "/beep", "/pick=SOFT", ":beep=SINGLE"];
+            let actions = &actions[..actions.len() - usize::from(self.policy.version == Version::V2)];
             let released = if index < base - 1 || horizon == 0 { "!" } else { "" };
-            let action = self.rng.choice(actions).unwrap();
+            let action = *self.rng.choice(actions).unwrap();
             let (node_action, edge_action) = if action.starts_with('/') { ("", action) } else { (action, "") };
             way.push_str(&format!(" {node}{released}{node_action}{edge_action}"));
         }
@@ -111,7 +113,10 @@ impl World {
             }
             6 => {
                 self.names += 1;
-                let kind = self.rng.choice(["cancelOrder", "startPause", "stopPause", "beep", "stateRequest"]).unwrap();
+                let kinds =
+                    ["cancelOrder", "startPause", "stopPause", "beep", "stateRequest", "clearInstantActions", "beep"];
+                let of_version = if self.policy.version == Version::V3 { &kinds[..] } else { &kinds[..5] };
+                let kind = *self.rng.choice(of_version).unwrap();
                 let mut message = instant(kind, &format!("i{}", self.names));
                 message.actions[0].blocking_type =
                     self.rng.choice([BlockingType::None, BlockingType::Soft, BlockingType::Hard]).unwrap();
@@ -216,10 +221,15 @@ fn rename(order: &mut Order, update: u32) {
 #[test]
 fn no_action_twice_no_other_base_and_no_order_lost() {
     let sequences = std::env::var("CARA_TEST_SEQUENCES").ok().and_then(|text| text.parse().ok()).unwrap_or(2_000);
+    sequences_of(Version::V2, sequences);
+    sequences_of(Version::V3, sequences / 4);
+}
+
+fn sequences_of(version: Version, sequences: u64) {
     let (mut driven, mut began, mut orders) = (0, 0, 0);
     for seed in 0..sequences {
         let run = std::panic::catch_unwind(|| {
-            let mut world = World::new(seed);
+            let mut world = World::new(seed, version);
             let mut last = String::new();
             for _ in 0..80 {
                 world.act();
@@ -245,10 +255,10 @@ fn no_action_twice_no_other_base_and_no_order_lost() {
             Ok((reached, actions, released)) => {
                 (driven, began, orders) = (driven + reached, began + actions, orders + released);
             }
-            Err(_) => panic!("seed {seed}"),
+            Err(_) => panic!("{version:?}: seed {seed}"),
         }
     }
-    println!("{sequences} sequences: {driven} edges driven, {began} actions run, {orders} nodes released");
+    println!("{version:?}: {sequences} sequences: {driven} edges driven, {began} actions run, {orders} nodes released");
     assert!(driven as u64 > sequences && began as u64 > sequences / 2, "the model does nothing");
 }
 
@@ -287,7 +297,8 @@ fn spoil(value: &mut Value, rng: &mut fastrand::Rng) {
 fn no_message_is_the_end() {
     let mut taken = 0;
     for seed in 0..400 {
-        let mut world = World::new(seed);
+        let version = if seed % 4 == 0 { Version::V3 } else { Version::V2 };
+        let mut world = World::new(seed, version);
         for _ in 0..40 {
             let from = world.node_here();
             let way = world.way(&from);
@@ -297,11 +308,13 @@ fn no_message_is_the_end() {
             for message in [&mut order, &mut action] {
                 (0..world.rng.u8(0..3)).for_each(|_| spoil(message, &mut world.rng));
             }
-            if let Ok(order) = read::<Order>(order.to_string().as_bytes()) {
+            // As a master of this version sends them.
+            let [order, action] = [order, action].map(|message| write(version, &message));
+            if let Ok(order) = read::<Order>(version, &order) {
                 world.pair.machine.order(order.clone());
                 taken += u32::from(world.pair.machine.record().order_id == order.order_id);
             }
-            if let Ok(action) = read(action.to_string().as_bytes()) {
+            if let Ok(action) = read(version, &action) {
                 world.pair.machine.instant_actions(action);
             }
             (0..world.rng.u8(0..8)).for_each(|_| world.pair.turn());
@@ -310,7 +323,7 @@ fn no_message_is_the_end() {
                 at.x = fake::place("a");
             }
         }
-        let text = serde_json::to_string(&world.pair.machine.report()).unwrap();
+        let text = write(version, &world.pair.machine.report());
         assert!(text.len() < 100_000);
     }
     assert!(taken > 300, "{taken}");

@@ -1,20 +1,28 @@
-//! The order handling of the standard (2.0 and 2.1: 6.6, 6.8 to 6.12), box by box.
+//! The order handling of the standard (2.0 and 2.1: 6.6, 6.8 to 6.12; 3.0: 6.1), box by box.
 
 mod fake;
 
 use std::time::Duration;
 
+use cara_vda5050::errors::Kind;
 use cara_vda5050::machine::Machine;
 use cara_vda5050::message::{
-    ActionScope, BlockingType, Corridor, EStop, Edge, NodePosition, OperatingMode, Order, Trajectory,
+    ActionScope, BlockingType, Corridor, Deviation, EStop, Edge, NodePosition, OperatingMode, Order, Trajectory,
 };
 use cara_vda5050::state::{Command, Failure, OnBrokerLoss, Policy};
+use cara_vda5050::version::Version;
 use fake::{Fake, Pair, instant, order, policy};
 
-const VERSIONS: [&str; 2] = ["2.0.0", "2.1.0"];
+const VERSIONS: [&str; 3] = ["2.0.0", "2.1.0", "3.0.0"];
 
-/// A way of preparing, what comes then, and what is reported; `""` is no error.
-type Row = (&'static str, fn(&mut Pair), Order, &'static str);
+/// A way of preparing, what comes then, and what is reported in 2.x and in 3.0.
+type Row = (&'static str, fn(&mut Pair), Order, [Option<Kind>; 2]);
+
+const TAKEN: [Option<Kind>; 2] = [None, None];
+
+const fn refused(kind: Kind) -> [Option<Kind>; 2] {
+    [Some(kind), Some(kind)]
+}
 
 fn nothing(_: &mut Pair) {}
 
@@ -27,6 +35,7 @@ fn half_way(pair: &mut Pair) {
 
 /// Has driven all of a, b.
 fn done(pair: &mut Pair) {
+    pair.machine.order(order("o1", 0, 0, "a!"));
     pair.machine.order(order("o1", 3, 0, "a! b!"));
     pair.turns(10);
     assert_eq!(pair.left(), "");
@@ -66,7 +75,7 @@ fn each_box_of_the_order_handling() {
                 order.nodes.clear();
                 order.edges.clear();
             }),
-            "validationError",
+            refused(Kind::Validation),
         ),
         (
             "an edge too few",
@@ -74,21 +83,36 @@ fn each_box_of_the_order_handling() {
             changed(|order| {
                 order.edges.pop();
             }),
-            "validationError",
+            refused(Kind::Validation),
         ),
-        ("a gap of sequence ids", nothing, changed(|order| order.nodes[1].sequence_id = 4), "validationError"),
-        ("an edge's sequence id", nothing, changed(|order| order.edges[0].sequence_id = 2), "validationError"),
-        ("the highest sequence id", nothing, changed(|order| order.nodes[0].sequence_id = u32::MAX), "validationError"),
+        ("a gap of sequence ids", nothing, changed(|order| order.nodes[1].sequence_id = 4), refused(Kind::Validation)),
+        ("an edge's sequence id", nothing, changed(|order| order.edges[0].sequence_id = 2), refused(Kind::Validation)),
+        (
+            "the highest sequence id",
+            nothing,
+            changed(|order| order.nodes[0].sequence_id = u32::MAX),
+            refused(Kind::Validation),
+        ),
         (
             "an edge from elsewhere",
             nothing,
             changed(|order| order.edges[0].start_node_id = "x".into()),
-            "validationError",
+            refused(Kind::Validation),
         ),
-        ("an edge to elsewhere", nothing, changed(|order| order.edges[1].end_node_id = "x".into()), "validationError"),
-        ("no base", nothing, order("o1", 0, 0, "a b c"), "validationError"),
-        ("a base behind the horizon", nothing, order("o1", 0, 0, "a! b c!"), "validationError"),
-        ("an edge ahead of its node", nothing, changed(|order| order.edges[1].released = true), "validationError"),
+        (
+            "an edge to elsewhere",
+            nothing,
+            changed(|order| order.edges[1].end_node_id = "x".into()),
+            refused(Kind::Validation),
+        ),
+        ("no base", nothing, order("o1", 0, 0, "a b c"), refused(Kind::Validation)),
+        ("a base behind the horizon", nothing, order("o1", 0, 0, "a! b c!"), refused(Kind::Validation)),
+        (
+            "an edge ahead of its node",
+            nothing,
+            changed(|order| order.edges[1].released = true),
+            refused(Kind::Validation),
+        ),
         (
             "an action id twice",
             nothing,
@@ -96,30 +120,40 @@ fn each_box_of_the_order_handling() {
                 order.nodes = fake::order("o1", 0, 0, "a!:pick b!:pick c").nodes;
                 order.nodes[1].actions[0].action_id = order.nodes[0].actions[0].action_id.clone();
             }),
-            "validationError",
+            refused(Kind::Validation),
         ),
-        ("one node", nothing, order("o1", 0, 0, "a!"), ""),
+        ("one node", nothing, order("o1", 0, 0, "a!"), TAKEN),
         // What the vehicle cannot do (6.6.4.2).
-        ("an action that it does not have", nothing, order("o1", 0, 0, "a!:dance b!"), "orderError"),
-        ("an id that is too long", nothing, changed(|order| order.edges[0].edge_id = "e".repeat(65)), "orderError"),
-        ("no position", nothing, changed(|order| order.nodes[1].node_position = None), "orderError"),
-        ("a trajectory", nothing, edge(|edge| edge.trajectory = Some(Trajectory::default())), "orderError"),
-        ("a corridor", nothing, edge(|edge| edge.corridor = Some(Corridor::default())), "orderError"),
-        ("an orientation", nothing, edge(|edge| edge.orientation = Some(0.0)), "orderError"),
-        ("a direction", nothing, edge(|edge| edge.direction = Some("left".into())), "orderError"),
-        ("a height", nothing, edge(|edge| edge.max_height = Some(2.0)), "orderError"),
-        ("a least height", nothing, edge(|edge| edge.min_height = Some(2.0)), "orderError"),
-        ("no rotation", nothing, edge(|edge| edge.rotation_allowed = Some(false)), "orderError"),
-        ("a speed of rotation", nothing, edge(|edge| edge.max_rotation_speed = Some(1.0)), "orderError"),
+        ("an action that it does not have", nothing, order("o1", 0, 0, "a!:dance b!"), refused(Kind::OrderAction)),
+        (
+            "an id that is too long",
+            nothing,
+            changed(|order| order.edges[0].edge_id = "e".repeat(65)),
+            refused(Kind::Text),
+        ),
+        ("no position", nothing, changed(|order| order.nodes[1].node_position = None), refused(Kind::NoWay)),
+        (
+            "a trajectory",
+            nothing,
+            edge(|edge| edge.trajectory = Some(Trajectory::default())),
+            refused(Kind::Unsupported),
+        ),
+        ("a corridor", nothing, edge(|edge| edge.corridor = Some(Corridor::default())), refused(Kind::Unsupported)),
+        ("an orientation", nothing, edge(|edge| edge.orientation = Some(0.0)), refused(Kind::Unsupported)),
+        ("a direction", nothing, edge(|edge| edge.direction = Some("left".into())), refused(Kind::Unsupported)),
+        ("a height", nothing, edge(|edge| edge.max_height = Some(2.0)), refused(Kind::Unsupported)),
+        ("a least height", nothing, edge(|edge| edge.min_height = Some(2.0)), refused(Kind::Unsupported)),
+        ("no rotation", nothing, edge(|edge| edge.rotation_allowed = Some(false)), refused(Kind::Unsupported)),
+        ("a speed of rotation", nothing, edge(|edge| edge.max_rotation_speed = Some(1.0)), refused(Kind::Unsupported)),
         (
             "rotation, a speed, a length",
             nothing,
             edge(|edge| {
                 (edge.rotation_allowed, edge.max_speed, edge.length) = (Some(true), Some(1.0), Some(2.0));
             }),
-            "",
+            TAKEN,
         ),
-        ("a speed of nothing", nothing, edge(|edge| edge.max_speed = Some(0.0)), "orderError"),
+        ("a speed of nothing", nothing, edge(|edge| edge.max_speed = Some(0.0)), refused(Kind::Unsupported)),
         (
             "from the last node, after it was moved by hand",
             |pair| {
@@ -128,13 +162,14 @@ fn each_box_of_the_order_handling() {
                 pair.machine.status(pair.vehicle.status.clone());
             },
             order("o2", 0, 0, "b! c!"),
-            "orderError",
+            refused(Kind::OutOfRange),
         ),
-        ("too many nodes", nothing, order("o1", 0, 0, &"a! ".repeat(21)), "orderError"),
-        ("too many actions", nothing, order("o1", 0, 0, &"a!:pick,beep,drop ".repeat(7)), "orderError"),
+        ("too many nodes", nothing, order("o1", 0, 0, &"a! ".repeat(21)), refused(Kind::Space)),
+        ("too many actions", nothing, order("o1", 0, 0, &"a!:pick,beep,drop ".repeat(7)), refused(Kind::Space)),
         // Boxes 2, 3 and 4: a new order.
-        ("a new order", nothing, order("o1", 7, 0, "a! b!"), ""),
-        ("while one is executed", half_way, order("o2", 0, 0, "b! c!"), "orderError"),
+        ("a new order", nothing, order("o1", 0, 0, "a! b!"), TAKEN),
+        ("a new order with an update", nothing, order("o1", 7, 0, "a! b!"), [None, Some(Kind::Replaced)]),
+        ("while one is executed", half_way, order("o2", 0, 0, "b! c!"), refused(Kind::OtherOrder)),
         (
             "while an action runs, with no node left",
             |pair| {
@@ -142,7 +177,7 @@ fn each_box_of_the_order_handling() {
                 pair.tell();
             },
             order("o2", 0, 0, "a! b!"),
-            "orderError",
+            refused(Kind::OtherOrder),
         ),
         (
             "in another mode",
@@ -151,24 +186,29 @@ fn each_box_of_the_order_handling() {
                 pair.machine.status(pair.vehicle.status.clone());
             },
             order("o1", 0, 0, "a! b!"),
-            "orderError",
+            refused(Kind::NotAvailable),
         ),
-        ("of a vehicle without a link", |pair| pair.machine.vehicle_lost(), order("o1", 0, 0, "a! b!"), "orderError"),
-        ("behind one", done, order("o2", 0, 0, "b! c!"), ""),
-        ("far away", nothing, order("o1", 0, 0, "c! b!"), "orderError"),
+        (
+            "of a vehicle without a link",
+            |pair| pair.machine.vehicle_lost(),
+            order("o1", 0, 0, "a! b!"),
+            refused(Kind::NotAvailable),
+        ),
+        ("behind one", done, order("o2", 0, 0, "b! c!"), TAKEN),
+        ("far away", nothing, order("o1", 0, 0, "c! b!"), refused(Kind::OutOfRange)),
         (
             "within its deviation",
             nothing,
             changed(|order| {
                 let at = NodePosition {
                     x: 1.9,
-                    allowed_deviation_xy: Some(2.0),
+                    allowed_deviation_xy: Some(Deviation::Radius(2.0)),
                     map_id: "hall".into(),
                     ..NodePosition::default()
                 };
                 order.nodes[0].node_position = Some(at);
             }),
-            "",
+            TAKEN,
         ),
         (
             "on another map",
@@ -176,14 +216,14 @@ fn each_box_of_the_order_handling() {
             changed(|order| {
                 order.nodes[0].node_position.as_mut().unwrap().map_id = "roof".into();
             }),
-            "orderError",
+            refused(Kind::OutOfRange),
         ),
-        ("one that was replaced", replaced, order("o1", 9, 0, "a! b!"), "orderError"),
+        ("one that was replaced", replaced, order("o1", 9, 0, "a! b!"), refused(Kind::Replaced)),
         // Boxes 5 and 6.
-        ("a lower update", done, order("o1", 2, 2, "b! c!"), "orderUpdateError"),
-        ("the same again", done, order("o1", 3, 0, "a! b!"), ""),
-        ("the same update with other content", done, order("o1", 3, 2, "b! c!"), ""),
-        ("the same while it drives", half_way, order("o1", 0, 0, "a! b! c"), ""),
+        ("a lower update", done, order("o1", 2, 2, "b! c!"), refused(Kind::Outdated)),
+        ("the same again", done, order("o1", 3, 0, "a! b!"), TAKEN),
+        ("the same update with other content", done, order("o1", 3, 2, "b! c!"), [None, Some(Kind::SameUpdate)]),
+        ("the same while it drives", half_way, order("o1", 0, 0, "a! b! c"), TAKEN),
         (
             "a lower update while it drives",
             |pair| {
@@ -191,15 +231,20 @@ fn each_box_of_the_order_handling() {
                 pair.machine.order(order("o1", 2, 2, "b! c! d"));
             },
             order("o1", 1, 2, "b! c!"),
-            "orderUpdateError",
+            refused(Kind::Outdated),
         ),
         // Box 7.
-        ("from the decision point", half_way, order("o1", 1, 2, "b! c!"), ""),
-        ("with another horizon", half_way, order("o1", 1, 2, "b! d e"), ""),
-        ("without a horizon", half_way, order("o1", 5, 2, "b!"), ""),
-        ("from an earlier node", half_way, order("o1", 1, 0, "a! b! c!"), "orderUpdateError"),
-        ("from the horizon", half_way, order("o1", 1, 4, "c! d!"), "orderUpdateError"),
-        ("from the right node at another sequence id", half_way, order("o1", 1, 6, "b! c!"), "orderUpdateError"),
+        ("from the decision point", half_way, order("o1", 1, 2, "b! c!"), TAKEN),
+        ("with another horizon", half_way, order("o1", 1, 2, "b! d e"), TAKEN),
+        ("without a horizon", half_way, order("o1", 5, 2, "b!"), TAKEN),
+        ("from an earlier node", half_way, order("o1", 1, 0, "a! b! c!"), refused(Kind::NoContinuation)),
+        ("from the horizon", half_way, order("o1", 1, 4, "c! d!"), refused(Kind::NoContinuation)),
+        (
+            "from the right node at another sequence id",
+            half_way,
+            order("o1", 1, 6, "b! c!"),
+            refused(Kind::NoContinuation),
+        ),
         (
             "with another zone set",
             half_way,
@@ -208,24 +253,26 @@ fn each_box_of_the_order_handling() {
                 update.zone_set_id = Some("zones".into());
                 update
             },
-            "orderUpdateError",
+            refused(Kind::NoContinuation),
         ),
         // Box 8.
-        ("from the last node", done, order("o1", 4, 2, "b! c!"), ""),
-        ("from another node", done, order("o1", 4, 2, "c! d!"), "orderUpdateError"),
+        ("from the last node", done, order("o1", 4, 2, "b! c!"), TAKEN),
+        ("from another node", done, order("o1", 4, 2, "c! d!"), refused(Kind::NoContinuation)),
         // Behind cancelOrder (6.6.3.1).
-        ("an update of a cancelled order", cancelled, order("o1", 1, 2, "b! c!"), "orderUpdateError"),
-        ("a new order behind a cancelled one", cancelled, order("o2", 0, 0, "b! c!"), ""),
+        ("an update of a cancelled order", cancelled, order("o1", 1, 2, "b! c!"), refused(Kind::Cancelled)),
+        ("a copy of a cancelled order", cancelled, order("o1", 0, 0, "a! b! c"), [None, Some(Kind::Cancelled)]),
+        ("a new order behind a cancelled one", cancelled, order("o2", 0, 0, "b! c!"), TAKEN),
     ];
     for version in VERSIONS {
         for (name, prepare, order, expected) in &rows {
-            let mut pair = Pair::new("a");
+            let of = Version::of(version).unwrap();
+            let mut pair = Pair::of("a", of);
             prepare(&mut pair);
             let before = pair.machine.record().clone();
             let mut order = order.clone();
             order.header.version = version.into();
             pair.machine.order(order.clone());
-            let expected: Vec<&str> = expected.split_whitespace().collect();
+            let expected: Vec<&str> = expected[of as usize].iter().map(|kind| kind.name(of)).collect();
             assert_eq!(pair.errors(), expected, "{version}: {name}");
             let after = pair.machine.record();
             if let Some(error) = after.errors.first() {
@@ -268,6 +315,8 @@ fn an_order_is_driven_node_by_node_and_not_beyond_its_base() {
 fn blocking_types_decide_what_runs_beside_what() {
     // The way, and what the log of the vehicle is: nodes and actions as they begin.
     let rows = [
+        ("a!:beep=SINGLE b!", "beep b"),
+        ("a!:beep,pick=SINGLE b!", "beep b|pick"),
         ("a!:beep=HARD b!", "beep|b"),
         ("a!:beep=SOFT b!", "beep|b"),
         ("a!:beep b!", "beep b"),
@@ -303,9 +352,13 @@ fn actions_run_side_by_side_where_the_vehicle_can() {
         entry
     };
     let (none, soft, hard) = (BlockingType::None, BlockingType::Soft, BlockingType::Hard);
+    let single = BlockingType::Single;
     // (actions with whether they run, how many at once, the next, whether it stands)
     type Case<'c> = (&'c [(BlockingType, u64)], usize, Option<usize>, bool);
-    let rows: [Case<'_>; 9] = [
+    let rows: [Case<'_>; 12] = [
+        (&[(none, 1), (single, 0)], 4, None, false),
+        (&[(single, 1), (none, 0)], 4, None, false),
+        (&[(single, 0)], 4, Some(0), false),
         (&[(none, 0), (soft, 0)], 4, Some(0), true),
         (&[(none, 1), (soft, 0)], 4, Some(1), true),
         (&[(none, 1), (soft, 0)], 1, None, true),
@@ -735,26 +788,10 @@ fn long_texts_are_neither_kept_nor_reported() {
         pair.machine.instant_actions(message.clone());
         assert_eq!((pair.errors(), pair.actions().len()), (vec!["validationError"], 0));
         let text = serde_json::to_vec(&message).unwrap();
-        let read = cara_vda5050::message::read::<cara_vda5050::message::InstantActions>(&text);
+        let read = cara_vda5050::message::read::<cara_vda5050::message::InstantActions>(Version::V2, &text);
         assert_eq!(read.is_err(), id == long, "a parameter's value is the application's");
     }
     let mut pair = Pair::new("a");
     pair.machine.order(order(&"o".repeat(65), 0, 0, "a! b!"));
     assert_eq!(pair.errors(), ["orderError"]);
-}
-
-#[test]
-fn a_vehicle_out_of_service_says_so_and_does_nothing() {
-    let mut pair = Pair::new("a");
-    pair.machine = Machine::out_of_service("damaged", policy(), pair.now);
-    pair.machine.broker(true, pair.now);
-    pair.machine.status(pair.vehicle.status.clone());
-    pair.machine.order(order("o1", 0, 0, "a! b!"));
-    pair.machine.instant_actions(instant("beep", "i1"));
-    pair.turns(10);
-    assert_eq!((pair.vehicle.reached.len(), pair.vehicle.began.len()), (0, 0));
-    let report = pair.machine.report().unwrap();
-    assert_eq!(report.operating_mode, OperatingMode::Service);
-    let fatal = |error: &&cara_vda5050::message::Error| error.error_level == cara_vda5050::message::ErrorLevel::Fatal;
-    assert_eq!(report.errors.iter().find(fatal).unwrap().error_type, "outOfService");
 }

@@ -12,10 +12,10 @@ use std::time::Duration;
 use cara_vda5050::driver::{Driver, Vehicle};
 use cara_vda5050::errors::{Kind, Refusal};
 use cara_vda5050::machine::{Machine, Topic};
-use cara_vda5050::message::Order;
+use cara_vda5050::message::{OperatingMode, Order};
 use cara_vda5050::record::{Keep, RecordLock, Store};
 use cara_vda5050::state::{Command, Failure, Record, Status};
-use fake::{Fake, instant, order, policy};
+use fake::{Fake, Pair, instant, order, policy};
 
 /// A store that is killed at a write.
 struct Dying {
@@ -354,4 +354,20 @@ fn a_vehicle_that_is_not_heard_of_counts_as_lost() {
     driver.vehicle_mut().status = Some(Fake::at("a").status);
     driver.turn(Duration::from_secs(4)).unwrap();
     assert!(!driver.is_silent() && driver.machine.is_linked());
+}
+
+#[test]
+fn a_vehicle_out_of_service_says_so_and_does_nothing() {
+    let mut pair = Pair::new("a");
+    pair.machine = Machine::out_of_service("damaged", policy(), pair.now);
+    pair.machine.broker(true, pair.now);
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.machine.order(order("o1", 0, 0, "a! b!"));
+    pair.machine.instant_actions(instant("beep", "i1"));
+    pair.turns(10);
+    assert_eq!((pair.vehicle.reached.len(), pair.vehicle.began.len()), (0, 0));
+    let report = pair.machine.report().unwrap();
+    assert_eq!(report.operating_mode, OperatingMode::Service);
+    let fatal = |error: &&cara_vda5050::message::Error| error.error_level == cara_vda5050::message::ErrorLevel::Fatal;
+    assert_eq!(report.errors.iter().find(fatal).unwrap().error_type, "outOfService");
 }

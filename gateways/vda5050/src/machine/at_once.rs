@@ -1,11 +1,12 @@
 //! Actions at once (6.8, 6.9): those of the gateway itself, and when those of the vehicle are given up.
 
-use super::{INSTANT_ACTIONS, Machine, OWN_ACTIONS, is_controlled};
+use super::{INSTANT_ACTIONS, Machine, is_controlled};
 use crate::actions::{Entry, Place};
 use crate::errors::{Kind, Refusal};
-use crate::message::{Action, ActionScope, ActionStatus, InstantActions};
+use crate::message::{Action, ActionScope, ActionStatus, BlockingType, InstantActions};
 use crate::order::{ID_BYTES, PARAMETER_BYTES, parameters, performable};
 use crate::state::{Failure, copy_of};
+use crate::version::Version;
 
 impl Machine {
     /// A message on topic `instantActions`. A copy of one changes nothing.
@@ -21,16 +22,19 @@ impl Machine {
                 continue;
             }
             if self.record.actions.len() >= self.policy.can.max_actions + INSTANT_ACTIONS {
-                self.refuse(&Refusal::new(Kind::Order, "too many actions").about("actionId", &action.action_id));
+                self.refuse(&Refusal::new(Kind::Space, "too many actions").about("actionId", &action.action_id));
                 continue;
             }
             self.has_changed = true;
             self.is_report_due = true;
             let mut entry = Entry { message: stamp.clone(), ..Entry::new(action, Place::Instant) };
             self.begin(&mut entry);
+            if entry.status != ActionStatus::Failed {
+                self.record.errors.retain(|error| !Kind::is_of_instant_action(error));
+            }
             self.record.actions.push(entry);
         }
-        self.forget_instant_actions();
+        self.forget_instant_actions(INSTANT_ACTIONS);
         self.settle();
     }
 
@@ -41,7 +45,7 @@ impl Machine {
         if self.record.spent.contains(&copy_of(id, stamp)) {
             return false;
         }
-        let is_own = OWN_ACTIONS.contains(&action.action_type.as_str());
+        let is_own = self.policy.version.rules().own_actions.contains(&action.action_type.as_str());
         let known = self.record.actions.iter().position(|entry| entry.action.action_id == *id);
         if let Some(known) = known {
             let entry = &self.record.actions[known];
@@ -66,6 +70,7 @@ impl Machine {
     fn begin(&mut self, entry: &mut Entry) {
         let finished = (ActionStatus::Finished, None);
         let running = (ActionStatus::Running, None);
+        let rules = self.policy.version.rules();
         let (status, result) = match entry.action.action_type.as_str() {
             "startPause" => {
                 self.record.is_paused = true;
@@ -73,7 +78,7 @@ impl Machine {
             }
             "stopPause" => {
                 self.record.is_paused = false;
-                self.record.errors.retain(|error| error.error_type != Kind::BrokerLost.name());
+                self.record.errors.retain(|error| !Kind::BrokerLost.is_of(error));
                 finished
             }
             "cancelOrder" => return self.cancel(entry),
@@ -82,11 +87,13 @@ impl Machine {
                 self.is_factsheet_due = true;
                 finished
             }
-            "initPosition" if self.is_executing() => {
-                (ActionStatus::Failed, Some("an order is being executed".to_owned()))
-            }
+            "initPosition" if self.is_executing() => self.cannot(&entry.action, "an order is being executed"),
             "initPosition" if self.is_linked() => running,
-            "initPosition" => (ActionStatus::Failed, Some("the vehicle is not connected".to_owned())),
+            "initPosition" => self.cannot(&entry.action, "the vehicle is not connected"),
+            "clearInstantActions" if rules.lists_instant_actions => {
+                self.forget_instant_actions(0);
+                finished
+            }
             _ => match self.performs(&entry.action) {
                 Ok(()) => {
                     entry.is_triggered = true;
@@ -101,21 +108,38 @@ impl Machine {
         (entry.status, entry.result) = (status, result);
     }
 
+    /// 3.0 wants an error as well (6.2.1).
+    fn cannot(&mut self, action: &Action, why: &str) -> (ActionStatus, Option<String>) {
+        if self.policy.version == Version::V3 {
+            let refusal = Refusal::new(Kind::InstantAction, why).about("topic", "instantActions");
+            self.refuse(&refusal.about("actionId", &action.action_id));
+        }
+        (ActionStatus::Failed, Some(why.to_owned()))
+    }
+
     /// Whether the vehicle does this at once: it does nothing late.
     fn performs(&self, action: &Action) -> Result<(), Refusal> {
-        let refused = |text: &str| Err(Refusal::new(Kind::Order, text).about("actionId", &action.action_id));
+        let refused = |text: &str| Err(Refusal::new(Kind::InstantAction, text).about("actionId", &action.action_id));
+        let is_none = action.blocking_type == BlockingType::None && action.retriable != Some(true);
         match &self.status {
             None => refused("the vehicle is not connected"),
             Some(status) if !is_controlled(status.mode) => refused("the vehicle is not in an automatic mode"),
+            Some(_) if self.policy.version.rules().instant_is_none && !is_none => {
+                refused("an action at once blocks nothing, and is not tried again")
+            }
             Some(_) => performable(action, ActionScope::Instant, &self.policy.can).map(drop),
         }
     }
 
     /// `cancelOrder` (6.6.3): what waits fails, what runs is ended where that can be; then the vehicle stands, and the order is over.
     fn cancel(&mut self, entry: &mut Entry) {
-        if !self.record.is_order_open() {
+        let named = entry.action.action_parameters.iter().flatten().find(|parameter| parameter.key == "orderId");
+        let is_other = self.policy.version.rules().cancels_by_name
+            && named.is_some_and(|named| named.value.as_str() != Some(&self.record.order_id));
+        if !self.record.is_order_open() || is_other {
             entry.status = ActionStatus::Failed;
-            let refusal = Refusal::new(Kind::NoOrderToCancel, "there is no order");
+            let text = if is_other { "another order is here" } else { "there is no order" };
+            let refusal = Refusal::new(Kind::NoOrderToCancel, text);
             return self.refuse(&refusal.about("actionId", &entry.action.action_id).about("topic", "instantActions"));
         }
         entry.status = ActionStatus::Running;
@@ -143,10 +167,10 @@ impl Machine {
         }
     }
 
-    fn forget_instant_actions(&mut self) {
+    /// Those that have ended, but for so many.
+    fn forget_instant_actions(&mut self, left: usize) {
         let is_old = |entry: &Entry| !entry.is_of_order() && entry.status.has_ended();
-        let mut too_many =
-            self.record.actions.iter().filter(|entry| is_old(entry)).count().saturating_sub(INSTANT_ACTIONS);
+        let mut too_many = self.record.actions.iter().filter(|entry| is_old(entry)).count().saturating_sub(left);
         let (gone, kept) = std::mem::take(&mut self.record.actions).into_iter().partition(|entry| {
             let goes = too_many > 0 && is_old(entry);
             too_many -= usize::from(goes);

@@ -1,4 +1,4 @@
-//! Topic `factsheet` (6.15).
+//! Topic `factsheet` (6.15; in 3.0 6.10). Members that 3.0 has added are optional here, and filled in for 3.0 only.
 
 use serde_json::Value;
 
@@ -14,11 +14,12 @@ object! {
     }
     TypeSpecification {
         series_name: String, agv_kinematic: String, agv_class: String, max_load_mass: f64,
-        localization_types: Vec<String>, navigation_types: Vec<String>; series_description: String
+        localization_types: Vec<String>, navigation_types: Vec<String>;
+        series_description: String, supported_zones: Vec<String>
     }
     PhysicalParameters {
         speed_min: f64, speed_max: f64, acceleration_max: f64, deceleration_max: f64, height_max: f64, width: f64, length: f64;
-        height_min: f64
+        height_min: f64, minimum_angular_speed: f64, maximum_angular_speed: f64
     }
     ProtocolLimits { max_string_lens: MaxStringLens, max_array_lens: MaxArrayLens, timing: Timing }
     MaxStringLens {;
@@ -33,6 +34,9 @@ object! {
         instant_actions: u32,
         #[serde(rename = "trajectory.knotVector")] trajectory_knot_vector: u32,
         #[serde(rename = "trajectory.controlPoints")] trajectory_control_points: u32,
+        #[serde(rename = "zoneSet.zones")] zone_set_zones: u32,
+        #[serde(rename = "state.instantActionStates")] state_instant_action_states: u32,
+        #[serde(rename = "state.zoneActionStates")] state_zone_action_states: u32,
         #[serde(rename = "state.nodeStates")] state_node_states: u32,
         #[serde(rename = "state.edgeStates")] state_edge_states: u32,
         #[serde(rename = "state.loads")] state_loads: u32,
@@ -48,7 +52,7 @@ object! {
     AgvAction {
         action_type: String, action_scopes: Vec<ActionScope>;
         action_description: String, action_parameters: Vec<ActionParameterType>, result_description: String,
-        blocking_types: Vec<BlockingType>
+        blocking_types: Vec<BlockingType>, pause_allowed: bool, cancel_allowed: bool
     }
     ActionParameterType { key: String, value_data_type: String; description: String, is_optional: bool }
     AgvGeometry {;
@@ -78,7 +82,11 @@ object! {
         agv_speed_limit: f64, agv_acceleration_limit: f64, agv_deceleration_limit: f64, pick_time: f64, drop_time: f64,
         description: String
     }
-    VehicleConfig {; versions: Vec<ComponentVersion>, network: VehicleNetwork }
+    VehicleConfig {; versions: Vec<ComponentVersion>, network: VehicleNetwork, battery_charging: BatteryCharging }
+    BatteryCharging {;
+        critical_low_charging_level: f64, minimum_desired_charging_level: f64, maximum_desired_charging_level: f64,
+        minimum_charging_time: f64
+    }
     ComponentVersion { key: String, value: String }
     VehicleNetwork {;
         dns_servers: Vec<String>, ntp_servers: Vec<String>, local_ip_address: String, netmask: String, default_gateway: String
@@ -87,5 +95,6 @@ object! {
 
 words! {
     Support { #[default] Supported = "SUPPORTED", Required = "REQUIRED" }
-    ActionScope { #[default] Instant = "INSTANT", Node = "NODE", Edge = "EDGE" }
+    /// `ZONE` is of 3.0.
+    ActionScope { #[default] Instant = "INSTANT", Node = "NODE", Edge = "EDGE", Zone = "ZONE" }
 }

@@ -10,6 +10,7 @@ use cara_vda5050::message::{
 };
 use cara_vda5050::order::{ActionKind, Capabilities};
 use cara_vda5050::state::{Command, Failure, OnBrokerLoss, Policy, Status};
+use cara_vda5050::version::Version;
 
 /// Actions `pick` and `beep` anywhere, `drop` that cannot be cancelled.
 pub fn policy() -> Policy {
@@ -17,6 +18,7 @@ pub fn policy() -> Policy {
     let kind = |can_be_cancelled| ActionKind { scopes: scopes.clone(), can_be_cancelled };
     let actions = [("pick", true), ("beep", true), ("drop", false)].map(|(name, can)| (name.to_owned(), kind(can)));
     Policy {
+        version: Version::V2,
         can: Capabilities { actions: actions.into(), max_nodes: 20, max_actions: 20, ..Capabilities::default() },
         on_broker_loss: OnBrokerLoss::FinishBase { seconds: 60.0, metres: 100.0 },
         resumes_by_itself: false,
@@ -71,7 +73,8 @@ pub fn order(id: &str, update: u32, first: u32, way: &str) -> Order {
             node_description: None,
         });
     }
-    Order { header: header("2.1.0"), order_id: id.into(), order_update_id: update, nodes, edges, zone_set_id: None }
+    let (order_id, zone_set_id, order_description) = (id.into(), None, None);
+    Order { header: header("2.1.0"), order_id, order_update_id: update, nodes, edges, zone_set_id, order_description }
 }
 
 /// `pick=HARD`.
@@ -80,6 +83,7 @@ fn action(id: &str, text: &str) -> Action {
     let blocking_type = match blocking {
         "HARD" => BlockingType::Hard,
         "SOFT" => BlockingType::Soft,
+        "SINGLE" => BlockingType::Single,
         _ => BlockingType::None,
     };
     let (action_id, action_type) = (format!("{id}-{kind}"), kind.into());
@@ -140,7 +144,7 @@ impl Fake {
                 }
                 assert!(!legs.is_empty() && legs.len() <= 8);
                 assert!(legs.iter().all(|(edge, node)| edge.released && node.released), "{command:?}");
-                let blocks = |actions: &[Action]| actions.iter().any(|of| of.blocking_type != BlockingType::None);
+                let blocks = |actions: &[Action]| actions.iter().any(|of| of.blocking_type.blocks_driving());
                 let (_, passed) = legs.split_last().unwrap();
                 assert!(!passed.iter().any(|(_, node)| blocks(&node.actions)), "past a node with {command:?}");
                 assert!(legs.len() == 1 || legs.iter().all(|(edge, _)| edge.actions.is_empty()), "{command:?}");
@@ -161,7 +165,7 @@ impl Fake {
                     return Err(Failure::Refused("an old number".into()));
                 }
                 if *number > self.status.action {
-                    self.is_blocked = action.blocking_type != BlockingType::None;
+                    self.is_blocked = action.blocking_type.blocks_driving();
                     assert!(!self.is_blocked || !self.status.is_driving, "{action:?} begins while it drives");
                     self.began.push(action.action_id.clone());
                     self.action = Some((action.action_id.clone(), self.steps));
@@ -250,6 +254,10 @@ pub struct Pair {
 impl Pair {
     pub fn new(node: &str) -> Self {
         Self::with(node, policy())
+    }
+
+    pub fn of(node: &str, version: Version) -> Self {
+        Self::with(node, Policy { version, ..policy() })
     }
 
     pub fn with(node: &str, policy: Policy) -> Self {

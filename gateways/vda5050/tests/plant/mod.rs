@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::keys::{FleetKeys, Store};
 use cara_std::{Fleet, Identity};
-use cara_vda5050::message::{InstantActions, Order};
+use cara_vda5050::message::{InstantActions, Order, write};
+use cara_vda5050::version::Version;
 use rumqttc::{Client, Event, MqttOptions, Packet, QoS};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -266,9 +267,13 @@ impl Plant {
         self.last("connection").0["connectionState"].as_str().unwrap_or_default().to_owned()
     }
 
+    pub fn version(&self) -> Version {
+        Version::of(self.protocol).unwrap()
+    }
+
     pub fn publish(&self, topic: &str, retain: bool, message: &impl serde::Serialize) {
-        let message = serde_json::to_vec(message).unwrap();
-        self.client.publish(format!("uagv/v2/KIT/0001/{topic}"), QoS::AtMostOnce, retain, message).unwrap();
+        let (root, message) = (self.version().rules().root, write(self.version(), message));
+        self.client.publish(format!("uagv/{root}/KIT/0001/{topic}"), QoS::AtMostOnce, retain, message).unwrap();
     }
 
     pub fn order(&self, id: &str, update: u32, first: u32, way: &str) -> Order {
@@ -279,7 +284,10 @@ impl Plant {
     }
 
     pub fn instant(&self, kind: &str, id: &str) -> InstantActions {
-        let message = instant(kind, id);
+        let mut message = instant(kind, id);
+        if self.version() == Version::V3 {
+            message.header.version = self.protocol.into();
+        }
         self.publish("instantActions", false, &message);
         message
     }
@@ -318,7 +326,8 @@ impl Plant {
 
     pub fn action(&self, id: &str) -> String {
         let state = self.state();
-        let states = state["actionStates"].as_array().cloned().unwrap_or_default();
+        let lists = [&state["actionStates"], &state["instantActionStates"]];
+        let states: Vec<&Value> = lists.into_iter().filter_map(Value::as_array).flatten().collect();
         let found = states.iter().find(|action| action["actionId"] == id);
         found.map_or_else(String::new, |action| action["actionStatus"].as_str().unwrap_or_default().to_owned())
     }
@@ -417,10 +426,11 @@ pub fn master_named(name: &str, port: u16, heard: Messages) -> Client {
 pub fn check_messages(plant: &Plant) {
     for (topic, messages) in plant.heard.lock().unwrap().iter() {
         let topic = topic.rsplit('/').next().unwrap();
-        if matches!(topic, "order" | "instantActions" | "cara-probe") {
+        if matches!(topic, "order" | "instantActions" | "zoneSet" | "responses" | "cara-probe") {
             continue;
         }
-        let file = format!("schemas/2.1.0/{topic}.schema");
+        let schemas = if plant.version() == Version::V3 { "main-0b2ae43" } else { "2.1.0" };
+        let file = format!("schemas/{schemas}/{topic}.schema");
         let schema = std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).unwrap();
         let validator = jsonschema::validator_for(&serde_json::from_slice(&schema).unwrap()).unwrap();
         let mut last = -1;
@@ -429,7 +439,7 @@ pub fn check_messages(plant: &Plant) {
             assert!(errors.is_empty(), "{topic}: {errors:?}\n{message}");
             let header_id = message["headerId"].as_i64().unwrap();
             // A retained one comes again with each connection, and a last will has the id of its making.
-            let is_will = message["connectionState"] == "CONNECTIONBROKEN";
+            let is_will = message["connectionState"].as_str().is_some_and(|state| state.ends_with("BROKEN"));
             assert!(header_id > last || *is_retained || is_will, "{topic}: {header_id} behind {last}");
             last = last.max(header_id);
         }
