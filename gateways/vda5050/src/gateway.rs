@@ -15,8 +15,8 @@ use crate::driver::Driver;
 use crate::errors::{Kind, Refusal};
 use crate::machine::{ERRORS, Machine, Topic};
 use crate::message::{
-    Action, BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, Response,
-    Responses, State, Visualization, ZoneSetMessage, read, write,
+    Action, BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, Responses,
+    State, Visualization, ZoneSetMessage, read, write,
 };
 use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, Link, Place};
@@ -286,15 +286,14 @@ impl Gateway {
                     Ok(message) => self.at_once(message),
                     Err(refusal) => self.refuse(&refusal),
                 },
-                "zoneSet" | "responses" => {
-                    let refusals = match topic.as_str() {
-                        "zoneSet" => {
-                            self.checked("zoneSet", is_retained, &bytes).map(|message| unwanted_zones(&message))
-                        }
-                        _ => self.checked("responses", is_retained, &bytes).map(|message| unwanted_responses(&message)),
-                    };
-                    refusals.unwrap_or_else(|refusal| vec![refusal]).iter().for_each(|refusal| self.refuse(refusal));
-                }
+                "zoneSet" => match self.checked("zoneSet", is_retained, &bytes) {
+                    Ok(message) => self.refuse(&unwanted_zones(&message)),
+                    Err(refusal) => self.refuse(&refusal),
+                },
+                "responses" => match self.checked("responses", is_retained, &bytes) {
+                    Ok(message) => self.refuse(&unwanted_responses(&message)),
+                    Err(refusal) => self.refuse(&refusal),
+                },
                 "connection" => self.hear_connection(&bytes),
                 _ => self.hear_probe(&bytes),
             },
@@ -537,20 +536,19 @@ fn late(topic: &str, header: &Header) -> Refusal {
 }
 
 /// No vehicle has zones: `supportedZones` of the factsheet is empty.
-fn unwanted_zones(message: &ZoneSetMessage) -> Vec<Refusal> {
+fn unwanted_zones(message: &ZoneSetMessage) -> Refusal {
     let refusal = Refusal::new(Kind::Unsupported, "the vehicle has no zones").about("topic", "zoneSet");
     let refusal = refusal.about("headerId", message.header.header_id);
-    vec![refusal.about("zoneSetId", &message.zone_set.zone_set_id).about("zoneSet", "zoneSet")]
+    refusal.about("zoneSetId", &message.zone_set.zone_set_id).about("zoneSet", "zoneSet")
 }
 
 /// No vehicle requests anything, so that there is nothing to grant.
-fn unwanted_responses(message: &Responses) -> Vec<Refusal> {
-    let refused = |response: &Response| {
-        let refusal = Refusal::new(Kind::Unsupported, "the vehicle has requested nothing").about("topic", "responses");
-        refusal.about("headerId", message.header.header_id).about("requestId", &response.request_id)
-    };
-    // As many errors as are kept.
-    message.responses.iter().take(ERRORS).map(refused).collect()
+fn unwanted_responses(message: &Responses) -> Refusal {
+    let refusal = Refusal::new(Kind::Unsupported, "the vehicle has requested nothing").about("topic", "responses");
+    let refusal = refusal.about("headerId", message.header.header_id).about("responses", "responses");
+    // One error for all, of a bounded size.
+    let named = message.responses.iter().take(ERRORS);
+    named.fold(refusal, |refusal, response| refusal.about("requestId", &response.request_id))
 }
 
 trait HasHeader {

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use cara_vda5050::message::{
-    Connection, Factsheet, InstantActions, Order, Responses, State, Visualization, ZoneSetMessage, read, write,
+    Connection, Deviation, Factsheet, InstantActions, Order, Responses, State, Visualization, ZoneSetMessage, read,
+    write,
 };
 use cara_vda5050::version::Version;
 use serde::Serialize;
@@ -212,9 +213,12 @@ fn members_may_be_null() {
     // The identifiers are null as well, which is refused.
     assert!(read::<Order>(Version::V2, text.as_bytes()).is_err());
     let mut order: Value = generated(&schema, &schema, true, 0);
+    *order.pointer_mut("/nodes/1/nodePosition/allowedDeviationXY").unwrap() = json!(2);
     for pointer in ["/zoneSetId", "/nodes/0/nodePosition", "/edges/0/maxSpeed", "/edges/0/trajectory"] {
         *order.pointer_mut(pointer).unwrap() = Value::Null;
     }
     let order: Order = read(Version::V2, order.to_string().as_bytes()).unwrap();
+    let deviation = order.nodes[1].node_position.as_ref().unwrap().allowed_deviation_xy.unwrap();
+    assert_eq!(deviation, Deviation::Radius(2.0), "a whole number is a number");
     assert_eq!((&order.zone_set_id, &order.nodes[0].node_position, order.edges[0].max_speed), (&None, &None, None));
 }

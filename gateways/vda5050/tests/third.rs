@@ -8,7 +8,7 @@ use cara_vda5050::errors::Kind;
 use cara_vda5050::message::ErrorLevel::{Critical, Fatal, Urgent, Warning};
 use cara_vda5050::message::{
     ActionParameter, BlockingType, Deviation, EStop, Edge, ErrorLevel, InstantActions, NodePosition, OperatingMode,
-    State, write,
+    Reference, State, write,
 };
 use cara_vda5050::state::Command;
 use cara_vda5050::version::Version;
@@ -198,7 +198,13 @@ fn what_is_offered_and_not_there_is_refused() {
         // Until an action at once is taken, whatever order comes (6.6.5.4).
         pair.machine.order(order("o1", 0, 0, "a! b!"));
         assert_eq!(pair.errors(), ["INVALID_INSTANT_ACTION"], "{kind}");
-        pair.machine.instant_actions(instant("stateRequest", "i2"));
+        let mut both = instant("stateRequest", "i2");
+        both.actions.extend(instant(kind, "i3").actions);
+        pair.machine.instant_actions(both);
+        let errors = &pair.machine.record().errors;
+        let of_i3 = |of: &Reference| of.reference_key == "actionId" && of.reference_value == "i3";
+        assert!(errors.len() == 1 && errors[0].error_references.iter().flatten().any(of_i3), "{kind}: {errors:?}");
+        pair.machine.instant_actions(instant("stateRequest", "i4"));
         assert!(pair.errors().is_empty(), "{kind}");
     }
     // An action at once blocks nothing (6.2.1), but what stops the vehicle does so however it comes.

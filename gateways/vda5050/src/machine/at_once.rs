@@ -3,7 +3,7 @@
 use super::{INSTANT_ACTIONS, Machine, is_controlled};
 use crate::actions::{Entry, Place};
 use crate::errors::{Kind, Refusal};
-use crate::message::{Action, ActionScope, ActionStatus, BlockingType, InstantActions};
+use crate::message::{Action, ActionScope, ActionStatus, BlockingType, Error, InstantActions};
 use crate::order::{ID_BYTES, PARAMETER_BYTES, parameters, performable};
 use crate::state::{Failure, copy_of};
 use crate::version::Version;
@@ -12,6 +12,9 @@ impl Machine {
     /// A message on topic `instantActions`. A copy of one changes nothing.
     pub fn instant_actions(&mut self, message: InstantActions) {
         let stamp = format!("{} {}", message.header.header_id, message.header.timestamp);
+        let known: Vec<Error> =
+            self.record.errors.iter().filter(|of| Kind::is_of_instant_action(of)).cloned().collect();
+        let mut is_one_taken = false;
         for action in message.actions {
             if action.action_id.len() > ID_BYTES || parameters(&action).len() > PARAMETER_BYTES {
                 let refusal = Refusal::new(Kind::Validation, "the action's id or its parameters are too long");
@@ -29,10 +32,11 @@ impl Machine {
             self.is_report_due = true;
             let mut entry = Entry { message: stamp.clone(), ..Entry::new(action, Place::Instant) };
             self.begin(&mut entry);
-            if entry.status != ActionStatus::Failed {
-                self.record.errors.retain(|error| !Kind::is_of_instant_action(error));
-            }
+            is_one_taken |= entry.status != ActionStatus::Failed;
             self.record.actions.push(entry);
+        }
+        if is_one_taken {
+            self.record.errors.retain(|error| !known.contains(error));
         }
         self.forget_instant_actions(INSTANT_ACTIONS);
         self.settle();
