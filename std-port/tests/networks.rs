@@ -3,28 +3,16 @@
 
 mod keyed;
 
-use std::collections::HashMap;
-use std::fmt::Write;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use cara_processes::faults::{self, CALM, Calls, PATIENCE, TIMEOUT, Table};
 use cara_processes::network::{self, filter};
 use cara_processes::random_fleet;
 use cara_processes::switch::Switch;
 use cara_std::control::Control;
 use cara_std::{CommunicationSystem, Interfaces, Parameters, RequestOptions, Unit};
-
-/// How long a call waits for its answer.
-const TIMEOUT: Duration = Duration::from_millis(500);
-/// A call that goes on for so much longer has no outcome.
-const LATE: Duration = Duration::from_secs(2);
-/// From the end of a fault until calls are answered.
-const PATIENCE: Duration = Duration::from_secs(90);
-/// Answered calls before the next fault.
-const CALM: usize = 20;
-/// How long faults last at least, and how much longer they are from one to the next, up to 12 s.
-const SHORTEST: Duration = Duration::from_millis(500);
 
 /// What breaks.
 struct Fault {
@@ -93,29 +81,23 @@ fn numbered(number: i64) -> Result<Parameters> {
     Ok(parameters)
 }
 
-/// How often the vehicle ran the call of each number.
-type Runs = Arc<Mutex<HashMap<i64, usize>>>;
-
 struct Pair {
     manager: CommunicationSystem,
     _vehicle: Unit,
-    runs: Runs,
-    /// Calls by number, and whether they were answered.
-    calls: Vec<bool>,
-    /// Answers that were another call's, and calls without an outcome.
-    wrong: usize,
+    calls: Arc<Mutex<Calls>>,
+    next: i64,
 }
 
 impl Pair {
     fn join(switch: &Switch) -> Result<Self> {
         let (manager, vehicle) = keyed::pair(random_fleet());
-        let runs = Runs::default();
-        let ran = runs.clone();
+        let calls = Arc::<Mutex<Calls>>::default();
+        let run = calls.clone();
         let vehicle = switch.hosts[VEHICLE].within(|| {
             let vehicle = vehicle.interfaces(Interfaces::All).build()?;
             vehicle.my_function_list().add_function("count", &numbered(0)?, move |arguments: Parameters| {
                 let number = arguments.variable("number").unwrap_or(-1);
-                *ran.lock().unwrap().entry(number).or_default() += 1;
+                run.lock().unwrap().ran(number);
                 arguments
             })?;
             vehicle.publish_my_function_list()?;
@@ -127,20 +109,20 @@ impl Pair {
             manager.start()?;
             Ok(manager)
         })?;
-        Ok(Self { manager, _vehicle: vehicle, runs, calls: Vec::new(), wrong: 0 })
+        Ok(Self { manager, _vehicle: vehicle, calls, next: 0 })
     }
 
     /// Whether a call was answered.
     fn call(&mut self) -> bool {
-        let number = self.calls.len() as i64;
+        let number = self.next;
+        self.next += 1;
         let mut arguments = numbered(number).unwrap();
         let options = RequestOptions { timeout: Some(TIMEOUT.into()), ..RequestOptions::default() };
         let began = Instant::now();
         let called = self.manager.s_unit("agv").map(|peer| peer.call("count", &mut arguments).with(options).wait());
         let is_answered = matches!(called, Ok(Ok(())));
-        self.wrong += usize::from(began.elapsed() > TIMEOUT + LATE);
-        self.wrong += usize::from(is_answered && arguments.variable("number") != Ok(number));
-        self.calls.push(is_answered);
+        let answer = is_answered.then(|| arguments.variable("number").unwrap_or(-1));
+        self.calls.lock().unwrap().ended(number, answer, began.elapsed(), Duration::ZERO);
         std::thread::sleep(Duration::from_millis(2));
         is_answered
     }
@@ -154,12 +136,11 @@ impl Pair {
         began.elapsed()
     }
 
-    /// Calls that ran twice or were answered and never ran, and what else went wrong.
-    fn lost(&self) -> usize {
-        let runs = self.runs.lock().unwrap();
-        let of = |number: usize| runs.get(&(number as i64)).copied().unwrap_or(0);
-        let is_wrong = |(number, is_answered): (usize, &bool)| of(number) > 1 || *is_answered && of(number) == 0;
-        self.wrong + self.calls.iter().enumerate().filter(|call| is_wrong(*call)).count()
+    /// How many calls there were, how many of them were not answered, and how many were lost.
+    fn counts(&self) -> (usize, usize, usize) {
+        let calls = self.calls.lock().unwrap();
+        let (count, failed) = calls.counts();
+        (count, failed, calls.lost())
     }
 }
 
@@ -168,27 +149,19 @@ fn calls_go_on_behind_each_fault() {
     if !network::test("calls_go_on_behind_each_fault", &["nft", "tc"], true) {
         return;
     }
-    let each: usize = std::env::var("CARA_EACH").map_or(3, |each| each.parse().unwrap());
-    let kind = std::env::var("CARA_KIND").unwrap_or_default();
+    let (each, kind) = faults::options();
     let switch = Switch::of(2).unwrap();
     let mut pair = Pair::join(&switch).unwrap();
     pair.recover();
-    let mut table = String::from(
-        "| fault | injections | calls; not answered | lost | recovery: median | 99 % | worst |\n|---|---|---|---|---|---|---|\n",
-    );
+    let mut table = Table::new(&[]);
     for fault in FAULTS.iter().filter(|fault| fault.name.contains(&kind)) {
-        let (first, lost) = (pair.calls.len(), pair.lost());
+        let before = pair.counts();
         let mut took: Vec<_> = (0..each).map(|number| break_once(&mut pair, &switch, fault, number, each)).collect();
-        took.sort_unstable();
-        let calls = &pair.calls[first..];
-        let (count, failed, lost) = (calls.len(), calls.iter().filter(|call| !**call).count(), pair.lost() - lost);
-        let at = |percent: usize| took[(took.len() * percent).div_ceil(100) - 1].as_secs_f64();
-        let spans = [50, 99, 100].map(at);
-        let spans = spans.map(|span| format!("{span:.2} s")).join(" | ");
-        writeln!(table, "| {} | {each} | {count}; {failed} | {lost} | {spans} |", fault.name).unwrap();
+        let (count, failed, lost) = pair.counts();
+        table.row(fault.name, &mut took, (count - before.0, failed - before.1), lost - before.2, &[]);
     }
     println!("{table}");
-    assert_eq!(pair.lost(), 0, "calls that ran twice, were answered and never ran, or had no outcome");
+    assert_eq!(pair.counts().2, 0, "calls that ran twice, were answered and never ran, or had no outcome");
 }
 
 /// A fault of a length of its own, between 0.5 and 12 s; how long it took from its end until a call was answered.
@@ -198,8 +171,7 @@ fn break_once(pair: &mut Pair, switch: &Switch, fault: &Fault, number: usize, ea
         answered = if pair.call() { answered + 1 } else { 0 };
     }
     (fault.begin)(switch, number).unwrap();
-    let lasts = SHORTEST + Duration::from_millis(11_500 * number as u64 / each.max(2) as u64);
-    let end = Instant::now() + lasts;
+    let end = Instant::now() + faults::lasts(number, each);
     // What an address that changed breaks is over at once.
     while Instant::now() < end && fault.name != "another address" {
         pair.call();

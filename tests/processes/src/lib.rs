@@ -2,6 +2,7 @@
 //! process that outlives its owner. Nothing here knows CARA.
 
 pub mod cable;
+pub mod faults;
 pub mod files;
 pub mod network;
 pub mod switch;

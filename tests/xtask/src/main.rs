@@ -147,7 +147,9 @@ enum Task {
         json: Option<PathBuf>,
     },
     /// Breaks the network between two hosts in many ways, and prints what is lost and how long calls take to be answered again.
-    Networks(networks::Networks),
+    Networks(networks::Faults),
+    /// Breaks a manager's and a vehicle's host in many ways, descriptors to disks, and prints the same.
+    Hosts(networks::Faults),
     /// Runs the warehouse for hours while everything fails, and looks at what its processes hold: nothing may grow.
     Soak(soak::Soak),
     /// Runs the Linux port's tests under the thread sanitizer, or the core's in Miri; needs a nightly compiler.
@@ -195,7 +197,8 @@ fn main() -> ExitCode {
         Task::Fuzz(options) => fuzz::run(&options),
         Task::Chaos(options) => chaos::run(&options),
         Task::Mutants(options) => mutants::run(&options),
-        Task::Networks(options) => networks::run(&options),
+        Task::Networks(options) => networks::networks(&options),
+        Task::Hosts(options) => networks::hosts(&options),
         Task::Soak(options) => soak::run(&options),
         Task::Sanitize(options) => sanitize::run(&options),
         Task::Security(options) => security::run(&options),
