@@ -66,9 +66,8 @@ pub(crate) struct Pair {
     pub(crate) grace: Duration,
     crashes: usize,
     busiest: f64,
-    /// Further processes and connections of a fault.
+    /// Further processes of a fault.
     pub(crate) others: Vec<Child>,
-    pub(crate) connections: Vec<std::os::unix::net::UnixStream>,
     /// Words before the vehicle's command.
     pub(crate) vehicle_on: String,
 }
@@ -98,7 +97,6 @@ impl Pair {
             crashes: 0,
             busiest: 0.0,
             others: Vec::new(),
-            connections: Vec::new(),
             vehicle_on: String::new(),
         };
         if let Kind::Killed(side) = kind {
@@ -371,7 +369,6 @@ impl Pair {
     }
 
     pub(crate) fn remove_others(&mut self) {
-        self.connections.clear();
         for mut other in self.others.drain(..) {
             let _ = other.kill().and_then(|()| other.wait());
         }
