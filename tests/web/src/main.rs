@@ -52,6 +52,7 @@ fn main() -> Result<()> {
         let browser = Browser::start(options.write.as_deref()).await?;
         look(&browser, &mut stage, &url).await?;
         command(&browser).await?;
+        managers(&browser, &stage).await?;
         pictures(&browser).await?;
         tablet(&browser).await?;
         widths(&browser, &url).await?;
@@ -194,6 +195,26 @@ async fn command(browser: &Browser) -> Result<()> {
     browser.fill(&x, "99999999").await?;
     browser.click(&format!("{form} button.primary")).await?;
     browser.says(&format!("{form} .outcome.bad"), "Service (Failed, code 1)").await
+}
+
+/// Which manager has which vehicle; one that does not answer is not known, and its name is text.
+async fn managers(browser: &Browser, stage: &Stage) -> Result<()> {
+    let _hangs = stage.hostile_socket()?;
+    browser.click("#managers-look").await?;
+    browser.says("#managers-about", "looked").await?;
+    let rows = "[...document.querySelectorAll('#managers tr')].map((row) => [...row.children].map((cell) => cell.textContent))";
+    let has = |manager: &str, s_unit: &str, state: &str| {
+        format!(
+            "{rows}.some((cells) => cells[0] === '{manager}' && cells[2] === '{s_unit}' && cells[3].startsWith('{state}'))"
+        )
+    };
+    for (agv, id) in AGVS.iter().zip(11..) {
+        browser.wait("a vehicle is at its manager", &has("depot/1", &format!("{agv}/{id}"), "connected")).await?;
+    }
+    let name = r"<img src=x onerror=alert(1)>\\u{202e}/9";
+    browser.wait("a manager that hangs is not known", &has(name, "not known", "not asked: ")).await?;
+    browser.wait("nothing becomes markup", "!document.querySelector('#managers img, #managers-remarks img')").await?;
+    browser.says("#managers-remarks", "S_units that have joined are silent").await
 }
 
 /// Opens the form of a function of the chosen node. How it is found from then on.

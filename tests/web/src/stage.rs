@@ -3,6 +3,7 @@
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -128,6 +129,12 @@ impl Stage {
         let line = web.expect("the page is at ", PATIENCE)?.text;
         let url = line.rsplit_once(' ').context("it names an address")?.1.to_owned();
         Ok((web, url))
+    }
+
+    /// The socket of a manager that does not answer, with a name that would be markup.
+    pub(crate) fn hostile_socket(&self) -> Result<UnixListener> {
+        let name = format!("%3Cimg src=x onerror=alert%281%29%3E%E2%80%AE-9-{}.sock", self.fleet);
+        Ok(UnixListener::bind(self.folder.path().join(name))?)
     }
 
     /// A node with a record in its signature, which it echoes.

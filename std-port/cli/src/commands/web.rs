@@ -10,6 +10,7 @@ use cara_std::control::protocol::{Answer, Question};
 use cara_web::{Arguments, Beat, Cancel, Connection, Unit};
 use serde_json::Value;
 
+use crate::commands::scan::all_managers;
 use crate::operator::{Need, Operator};
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
@@ -50,6 +51,15 @@ impl Unit for Chosen {
             ));
         }
         cara_doctor::examine(listen, &self.global)
+    }
+
+    fn managers(&self, listen: Duration) -> anyhow::Result<Value> {
+        if self.own.is_some() {
+            return Err(Ended::usage(
+                "this asks units that run, and this one is of `cara web --as`: start `cara scan --all-managers`",
+            ));
+        }
+        all_managers::for_page(listen, &self.global)
     }
 }
 

@@ -172,6 +172,16 @@ fn all_managers_as_json() {
     assert_eq!(lost["heard"][0]["looks_for"], "nobody/9");
     let rest = ["not_looked", "fleets_without_keys", "key_files_refused"].map(|key| &shown[key]);
     assert_eq!(rest, [&json!([]), &json!([]), &json!([])]);
+    // A socket that hangs belongs to the run that is heard.
+    let socket = stage.control().join(format!("far-3-{}.sock", stage.fleet));
+    let _hangs = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+    let shown = scan_all(&stage, &["--json"]).json();
+    let far: Vec<_> =
+        shown["managers"].as_array().unwrap().iter().filter(|manager| manager["manager"] == "far/3").collect();
+    let [far] = far[..] else { panic!("each once: {shown}") };
+    assert_eq!((&far["socket"], &far["epoch"]), (&json!(socket), &expected["epoch"]));
+    assert!(far["not_asked"].is_string() && far["heard"][0]["source"].is_string(), "{far}");
+    assert_eq!(far["linked_to"], expected["linked_to"]);
 }
 
 #[test]

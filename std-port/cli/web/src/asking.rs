@@ -1,4 +1,4 @@
-//! What pages ask for: functions, calls, holds, stops, resets, the doctor. Answers go to the page as they come, a line of JSON
+//! What pages ask for: functions, calls, holds, stops, resets, surveys. Answers go to the page as they come, a line of JSON
 //! each, of which the last one is `done` or `failed`.
 
 use std::collections::HashMap;
@@ -23,7 +23,7 @@ use crate::picture::Section;
 use crate::push::piecewise;
 use crate::server::Shared;
 use crate::users::User;
-use crate::{Beat, Connection, form, guard};
+use crate::{Beat, Connection, Unit, form, guard};
 
 /// A hold ends when its page has not said for so long that it is there.
 pub(crate) const ATTENDED: Duration = Duration::from_millis(1500);
@@ -37,6 +37,8 @@ const STOP_ANSWERS: usize = 2048;
 const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 /// How long the doctor listens.
 const LISTEN: Duration = Duration::from_secs(6);
+/// How long managers are listened for, as by `cara scan`.
+const LISTEN_TO_MANAGERS: Duration = Duration::from_secs(2);
 
 type Asked = State<Arc<Shared>>;
 /// Whose token the request has.
@@ -247,25 +249,48 @@ async fn named(body: Body) -> Result<Option<String>, Response> {
 
 /// Has the doctor look, and tells all pages what it found.
 pub(crate) async fn doctor(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
-    if let Some(refusal) = guard::unseen(&user) {
+    survey(shared, &user, body, Section::Doctor, |unit| {
+        let found = unit.findings(LISTEN)?;
+        Ok(json!({ "findings": found["findings"], "listened_ms": found["listened_ms"] }))
+    })
+    .await
+}
+
+/// Has all managers asked that can be, and tells all pages which one has which vehicle.
+pub(crate) async fn managers(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
+    survey(shared, &user, body, Section::Managers, |unit| {
+        let found = unit.managers(LISTEN_TO_MANAGERS)?;
+        Ok(json!({ "rows": found["rows"], "remarks": found["remarks"] }))
+    })
+    .await
+}
+
+/// One at a time. What was found is the row of the section, with the time.
+async fn survey(
+    shared: Arc<Shared>,
+    user: &User,
+    body: Body,
+    section: Section,
+    find: fn(&dyn Unit) -> anyhow::Result<Value>,
+) -> Response {
+    if let Some(refusal) = guard::unseen(user) {
         return refusal;
     }
     if let Err(refusal) = read(body).await {
         return refusal;
     }
-    let Ok(_turn) = shared.doctor.try_acquire() else { return busy("doctors", 1) };
+    let Ok(_turn) = shared.surveys.try_acquire() else { return busy("surveys", 1) };
     let own = shared.clone();
-    let found = spawn_blocking(move || own.unit.findings(LISTEN)).await;
+    let found = spawn_blocking(move || find(&*own.unit)).await;
     let line = match found {
-        Ok(Ok(found)) => {
+        Ok(Ok(mut found)) => {
             let mut picture = shared.picture();
-            let reported =
-                json!({ "at": picture.now(), "findings": found["findings"], "listened_ms": found["listened_ms"] });
-            picture.put(Section::Doctor, "", &reported);
+            found["at"] = picture.now().into();
+            picture.put(section, "", &found);
             json!({ "answer": "done" })
         }
         Ok(Err(error)) => failed(&failure(&error)),
-        Err(_) => failed(&Failure::configuration("Failed", "the doctor failed")),
+        Err(_) => failed(&Failure::configuration("Failed", "the survey failed")),
     };
     lines(&[line])
 }

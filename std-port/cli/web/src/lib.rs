@@ -74,6 +74,9 @@ pub trait Unit: Send + Sync + 'static {
 
     /// What the doctor finds when it listens for so long.
     fn findings(&self, listen: Duration) -> anyhow::Result<Value>;
+
+    /// Which m_unit has which s_unit, after a survey of so long: `rows` (`cells`: m_unit, fleet, s_unit, state; `kind`) and `remarks`.
+    fn managers(&self, listen: Duration) -> anyhow::Result<Value>;
 }
 
 /// Ends what is asked over a connection, from another thread.

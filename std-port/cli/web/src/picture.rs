@@ -34,9 +34,11 @@ pub(crate) enum Section {
     Doctor,
     /// The limits of this server.
     Limits,
+    /// Which manager had which vehicle, when somebody looked last.
+    Managers,
 }
 
-const SECTIONS: [(Section, &str); 10] = [
+const SECTIONS: [(Section, &str); 11] = [
     (Section::Unit, "unit"),
     (Section::Nodes, "nodes"),
     (Section::Refused, "refused"),
@@ -47,6 +49,7 @@ const SECTIONS: [(Section, &str); 10] = [
     (Section::Pings, "pings"),
     (Section::Doctor, "doctor"),
     (Section::Limits, "limits"),
+    (Section::Managers, "managers"),
 ];
 
 #[derive(Default)]

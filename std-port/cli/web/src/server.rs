@@ -33,9 +33,9 @@ pub(crate) struct Shared {
     pub(crate) next_hold: AtomicU64,
     pub(crate) stops_of_all: Arc<Semaphore>,
     pub(crate) stops_of_one: Arc<Semaphore>,
-    /// One question about functions at a time, and one doctor.
+    /// One question about functions at a time, and one survey of the network.
     pub(crate) functions: Semaphore,
-    pub(crate) doctor: Semaphore,
+    pub(crate) surveys: Semaphore,
 }
 
 impl Shared {
@@ -51,7 +51,7 @@ impl Shared {
             stops_of_all: Arc::new(Semaphore::new(STOPS_OF_ALL)),
             stops_of_one: Arc::new(Semaphore::new(STOPS_OF_ONE)),
             functions: Semaphore::new(1),
-            doctor: Semaphore::new(1),
+            surveys: Semaphore::new(1),
         })
     }
 }
@@ -83,6 +83,7 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
         .route("/api/stop", post(asking::stop))
         .route("/api/reset", post(asking::reset))
         .route("/api/doctor", post(asking::doctor))
+        .route("/api/managers", post(asking::managers))
         .layer(middleware::from_fn_with_state(shared.clone(), guard::pass))
         .with_state(shared)
 }

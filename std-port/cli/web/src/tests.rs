@@ -49,6 +49,13 @@ impl Unit for Fake {
     fn findings(&self, _: Duration) -> anyhow::Result<Value> {
         Ok(json!({ "findings": [{ "id": "full" }], "listened_ms": 5 }))
     }
+
+    fn managers(&self, _: Duration) -> anyhow::Result<Value> {
+        anyhow::ensure!(!self.is_gone.load(Ordering::Acquire), "no survey");
+        Ok(
+            json!({ "rows": [{ "cells": ["depot/1", "7", "agv/1", "connected"], "kind": "" }], "remarks": ["silent"], "more": 1 }),
+        )
+    }
 }
 
 impl Connection for Way {
@@ -336,7 +343,7 @@ fn the_manager_is_told_who_asks_and_every_user_may_stop() {
         let ready = stage.answer("POST", "/api/ready", &[("authorization", &bearer)], "{}");
         assert!(starts(&ready, 204), "{name}: {ready}");
         let status = if role == Role::Stop { 403 } else { 200 };
-        for (method, path) in [("GET", "/api/map"), ("POST", "/api/doctor")] {
+        for (method, path) in [("GET", "/api/map"), ("POST", "/api/doctor"), ("POST", "/api/managers")] {
             let answer = stage.answer(method, path, &[("authorization", &bearer)], "{}");
             assert!(starts(&answer, status), "{name} {path}: {answer}");
         }
@@ -543,6 +550,13 @@ fn functions_and_findings_come_in_the_pages_form() {
     );
     assert!(stage.post("/api/doctor", &json!({})).contains("done"));
     stage.follow(|message| message["doctor"]["rows"][""]["findings"][0]["id"] == "full");
+    assert!(stage.post("/api/managers", &json!({})).contains("done"));
+    stage.follow(|message| {
+        let found = &message["managers"]["rows"][""];
+        found["rows"][0]["cells"][2] == "agv/1" && found["remarks"][0] == "silent" && found["at"].is_u64()
+    });
+    stage.unit.is_gone.store(true, Ordering::Release);
+    assert!(stage.post("/api/managers", &json!({})).contains("no survey"));
 }
 
 fn refused(change: impl FnOnce(&std::path::Path) -> Arguments) -> String {

@@ -5,18 +5,24 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::Duration;
 
+use anstyle::Style;
 use cara_std::control::{RunningUnit, directories, running_in};
 use cara_std::survey::{Heard, Survey};
 use cara_std::{Fleet, Shown};
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
+use super::survey::Remark;
 use super::{LISTED, survey};
 use crate::nodes::{self, full_name};
 use crate::operator::{Way, of_others};
 use cara_tools::global::Global;
 use cara_tools::listening::shown_standing;
 use cara_tools::output::{self, BAD, FAINT, PLAIN, Rows};
+
+/// Said under the table.
+const SILENT: &str = "S_units that have joined are silent: those of an m_unit that was not asked are not known here. `cara scan` on \
+                      its host shows them.";
 
 /// A run of an m_unit, or a socket whose unit cannot be asked.
 #[derive(Default, Serialize)]
@@ -66,22 +72,20 @@ struct Fleets {
     not_looked: Vec<String>,
 }
 
+/// Rows that the page shows at most. Whoever is on the network can have datagrams heard, so those that a socket tells come first.
+const PAGE_ROWS: usize = 1000;
+
+/// A line of the table.
+struct Line {
+    style: Style,
+    cells: [String; 4],
+    /// A control socket tells it, or is why it is not known.
+    is_of_socket: bool,
+}
+
 pub(super) fn show(span: Duration, global: &Global) -> anyhow::Result<()> {
-    let is_meant = |fleet| global.fleet.is_none_or(|meant| meant == fleet);
-    let mut fleets = Fleets::default();
-    let looked = directories().into_iter().filter_map(|directory| {
-        running_in(&directory).map_err(|refused| fleets.not_looked.push(refused.to_string())).ok()
-    });
-    let running: Vec<_> = looked.flatten().filter(|unit| is_meant(unit.fleet)).collect();
-    fleets.not_looked.extend(Some(of_others(None, global.fleet)).filter(|others| !others.is_empty()));
-    let of_sockets: Vec<_> = running.iter().map(|unit| Fleet(unit.fleet)).collect();
-    let (survey, mut meant) = survey::listen(span, &of_sockets, global)?;
-    let heard = survey.heard().iter().filter(|heard| !heard.is_survey() && is_meant(heard.fleet.0));
-    let heard: Vec<_> = heard.collect();
-    heard.iter().for_each(|heard| fleets.hear(heard));
-    running.into_iter().for_each(|unit| fleets.ask(unit));
-    fleets.managers.sort_by(|a, b| (a.fleet, &a.manager).cmp(&(b.fleet, &b.manager)));
-    meant.extend(&fleets.secured);
+    let (fleets, survey, meant) = gather(span, global)?;
+    let heard = heard_of(&survey, global);
     if global.json {
         let without_keys = survey::without_keys(&survey, &heard, &meant, global);
         return fleets.print_json(&survey, without_keys.iter().map(|fleet| fleet.0).collect());
@@ -89,16 +93,65 @@ pub(super) fn show(span: Duration, global: &Global) -> anyhow::Result<()> {
     if fleets.managers.is_empty() {
         output::line("no m_unit was found; `cara doctor` looks for reasons")?;
     }
-    fleets.table().print()?;
-    for why in &fleets.not_looked {
-        output::line(format_args!("\n{BAD}not asked{BAD:#}: {}", Shown(why)))?;
-    }
-    survey::about_keys(&survey, &heard, &meant, global)?;
-    output::line(
-        "\nS_units that have joined are silent: those of an m_unit that was not asked are not known here. `cara scan` on its \
-         host shows them.",
-    )?;
+    let mut rows = Rows::new(["M_UNIT", "FLEET", "S_UNIT", "STATE"]);
+    fleets.lines().into_iter().for_each(|line| rows.add(line.style, line.cells));
+    rows.print()?;
+    let not_asked = fleets.not_looked.iter().map(|why| Remark { mistake: "not asked", text: Shown(why).to_string() });
+    survey::print(not_asked.chain(survey::about_keys(&survey, &heard, &meant, global)))?;
+    output::line(format_args!("\n{SILENT}"))?;
     Ok(())
+}
+
+/// The same for the page: `rows` (m_unit, fleet, s_unit, state, and how it is shown) and `remarks`.
+pub(crate) fn for_page(span: Duration, global: &Global) -> anyhow::Result<Value> {
+    let (fleets, survey, meant) = gather(span, global)?;
+    let shown = |text: &str| Shown(&text.replace(['\n', '\r'], " ")).to_string();
+    let mut lines = fleets.lines();
+    lines.sort_by_key(|line| !line.is_of_socket);
+    let left_out = lines.len().saturating_sub(PAGE_ROWS);
+    let rows = lines.iter().take(PAGE_ROWS).map(|line| {
+        let kind = if line.style == BAD {
+            "bad"
+        } else if line.style == FAINT {
+            "faint"
+        } else {
+            ""
+        };
+        json!({ "cells": line.cells.each_ref().map(|cell| shown(cell)), "kind": kind })
+    });
+    let not_asked = fleets.not_looked.iter().map(|why| format!("not asked: {why}"));
+    let about_keys = survey::about_keys(&survey, &heard_of(&survey, global), &meant, global);
+    let about_keys = about_keys.into_iter().map(|remark| format!("{}{}", remark.head(), remark.text));
+    let more = format!("{left_out} more lines: `cara scan --all-managers` shows them");
+    let more = (left_out > 0).then_some(more);
+    let remarks = not_asked.chain(about_keys).chain(more).chain([SILENT.to_owned()]).map(|text| shown(&text));
+    Ok(json!({ "rows": rows.collect::<Vec<_>>(), "remarks": remarks.collect::<Vec<_>>() }))
+}
+
+/// What the sockets and a survey tell, and the fleets whose keys should be here.
+fn gather(span: Duration, global: &Global) -> anyhow::Result<(Fleets, Survey, Vec<Fleet>)> {
+    let mut fleets = Fleets::default();
+    let looked = directories().into_iter().filter_map(|directory| {
+        running_in(&directory).map_err(|refused| fleets.not_looked.push(refused.to_string())).ok()
+    });
+    let running: Vec<_> = looked.flatten().filter(|unit| is_meant(unit.fleet, global)).collect();
+    fleets.not_looked.extend(Some(of_others(None, global.fleet)).filter(|others| !others.is_empty()));
+    let of_sockets: Vec<_> = running.iter().map(|unit| Fleet(unit.fleet)).collect();
+    let (survey, mut meant) = survey::listen(span, &of_sockets, global)?;
+    heard_of(&survey, global).iter().for_each(|heard| fleets.hear(heard));
+    let not_asked: Vec<_> = running.into_iter().filter_map(|unit| fleets.ask(unit)).collect();
+    not_asked.into_iter().for_each(|(unit, why)| fleets.not_asked(unit, why));
+    fleets.managers.sort_by(|a, b| (a.fleet, &a.manager).cmp(&(b.fleet, &b.manager)));
+    meant.extend(&fleets.secured);
+    Ok((fleets, survey, meant))
+}
+
+fn is_meant(fleet: u32, global: &Global) -> bool {
+    global.fleet.is_none_or(|meant| meant == fleet)
+}
+
+fn heard_of<'s>(survey: &'s Survey, global: &Global) -> Vec<&'s Heard> {
+    survey.heard().iter().filter(|heard| !heard.is_survey() && is_meant(heard.fleet.0, global)).collect()
 }
 
 impl Fleets {
@@ -115,12 +168,21 @@ impl Fleets {
         self.manager(heard.fleet.0, name, epoch).heard.push(datagrams);
     }
 
-    fn ask(&mut self, running: RunningUnit) {
+    /// Why it was not asked, if so.
+    fn ask(&mut self, running: RunningUnit) -> Option<(RunningUnit, String)> {
         let refusal = running.refusal().map_or(Ok(()), |refusal| Err(refusal.into()));
-        if let Err(error) = refusal.and_then(|()| self.ask_at(&running.path)) {
-            let RunningUnit { unit: manager, fleet, path, .. } = running;
-            let (socket, not_asked) = (Some(path.display().to_string()), Some(error.to_string()));
-            self.managers.push(Manager { manager, fleet, socket, not_asked, ..Manager::default() });
+        let error = refusal.and_then(|()| self.ask_at(&running.path)).err()?;
+        Some((running, error.to_string()))
+    }
+
+    /// It is the run of its name that is known from others, if that is one alone; of several its socket does not say which.
+    fn not_asked(&mut self, RunningUnit { unit: manager, fleet, path, .. }: RunningUnit, why: String) {
+        let is_same = |known: &&mut Manager| known.fleet == fleet && known.manager == manager && known.socket.is_none();
+        let mut known: Vec<_> = self.managers.iter_mut().filter(is_same).collect();
+        let (socket, not_asked) = (Some(path.display().to_string()), Some(why));
+        match known.as_mut_slice() {
+            [one] => (one.socket, one.not_asked) = (socket, not_asked),
+            _ => self.managers.push(Manager { manager, fleet, socket, not_asked, ..Manager::default() }),
         }
     }
 
@@ -182,23 +244,26 @@ impl Fleets {
         }))?)
     }
 
-    fn table(&self) -> Rows {
-        let mut rows = Rows::new(["M_UNIT", "FLEET", "S_UNIT", "STATE"]);
-        let mut add = |style, manager: &str, fleet: u32, s_unit: &str, state: String| {
-            rows.add(style, [manager.to_owned(), fleet.to_string(), s_unit.to_owned(), state]);
-        };
+    fn lines(&self) -> Vec<Line> {
+        let mut lines = Vec::new();
         for manager in &self.managers {
-            let (name, fleet) = (&manager.manager, manager.fleet);
+            let is_of_socket = manager.socket.is_some();
+            let mut add = |style, s_unit: &str, state: String| {
+                let cells = [manager.manager.clone(), manager.fleet.to_string(), s_unit.to_owned(), state];
+                lines.push(Line { style, cells, is_of_socket });
+            };
             match &manager.s_units {
-                None => add(FAINT, name, fleet, "not known", format!("not asked: {}", manager.why_not())),
-                Some(s_units) if s_units.is_empty() => add(PLAIN, name, fleet, "none", "asked".into()),
-                Some(s_units) => s_units.iter().for_each(|s_unit| add(PLAIN, name, fleet, s_unit, "connected".into())),
+                None => add(FAINT, "not known", format!("not asked: {}", manager.why_not())),
+                Some(s_units) if s_units.is_empty() => add(PLAIN, "none", "asked".into()),
+                Some(s_units) => s_units.iter().for_each(|s_unit| add(PLAIN, s_unit, "connected".into())),
             }
         }
-        for vehicle in self.without() {
-            add(BAD, "-", vehicle.fleet, &vehicle.s_unit, vehicle.state());
-        }
-        rows
+        lines.extend(self.without().map(|vehicle| Line {
+            style: BAD,
+            cells: ["-".into(), vehicle.fleet.to_string(), vehicle.s_unit.clone(), vehicle.state()],
+            is_of_socket: !vehicle.missed_by.is_empty(),
+        }));
+        lines
     }
 }
 

@@ -1,6 +1,6 @@
 //! `cara scan`: the nodes on the network, and the ones that were refused and why.
 
-mod all_managers;
+pub(crate) mod all_managers;
 mod survey;
 
 use std::process::ExitCode;

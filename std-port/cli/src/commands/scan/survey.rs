@@ -50,7 +50,7 @@ pub(super) fn show(span: Duration, global: &Global) -> anyhow::Result<()> {
     }
     table(&heard).print()?;
     about_fleets(&heard)?;
-    about_keys(&survey, &heard, &meant, global)?;
+    print(about_keys(&survey, &heard, &meant, global))?;
     output::line(
         "\nA survey hears m_units, and s_units that look for their manager. S_units that have joined are silent: their \
          manager shows them (`cara scan` on its host).",
@@ -71,26 +71,49 @@ fn about_fleets(heard: &[&Heard]) -> std::io::Result<()> {
     Ok(())
 }
 
+/// Something to know of a survey.
+pub(super) struct Remark {
+    /// What went wrong; empty if nothing did.
+    pub(super) mistake: &'static str,
+    pub(super) text: String,
+}
+
+impl Remark {
+    /// What stands before the text.
+    pub(super) fn head(&self) -> String {
+        if self.mistake.is_empty() { String::new() } else { format!("{}: ", self.mistake) }
+    }
+}
+
+/// Each as a paragraph.
+pub(super) fn print(remarks: impl IntoIterator<Item = Remark>) -> std::io::Result<()> {
+    remarks.into_iter().try_for_each(|Remark { mistake, text }| match mistake {
+        "" => output::line(format_args!("\n{text}")),
+        _ => output::line(format_args!("\n{BAD}{mistake}{BAD:#}: {text}")),
+    })
+}
+
 /// What could not be asked or checked, and how it can be.
-pub(super) fn about_keys(survey: &Survey, heard: &[&Heard], meant: &[Fleet], global: &Global) -> std::io::Result<()> {
-    for refused in survey.keys().refused() {
-        output::line(format_args!("\n{BAD}keys were not taken{BAD:#}: {refused}"))?;
-    }
-    if heard.iter().any(|heard| heard.standing == Standing::OtherKeys) {
-        output::line(
-            "\n\"other keys\": their codes were made with none of the keys that are here: they have keys of another root, or of \
-             a generation that is over, or somebody speaks in their name",
-        )?;
-    }
-    for fleet in without_keys(survey, heard, meant, global) {
-        output::line(format_args!(
-            "\nthere are no keys of fleet {} here, so the survey did not ask its secured units, and nothing shows that those \
+pub(super) fn about_keys(survey: &Survey, heard: &[&Heard], meant: &[Fleet], global: &Global) -> Vec<Remark> {
+    let plain = |text| Remark { mistake: "", text };
+    let refused = survey.keys().refused().iter();
+    let refused = refused.map(|refused| Remark { mistake: "keys were not taken", text: refused.to_string() });
+    let others = heard.iter().any(|heard| heard.standing == Standing::OtherKeys).then(|| {
+        plain(
+            "\"other keys\": their codes were made with none of the keys that are here: they have keys of another root, or of \
+             a generation that is over, or somebody speaks in their name"
+                .to_owned(),
+        )
+    });
+    let without = without_keys(survey, heard, meant, global).into_iter().map(|fleet| {
+        plain(format!(
+            "there are no keys of fleet {} here, so the survey did not ask its secured units, and nothing shows that those \
              which were heard belong to it: {}",
             fleet.0,
             listening::how_to_get_keys(fleet)
-        ))?;
-    }
-    Ok(())
+        ))
+    });
+    refused.chain(others).chain(without).collect()
 }
 
 /// Fleets whose secured units were not asked. Plain mode needs no keys.

@@ -110,7 +110,7 @@ function drawLink() {
   flag($("link"), "good", !wrong && state.heard !== null);
   $("me").hidden = !state.me?.name;
   if (state.me?.name) text($("me"), `${state.me.name} ${ROLES[state.me.role] ?? state.me.role}`);
-  $("doctor").disabled = doctorLooks || !may("see");
+  for (const button of ["doctor", "managers-look"]) $(button).disabled = surveys.has(button) || !may("see");
   const unit = state.unit[""];
   if (unit) {
     text($("unit"), `${unit.name}/${unit.id}`);
@@ -155,18 +155,22 @@ function keyboard(event) {
   }
 }
 
-let doctorLooks = false;
-async function doctor() {
-  doctorLooks = $("doctor").disabled = true;
-  text($("doctor-about"), "listens for 6 s …");
+// Surveys of the network that this page has asked for, by their buttons.
+const surveys = new Set();
+async function survey(button, about, path, seconds) {
+  surveys.add(button);
+  $(button).disabled = true;
+  text($(about), `listens for ${seconds} s …`);
+  let failure = null;
   try {
-    for await (const line of api.ask("api/doctor", {})) {
-      if (line.answer === "failed") text($("doctor-about"), line.text);
+    for await (const line of api.ask(path, {})) {
+      if (line.answer === "failed") failure = line.text;
     }
   } catch (error) {
-    text($("doctor-about"), `not reached: ${error.message}`);
+    failure = `not reached: ${error.message}`;
   }
-  doctorLooks = false;
+  if (failure) text($(about), failure);
+  surveys.delete(button);
 }
 
 api.token();
@@ -182,7 +186,8 @@ $("confirm-no").onclick = () => $("confirm").close();
 $("confirm-yes").onclick = () => { $("confirm").close(); stopAll("reset"); };
 $("help-open").onclick = () => $("help").showModal();
 $("help-close").onclick = () => $("help").close();
-$("doctor").onclick = doctor;
+$("doctor").onclick = () => survey("doctor", "doctor-about", "api/doctor", 6);
+$("managers-look").onclick = () => survey("managers-look", "managers-about", "api/managers", 2);
 $("alarms-all").onclick = () => alarms.acknowledge();
 $("filter").oninput = () => nodes.draw();
 // A token is not to be passed by: without it nothing is shown.

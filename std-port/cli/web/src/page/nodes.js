@@ -1,4 +1,4 @@
-// The table of nodes, the chosen one, orders, events, what the doctor found, and limits.
+// The table of nodes, the chosen one, orders, events, what the doctor found, all managers, and limits.
 
 import { $, facts, flag, make, rows, span, text, words } from "./dom.js";
 import { chosen, clock, natural, nodes, now, state, trouble } from "./state.js";
@@ -55,6 +55,7 @@ export function draw() {
   drawOrders();
   drawEvents();
   drawDoctor();
+  drawManagers();
   drawLimits();
 }
 
@@ -142,10 +143,11 @@ function drawEvents() {
 }
 
 let found = null;
+const looked = (at) => `looked ${span(now() - at)} ago, at ${clock(Date.now() - (now() - at))}`;
 function drawDoctor() {
   const doctor = state.doctor[""];
   const refused = Object.entries(state.refused);
-  if (doctor) text($("doctor-about"), `looked ${span(now() - doctor.at)} ago, at ${clock(Date.now() - (now() - doctor.at))}`);
+  if (doctor) text($("doctor-about"), looked(doctor.at));
   const key = JSON.stringify([doctor, refused]);
   if (key === found) return;
   found = key;
@@ -157,6 +159,17 @@ function drawDoctor() {
 
 const finding = (severity, what, seen, advice) => make("li", {},
   make("strong", { className: { error: "bad", warning: "warn" }[severity] ?? "good" }, `${severity}: ${what}`), seen ? ` ${seen}` : "", make("div", { className: "advice" }, `→ ${advice}`));
+
+let asked = null;
+function drawManagers() {
+  const managers = state.managers[""];
+  if (!managers) return;
+  text($("managers-about"), looked(managers.at));
+  if (managers === asked) return;
+  asked = managers;
+  $("managers").replaceChildren(...managers.rows.map(({ cells, kind }) => make("tr", { className: kind }, ...cells.map((cell, index) => make("td", { className: index === 1 ? "number" : "" }, cell)))));
+  $("managers-remarks").replaceChildren(...managers.remarks.map((remark) => make("li", { className: "faint" }, remark)));
+}
 
 function drawLimits() {
   const all = state.limits[""] ?? [];
