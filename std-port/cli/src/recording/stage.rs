@@ -168,6 +168,9 @@ impl Stage {
                 Question::Watch | Question::Streams { .. } => {
                     let watched = if *question == Question::Watch { Watched::Events } else { Watched::Streams };
                     let (sender, answers) = sync_channel(WAITING);
+                    // The newest values come first, as a unit sends them.
+                    let newest = state.streams.values().filter(|_| watched == Watched::Streams);
+                    newest.for_each(|value| drop(sender.try_send(value.clone())));
                     state.watching.push((watched, sender));
                     drop(state);
                     return pass_on(stream, watched, &answers);

@@ -2,14 +2,17 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::Write as _;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::Command;
+use std::time::Instant;
 
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use serde_json::Value;
 
-use crate::support::{Running, Stage, until};
+use crate::support::{PATIENCE, Running, Stage, until};
+use crate::terminal::OnTerminal;
 
 /// A line of the log of `agv-1`.
 const LOGGED: &str = "agv-1 has drawn its map";
@@ -89,6 +92,58 @@ fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_fil
     stage.ends(2, &["stop", "--all", "--socket", socket]).says("this is a recording");
     stage.ends(1, &["replay", folder.path().join("none").to_str().unwrap()]);
     agv.stop();
+}
+
+/// A recording that answers at `socket`, with its manager and vehicles gone.
+fn replaying(speed: &str) -> (Stage, tempfile::TempDir, Running, String) {
+    let (mut stage, agv, _pose) = stage();
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (file, socket) = (path("a.mcap"), path("replay.sock"));
+    record(&mut stage, Path::new(&file), Path::new(&path("killed.mcap")));
+    agv.stop();
+    stage.stop_agvs();
+    stage.kill_manager();
+    let replaying = Running::start(stage.command(&["replay", &file, "--serve", &socket, "--speed", speed]));
+    until("the recording answers", || stage.cara(&["scan", "--socket", &socket]).code == 0);
+    (stage, folder, replaying, socket)
+}
+
+#[test]
+fn top_shows_a_recording_at_any_speed() {
+    for speed in ["0.9", "1000"] {
+        let (stage, _folder, _replaying, socket) = replaying(speed);
+        let mut command = stage.command(&["top", "--socket", &socket]);
+        command.env("TERM", "xterm-256color");
+        let mut top = OnTerminal::start(&command);
+        let is_live = |shown: &str, node| shown.lines().any(|line| line.contains(node) && line.contains(" live "));
+        top.until(&format!("both at speed {speed}"), |shown| {
+            shown.contains("cara top  manager/1") && is_live(shown, "agv-1/11") && is_live(shown, "late-1/12")
+        });
+        top.type_in("q");
+        assert_eq!(top.ends_restored(), 0);
+    }
+}
+
+#[test]
+fn the_page_shows_a_recording_at_any_speed() {
+    for speed in ["0.9", "1000"] {
+        let (stage, _folder, _replaying, socket) = replaying(speed);
+        let mut web = Running::start(stage.command(&["web", "--socket", &socket, "--listen", "127.0.0.1:0"]));
+        let line = web.expect("the page is at ");
+        let (address, key) = line.rsplit_once("http://").unwrap().1.split_once("/#").unwrap();
+        let mut page = TcpStream::connect(address).unwrap();
+        page.set_read_timeout(Some(PATIENCE)).unwrap();
+        write!(page, "GET /api/stream HTTP/1.1\r\nhost: {address}\r\nauthorization: Bearer {key}\r\n\r\n").unwrap();
+        let (mut told, mut piece, start) = (Vec::new(), [0; 4096], Instant::now());
+        // Its nodes, and a stream with its value.
+        let wanted = ["\"agv-1/11@s_unit\":{", "\"late-1/12@s_unit\":{", "pose() -> (x: int)", "[[\"x\",[7]"];
+        while !wanted.iter().all(|part| String::from_utf8_lossy(&told).contains(part)) {
+            let read = page.read(&mut piece).unwrap_or_default();
+            assert!(read > 0 && start.elapsed() < PATIENCE, "at speed {speed} only {}", String::from_utf8_lossy(&told));
+            told.extend_from_slice(&piece[..read]);
+        }
+    }
 }
 
 /// A limit of the system for the size of files stands for a disk that is full, and later has space again.
