@@ -45,12 +45,30 @@ pub(crate) fn shown(argument: &Argument) -> Value {
 }
 
 /// The value of a stream's variable: its name, the value, and whether that is JSON as text.
-pub(crate) fn streamed(argument: &Argument) -> Value {
+fn streamed(argument: &Argument) -> Value {
     let value = shown(argument)["value"].take();
     match &argument.value {
         ArgumentValue::List(_) | ArgumentValue::Record(_) => json!([argument.name, value, true]),
         _ => json!([argument.name, value]),
     }
+}
+
+/// The values of a stream, in the order of its signature. Of a piece of a log there is its text; one of defmt takes the firmware's
+/// file, which a page does not have.
+pub(crate) fn streamed_all(stream: &str, values: &[Argument]) -> Value {
+    let is_log = stream.split('(').next() == Some("log");
+    let is_defmt = values.iter().any(|value| value.name == "build");
+    let one = |value: &Argument| match &value.value {
+        ArgumentValue::Bytes(digits) if is_log && is_defmt => {
+            json!([value.name, format!("{} bytes of defmt", digits.len() / 2), true])
+        }
+        ArgumentValue::Bytes(digits) if is_log => match hex::decode(digits) {
+            Ok(bytes) => json!([value.name, Shown(&String::from_utf8_lossy(&bytes)).to_string(), true]),
+            Err(_) => streamed(value),
+        },
+        _ => streamed(value),
+    };
+    values.iter().map(one).collect()
 }
 
 /// A call as a page asks for it: as on the control socket, with values in the page's form.
@@ -94,6 +112,20 @@ mod tests {
             "node": "agv/1", "function": "go_to", "asynchronous": false, "timeout_ms": null, "priority": null,
             "best_effort": false, "arguments": [{ "name": "position", "size": 2, "type": "int", "value": value }],
         })
+    }
+
+    #[test]
+    fn a_piece_of_a_log_is_text_and_one_of_defmt_its_length() {
+        let log = |build: bool| {
+            let value = |name: &str, value| Argument { name: name.to_owned(), size: 1, value };
+            let build = build.then(|| value("build", ArgumentValue::Int(vec![7])));
+            let piece = value("piece", ArgumentValue::Bytes("6f6e65ff".to_owned()));
+            build.into_iter().chain([piece]).collect::<Vec<_>>()
+        };
+        assert_eq!(streamed_all("log() -> (piece: bytes[9])", &log(false)), json!([["piece", "one\u{fffd}", true]]));
+        let defmt = json!([["build", ["7"]], ["piece", "4 bytes of defmt", true]]);
+        assert_eq!(streamed_all("log() -> (build: int, piece: bytes[9])", &log(true)), defmt);
+        assert_eq!(streamed_all("scan() -> (piece: bytes[9])", &log(false)), json!([["piece", "6f6e65ff"]]));
     }
 
     #[test]

@@ -202,8 +202,8 @@ fn streams(shared: &Shared, way: &mut dyn Connection) -> anyhow::Result<()> {
     way.ask(&Question::Streams { interval_ms: STREAM_INTERVAL_MS, names: Vec::new() }, &mut |answer| {
         if let Answer::Value { node, stream, age_us: Some(age), values, error: None, .. } = answer {
             // Pairs, in the order of the signature: an object has none, and a place is the first two numbers of a pose.
-            let values: Vec<_> = values.iter().map(form::streamed).collect();
-            shared.picture().value(&node, &stream, &values.into(), age / 1000, &shared.limits);
+            let values = form::streamed_all(&stream, &values);
+            shared.picture().value(&node, &stream, &values, age / 1000, &shared.limits);
         }
         ControlFlow::Continue(())
     })
