@@ -1,6 +1,7 @@
 //! A vehicle that a gateway drives: a point that moves at a constant speed, and actions that take a while.
 //!
-//! Its output is what really happens: `drive 4 b`, `passed b`, `arrived c`, `stood 1.25`, `act 5 pick-1`, `ended pick-1 FINISHED`.
+//! Its output is what really happens: `drive 4 b`, `passed b`, `arrived c`, `stood 1.25`, `act 5 pick-1`, `ended pick-1 FINISHED`;
+//! of several vehicles each line begins with the vehicle's name.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -49,6 +50,8 @@ struct Options {
 }
 
 struct Body {
+    /// Before each line of its output.
+    prefix: String,
     condition: Condition,
     /// What it was told to drive over.
     legs: Vec<Leg>,
@@ -123,7 +126,7 @@ impl Guided for Vehicle {
         }
         call.commit(|| {
             if number > body.condition.action {
-                println!("act {number} {id}");
+                println!("{}act {number} {id}", body.prefix);
                 body.condition.action = number;
                 let details: Value = serde_json::from_str(details).unwrap_or_default();
                 body.action = Some((id.to_owned(), kind.to_owned(), details, Instant::now()));
@@ -174,7 +177,7 @@ impl Body {
             self.condition.driven += left.min(step);
             if part >= 1.0 {
                 let is_last = self.legs.last().is_some_and(|last| last.number == leg.number);
-                println!("{} {}", if is_last { "arrived" } else { "passed" }, leg.node);
+                println!("{}{} {}", self.prefix, if is_last { "arrived" } else { "passed" }, leg.node);
                 self.next_leg();
                 self.condition.is_driving = !self.condition.has_arrived;
             }
@@ -183,15 +186,15 @@ impl Body {
         if self.condition.has_arrived {
             done.extend(self.drive.take());
         } else if was_driving && !self.condition.is_driving {
-            println!("stood {:.3}", self.condition.position[0]);
+            println!("{}stood {:.3}", self.prefix, self.condition.position[0]);
         }
         if let Some((id, kind, details, since)) = self.action.take() {
             let may_act = self.handling.as_ref().is_some_and(LeaseWatch::is_live);
             if !may_act {
-                println!("ended {id} FAILED");
+                println!("{}ended {id} FAILED", self.prefix);
                 self.end_with(ActionStatus::Failed, "nobody wanted it any more");
             } else if since.elapsed() >= self.takes {
-                println!("ended {id} FINISHED");
+                println!("{}ended {id} FINISHED", self.prefix);
                 self.handled(&kind, &details);
                 self.end_with(ActionStatus::Finished, "done");
                 done.extend(self.handling.take());
@@ -215,7 +218,7 @@ impl Body {
         let next = self.legs.iter().find(|leg| leg.number > self.condition.drive);
         self.condition.has_arrived = next.is_none();
         if let Some(Leg { number, node, .. }) = next {
-            println!("drive {number} {node}");
+            println!("{}drive {number} {node}", self.prefix);
             self.condition.drive = *number;
         }
     }
@@ -263,10 +266,12 @@ fn main() -> anyhow::Result<()> {
 }
 
 fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Unit<Vehicle>)> {
-    let Options { manager, manager_id, fleet, speed, x, action, .. } = options;
+    let Options { manager, manager_id, fleet, speed, x, action, vehicles, .. } = options;
     let position = [*x, 0.0, 0.0];
     let condition = Condition { position, map: "hall".into(), charge: 80.0, ..Condition::default() };
+    let prefix = if *vehicles > 1 { format!("{name} ") } else { String::new() };
     let vehicle = Vehicle(Arc::new(Mutex::new(Body {
+        prefix,
         condition,
         legs: Vec::new(),
         loads: Vec::new(),
