@@ -1,18 +1,21 @@
-//! A vehicle that a gateway drives: a point that moves at a constant speed, and actions that take a while.
+//! A vehicle that a gateway drives: a point that moves at a constant speed, or a body of `examples/warehouse` on its floor of cells,
+//! and actions that take a while.
 //!
 //! Its output is what really happens: `drive 4 b`, `passed b`, `arrived c`, `stood 1.25`, `act 5 pick-1`, `ended pick-1 FINISHED`;
-//! of several vehicles each line begins with the vehicle's name.
+//! of several vehicles each line begins with the vehicle's name. One of the warehouse also writes its log: `7.020000000 agv-1 enter 3,4`.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use cara_apps::warehouse::Cell;
 use cara_std::{AnyCall, Interfaces, LeaseWatch, ServiceError, Unit};
 use cara_vda5050::message::{ActionStatus, Load};
 use cara_vda5050::stretch::{Leg, Stretch};
 use cara_vda5050::vehicle::{
     ACTION_STATUSES, Condition, Equipment, Equipped, EquippedServer, Guided, GuidedServer, refusal,
 };
+use cara_warehouse::vehicle::Shared;
 use clap::Parser;
 use serde_json::Value;
 
@@ -41,6 +44,10 @@ struct Options {
     /// Where it stands at first.
     #[arg(long, default_value_t = 0.0)]
     x: f64,
+    /// A vehicle of the warehouse, which stands in this cell at first. Nodes are the middles of cells, a metre apart; each edge leads
+    /// to a cell beside.
+    #[arg(long, value_parser = |text: &str| text.parse::<Cell>().map_err(|()| "write a cell as 3,4"))]
+    cell: Option<Cell>,
     /// So many of them: behind agv-1 come agv-2, agv-3 …, with the ID numbers that follow.
     #[arg(long, default_value_t = 1)]
     vehicles: u32,
@@ -53,6 +60,8 @@ struct Body {
     /// Before each line of its output.
     prefix: String,
     condition: Condition,
+    /// Of one of the warehouse.
+    on_floor: Option<Shared>,
     /// What it was told to drive over.
     legs: Vec<Leg>,
     loads: Vec<Load>,
@@ -99,6 +108,9 @@ impl Guided for Vehicle {
         let Some(legs) = legs else { return Err(ServiceError::Failed(refusal::NO_WAY)) };
         if number + count <= body.condition.drive {
             return Err(ServiceError::Failed(refusal::OLD_NUMBER));
+        }
+        if !body.can_drive(&legs) {
+            return Err(ServiceError::Failed(refusal::NO_WAY));
         }
         call.commit(|| {
             map.clone_into(&mut body.condition.map);
@@ -162,25 +174,14 @@ impl Body {
         let mut done = Vec::new();
         let may_drive = self.may_drive();
         let was_driving = self.condition.is_driving;
-        self.condition.is_driving = may_drive && self.leg().is_some() && !self.condition.has_arrived;
-        let mut speed = 0.0;
-        if self.condition.is_driving
-            && let Some(leg) = self.leg().cloned()
-            && let Some([x, y]) = leg.position
-        {
-            speed = leg.max_speed.unwrap_or(self.speed).min(self.speed);
-            let [at_x, at_y, at_theta] = self.condition.position;
-            let (left, step) = ((x - at_x).hypot(y - at_y), speed * seconds);
-            let part = if left <= step { 1.0 } else { step / left };
-            let theta = leg.theta.unwrap_or(at_theta);
-            self.condition.position = [at_x + (x - at_x) * part, at_y + (y - at_y) * part, theta];
-            self.condition.driven += left.min(step);
-            if part >= 1.0 {
-                let is_last = self.legs.last().is_some_and(|last| last.number == leg.number);
-                println!("{}{} {}", self.prefix, if is_last { "arrived" } else { "passed" }, leg.node);
-                self.next_leg();
-                self.condition.is_driving = !self.condition.has_arrived;
-            }
+        let leg = self.leg().filter(|_| may_drive && !self.condition.has_arrived).cloned();
+        let (speed, is_there) = self.advance(leg.as_ref(), seconds);
+        self.condition.is_driving = leg.is_some() || speed > 0.0;
+        if let Some(leg) = leg.filter(|_| is_there) {
+            let is_last = self.legs.last().is_some_and(|last| last.number == leg.number);
+            println!("{}{} {}", self.prefix, if is_last { "arrived" } else { "passed" }, leg.node);
+            self.next_leg();
+            self.condition.is_driving = !self.condition.has_arrived;
         }
         self.condition.velocity = [if self.condition.is_driving { speed } else { 0.0 }, 0.0, 0.0];
         if self.condition.has_arrived {
@@ -205,6 +206,47 @@ impl Body {
         done
     }
 
+    /// Moves to the end of a leg, or down to a stop: how fast, and whether it is there.
+    fn advance(&mut self, leg: Option<&Leg>, seconds: f64) -> (f64, bool) {
+        let [at_x, at_y, at_theta] = self.condition.position;
+        let theta = leg.and_then(|leg| leg.theta).unwrap_or(at_theta);
+        let (to, speed, is_there) = if let Some(vehicle) = &self.on_floor {
+            let mut vehicle = vehicle.lock();
+            let before = vehicle.agv.body.at();
+            let is_there = vehicle.agv.body.step(Duration::from_secs_f64(seconds), leg.is_some(), false);
+            if is_there {
+                vehicle.note(format_args!("leave {before}"));
+            }
+            vehicle.log.drain(..).for_each(|line| println!("{line}"));
+            let [x, y] = vehicle.agv.body.position();
+            ([x, y], (x - at_x).hypot(y - at_y) / seconds, is_there)
+        } else if let Some((leg, [x, y])) = leg.and_then(|leg| Some((leg, leg.position?))) {
+            let speed = leg.max_speed.unwrap_or(self.speed).min(self.speed);
+            let (left, step) = ((x - at_x).hypot(y - at_y), speed * seconds);
+            let part = if left <= step { 1.0 } else { step / left };
+            ([at_x + (x - at_x) * part, at_y + (y - at_y) * part], speed, part >= 1.0)
+        } else {
+            ([at_x, at_y], 0.0, false)
+        };
+        self.condition.position = [to[0], to[1], theta];
+        self.condition.driven += (to[0] - at_x).hypot(to[1] - at_y);
+        (speed, is_there)
+    }
+
+    /// Whether it gets there: on a floor from cell to cell.
+    fn can_drive(&self, legs: &[Leg]) -> bool {
+        let Some(vehicle) = &self.on_floor else { return true };
+        let body = &vehicle.lock().agv.body;
+        let goes_on = !self.condition.has_arrived && legs.iter().any(|leg| leg.number == self.condition.drive);
+        let mut at = goes_on.then(|| body.next());
+        let mut new = legs.iter().filter(|leg| leg.number > self.condition.drive).map(cell);
+        new.all(|cell| {
+            let before = at;
+            at = cell;
+            cell.is_some_and(|cell| before.map_or(body.can_enter(cell), |before| before.distance(cell) == 1))
+        })
+    }
+
     fn may_drive(&self) -> bool {
         self.may_drive.as_ref().is_some_and(LeaseWatch::is_live) && !self.is_stopped.load(Ordering::SeqCst)
     }
@@ -217,9 +259,16 @@ impl Body {
     fn next_leg(&mut self) {
         let next = self.legs.iter().find(|leg| leg.number > self.condition.drive);
         self.condition.has_arrived = next.is_none();
-        if let Some(Leg { number, node, .. }) = next {
+        if let Some(next @ Leg { number, node, .. }) = next {
             println!("{}drive {number} {node}", self.prefix);
             self.condition.drive = *number;
+            if let (Some(vehicle), Some(cell)) = (&self.on_floor, cell(next)) {
+                let mut vehicle = vehicle.lock();
+                if vehicle.agv.body.next() != cell {
+                    vehicle.agv.body.enter(cell);
+                    vehicle.note(format_args!("enter {cell}"));
+                }
+            }
         }
     }
 
@@ -240,6 +289,11 @@ impl Body {
         self.condition.action_status = index as i64;
         result.clone_into(&mut self.condition.action_result);
     }
+}
+
+/// The cell at the end of a leg.
+fn cell(leg: &Leg) -> Option<Cell> {
+    Cell::of_numbers(leg.position?.map(|metres| metres.round() as i64))
 }
 
 fn main() -> anyhow::Result<()> {
@@ -267,11 +321,12 @@ fn main() -> anyhow::Result<()> {
 
 fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Unit<Vehicle>)> {
     let Options { manager, manager_id, fleet, speed, x, action, vehicles, .. } = options;
-    let position = [*x, 0.0, 0.0];
+    let position = options.cell.map_or([*x, 0.0, 0.0], |cell| [f64::from(cell.x), f64::from(cell.y), 0.0]);
     let condition = Condition { position, map: "hall".into(), charge: 80.0, ..Condition::default() };
     let prefix = if *vehicles > 1 { format!("{name} ") } else { String::new() };
     let vehicle = Vehicle(Arc::new(Mutex::new(Body {
         prefix,
+        on_floor: options.cell.map(|cell| Shared::new(name.to_owned(), cell, 80.0)),
         condition,
         legs: Vec::new(),
         loads: Vec::new(),

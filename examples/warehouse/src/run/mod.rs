@@ -5,7 +5,7 @@ mod child;
 mod report;
 mod soak;
 mod stage;
-mod truth;
+pub mod truth;
 
 use std::collections::HashSet;
 use std::path::PathBuf;

@@ -28,7 +28,7 @@ impl Stop {
 
 /// What the vehicles have done.
 #[derive(Debug)]
-pub(super) struct Truth<'m> {
+pub struct Truth<'m> {
     map: &'m Map,
     orders: &'m [Order],
     /// Lines by their time, which have not been looked at yet.
@@ -40,17 +40,18 @@ pub(super) struct Truth<'m> {
     pub(super) stops: Vec<Stop>,
     pub(super) restarts: usize,
     /// From cell to cell, of each vehicle.
-    pub(super) moves: HashMap<String, usize>,
+    pub moves: HashMap<String, usize>,
     /// How often each order's parcel was put down.
     pub(super) delivered: HashMap<usize, usize>,
     /// Orders whose parcels were put down, also where the line has not been looked at yet.
     pub(super) done: HashSet<usize>,
     /// What is wrong.
-    pub(super) wrong: Vec<String>,
+    pub wrong: Vec<String>,
 }
 
 impl<'m> Truth<'m> {
-    pub(super) fn new(map: &'m Map, orders: &'m [Order]) -> Self {
+    /// Of vehicles that have not said anything yet.
+    pub fn new(map: &'m Map, orders: &'m [Order]) -> Self {
         Self {
             map,
             orders,
@@ -69,7 +70,7 @@ impl<'m> Truth<'m> {
     }
 
     /// A line of a process with vehicles.
-    pub(super) fn hear(&mut self, line: &str) {
+    pub fn hear(&mut self, line: &str) {
         let Some((time, vehicle, what)) = split(line) else {
             self.wrong.push(format!("no line of a log: `{line}`"));
             return;
@@ -91,7 +92,7 @@ impl<'m> Truth<'m> {
     }
 
     /// Looks at all that has come.
-    pub(super) fn finish(&mut self) {
+    pub fn finish(&mut self) {
         for (vehicle, what) in std::mem::take(&mut self.waiting).into_values() {
             self.take(&vehicle, &what);
         }

@@ -131,6 +131,17 @@ impl Plant {
         version: &'static str,
         secured: impl Fn(&Path) -> (String, String),
     ) -> Self {
+        Self::on_floor(vehicles, &[], on_broker_loss, version, secured)
+    }
+
+    /// With vehicles of the warehouse that stand in these cells, if there are any.
+    pub fn on_floor(
+        vehicles: u32,
+        cells: &[String],
+        on_broker_loss: &str,
+        version: &'static str,
+        secured: impl Fn(&Path) -> (String, String),
+    ) -> Self {
         static FLEETS: AtomicU32 = AtomicU32::new(0);
         let fleet = 5_050_000 + std::process::id() % 10_000 * 20 + FLEETS.fetch_add(1, Ordering::SeqCst);
         let (folder, port, heard) = (tempfile::tempdir().unwrap(), free_port(), Messages::default());
@@ -156,10 +167,10 @@ impl Plant {
             .unwrap();
         // Each a process, or one for many.
         let others = match vehicles {
-            0..=20 => (2..=vehicles).map(|number| vehicles_from(folder.path(), fleet, number, 1)).collect(),
-            _ => vec![vehicles_from(folder.path(), fleet, 2, vehicles - 1)],
+            0..=20 => (2..=vehicles).map(|number| vehicles_from(folder.path(), fleet, number, 1, cells)).collect(),
+            _ => vec![vehicles_from(folder.path(), fleet, 2, vehicles - 1, &[])],
         };
-        let vehicle = vehicle(folder.path(), fleet, 1);
+        let vehicle = vehicles_from(folder.path(), fleet, 1, 1, cells);
         let broker = Some(broker(folder.path(), port, &more_of_broker));
         let client = master(port, heard.clone());
         let gateway = None;
@@ -361,15 +372,18 @@ pub fn keys(folder: &Path, fleet: u32, vehicles: u32) {
 }
 
 pub fn vehicle(folder: &Path, fleet: u32, number: u32) -> Process {
-    vehicles_from(folder, fleet, number, 1)
+    vehicles_from(folder, fleet, number, 1, &[])
 }
 
-fn vehicles_from(folder: &Path, fleet: u32, number: u32, count: u32) -> Process {
+fn vehicles_from(folder: &Path, fleet: u32, number: u32, count: u32, cells: &[String]) -> Process {
     // Examples are beside the programs.
     let file = Path::new(env!("CARGO_BIN_EXE_cara-vda5050")).with_file_name("examples").join("vehicle");
     let mut command = Command::new(file);
     let (name, id) = (format!("agv-{number}"), (100 + number).to_string());
     command.args([&name, &id]).args(["--vehicles", &count.to_string(), "--speed", "2", "--fleet", &fleet.to_string()]);
+    if let Some(cell) = cells.get(number as usize - 1) {
+        command.args(["--cell", cell]);
+    }
     Process::start(
         command
             .env("CARA_KEYS", folder.join("keys"))
