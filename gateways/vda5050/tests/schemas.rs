@@ -205,6 +205,15 @@ fn names_of_another_version_are_refused() {
     }
 }
 
+/// What stops a vehicle is not refused for the name of a description.
+#[test]
+fn a_pause_with_a_name_of_2_is_read() {
+    let schema = schema(THIRD, "instantActions");
+    let text = generated(&schema, &schema, true, 0).to_string().replace("actionDescriptor", "actionDescription");
+    let message = read::<InstantActions>(Version::V3, text.as_bytes()).unwrap();
+    assert_eq!(message.actions[0].action_description.as_deref(), Some("text-0"));
+}
+
 #[test]
 fn members_may_be_null() {
     let schema = schema("2.1.0", "order");

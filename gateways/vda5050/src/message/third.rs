@@ -89,6 +89,9 @@ const GONE: [(&str, &str, bool); 7] = [
     ("maxStringLens", "enumLen", false),
 ];
 
+/// Where members are limits.
+const LIMITS: [&str; 2] = ["edges", "corridor"];
+
 /// Whose content is the application's.
 const OPAQUE: [&str; 2] = ["value", "data"];
 
@@ -96,7 +99,8 @@ fn names(within: &str) -> impl Iterator<Item = (&'static str, &'static str)> {
     NAMES.into_iter().filter(move |(place, ..)| place.is_empty() || *place == within).map(|(_, old, new)| (old, new))
 }
 
-/// From 3.0 to the model. A message that has a member under its name of 2.x is refused: nobody would see that it does nothing.
+/// From 3.0 to the model. An order that has a limit under its name of 2.x is refused: nobody would see that it limits nothing. Other
+/// names of 2.x do no harm, and are no reason to refuse what stops a vehicle.
 pub(super) fn read(message: &mut Value) -> Result<(), String> {
     adopt(message, "", true)?;
     join(message);
@@ -112,8 +116,10 @@ pub(super) fn read_any(factsheet: &mut Value) {
 fn adopt(value: &mut Value, within: &str, is_strict: bool) -> Result<(), String> {
     match value {
         Value::Object(object) => {
-            let refused = names(within).find(|(old, _)| *old != ROTATION_OF_SCHEMA && object.contains_key(*old));
-            if let Some((old, new)) = refused.filter(|_| is_strict) {
+            let is_limit = |(place, old, _): &(&str, &str, &str)| {
+                *place == within && LIMITS.contains(place) && *old != ROTATION_OF_SCHEMA && object.contains_key(*old)
+            };
+            if let Some((_, old, new)) = NAMES.iter().find(|row| is_strict && is_limit(row)) {
                 return Err(format!("{old} is called {new} in 3.0"));
             }
             for (old, new) in names(within) {
