@@ -10,7 +10,8 @@ use cara_processes::network::run;
 
 use crate::Kind;
 use crate::disk::Way;
-use crate::pair::{Group, MANAGER, Pair, VEHICLE};
+use crate::group::Group;
+use crate::pair::{MANAGER, Pair, VEHICLE};
 
 /// More than are served at a time.
 const CONNECTIONS: usize = 12;

@@ -16,6 +16,7 @@ use tempfile::TempDir;
 
 use crate::Kind;
 use crate::disk::Disk;
+use crate::group::Group;
 use crate::motion::{LEASE, Motion, Why};
 
 pub(crate) const MANAGER: usize = 0;
@@ -426,7 +427,7 @@ impl Drop for Pair {
         if let Kind::Killed(side) = self.kind
             && let Ok(group) = Group::of(side)
         {
-            let _ = std::fs::remove_dir(group.folder);
+            group.remove();
         }
     }
 }
@@ -438,47 +439,4 @@ fn faketime() -> Result<PathBuf> {
     places
         .find(|path| path.exists())
         .context("the time of day is changed by `libfaketime`: apt-get install libfaketime")
-}
-
-/// A control group whose memory has a limit, of either version of Linux's interface.
-pub(crate) struct Group {
-    folder: PathBuf,
-    is_old: bool,
-}
-
-impl Group {
-    pub(crate) fn of(side: usize) -> Result<Self> {
-        let roots = [("/sys/fs/cgroup/memory", true), ("/sys/fs/cgroup", false)];
-        let has_memory = |root: &str, is_old| {
-            let controllers = std::fs::read_to_string(format!("{root}/cgroup.subtree_control")).unwrap_or_default();
-            if is_old { Path::new(root).join("memory.limit_in_bytes").exists() } else { controllers.contains("memory") }
-        };
-        let root = roots.into_iter().find(|(root, is_old)| has_memory(root, *is_old));
-        let (root, is_old) = root.context("this kernel limits the memory of no group")?;
-        Ok(Self { folder: Path::new(root).join(format!("cara-hosts-{}-{side}", std::process::id())), is_old })
-    }
-
-    fn make(side: usize) -> Result<()> {
-        Ok(std::fs::create_dir(Self::of(side)?.folder)?)
-    }
-
-    fn path(&self) -> std::path::Display<'_> {
-        self.folder.display()
-    }
-
-    fn set(&self, limit: &str) -> Result<()> {
-        let file = if self.is_old { "memory.limit_in_bytes" } else { "memory.max" };
-        Ok(std::fs::write(self.folder.join(file), limit)?)
-    }
-
-    /// Lets it have so many bytes more than it has.
-    pub(crate) fn limit(&self, more: u64) -> Result<()> {
-        let file = if self.is_old { "memory.usage_in_bytes" } else { "memory.current" };
-        let used: u64 = std::fs::read_to_string(self.folder.join(file))?.trim().parse()?;
-        self.set(&(used + more).to_string())
-    }
-
-    pub(crate) fn free(&self) -> Result<()> {
-        self.set(if self.is_old { "-1" } else { "max" })
-    }
 }
