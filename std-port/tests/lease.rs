@@ -1,4 +1,4 @@
-//! A service's lease, in every order in which threads can write and read it.
+//! A service's lease, the heart that renews it, and the latch of a stop, in every order in which threads can write and read them.
 //!
 //! `Lease` is the core's own. Two links write it, under a lock as in `safe_hook.rs`, and the application reads it without.
 //! Where the links take no lock, the model must fail.
@@ -9,6 +9,9 @@
 extern crate self as core;
 use std::*;
 
+#[allow(dead_code, unused_imports, unreachable_pub, reason = "the file is included for the type it defines")]
+#[path = "../../core/src/services/heart.rs"]
+mod heart;
 #[allow(dead_code, unreachable_pub, reason = "the file is included for the type it defines")]
 #[path = "../../core/src/distribution/latch.rs"]
 mod latch;
@@ -71,6 +74,9 @@ mod sync {
 
 use std::cell::Cell;
 
+use cara_core::distribution::message::Latch;
+use heart::Heart;
+use latch::LatchWord;
 use lease::{Lease, LeaseEnd, Order};
 use loom::sync::{Arc, Mutex};
 use loom::thread;
@@ -182,4 +188,43 @@ fn an_order_that_was_seen_dead_stays_dead() {
             writer.join().unwrap();
         });
     }
+}
+
+/// A loop's heart is dropped, and the next loop gets it and beats, while a link renews the order of the first one.
+#[test]
+fn the_beat_of_a_later_loop_renews_no_earlier_order() {
+    model(|| {
+        let heart: &'static Heart = Box::leak(Box::new(Heart::new(time::Duration::from_millis(100))));
+        heart.beat(NOW);
+        let beats = heart.beats();
+        assert!(beats.age(NOW).is_some() && beats.period().as_millis() == 100);
+        let next = thread::spawn(move || {
+            heart.stop();
+            // Both owners take it from one list, under a lock: no two are in this at once.
+            heart.set_period(time::Duration::from_millis(200));
+            heart.beat(LATER);
+        });
+        let ages = [(); 2].map(|()| beats.age(LATER));
+        let is_of_first = |age: Option<time::Duration>| age.is_none_or(|age| age >= LATER.since(NOW));
+        assert!(ages.iter().all(|age| is_of_first(*age)), "another loop's beat renews it: {ages:?}");
+        assert!(ages[0].is_some() || ages[1].is_none(), "it was stopped, and beats: {ages:?}");
+        next.join().unwrap();
+        assert!(beats.age(LATER).is_none() && heart.beats().age(LATER).is_some());
+    });
+}
+
+/// The vehicle is stopped once more while the reset of the first stop is done.
+#[test]
+fn a_stop_beside_a_reset_stays_in_effect() {
+    model(|| {
+        let cause = |reason| Latch { by: 7, reason };
+        let latch = Arc::new(LatchWord::new());
+        latch.inhibit(NOW, cause(1));
+        let (stops, second) = (latch.clone(), cause(2));
+        let stops = thread::spawn(move || stops.inhibit(LATER, second));
+        latch.reset(LATER, END);
+        stops.join().unwrap();
+        assert!(latch.is_inhibited(), "the second stop is lost");
+        assert!(!latch.is_behind_stop(LATER, END), "what was wanted before it is");
+    });
 }

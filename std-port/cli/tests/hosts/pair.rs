@@ -275,11 +275,11 @@ impl Pair {
                 self.calls.ended(number, Some(answer), took, self.grace);
                 self.answered_in_turn += 1;
                 self.answered = Some(said.at);
-                let real = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-                self.clock_ahead = unix - real.cast_signed();
+                self.compare_clock(unix);
             }
             "failed" => {
-                let (number, took) = (next(), next());
+                let (number, took, unix) = (next(), next(), next());
+                self.compare_clock(unix);
                 self.calls.ended(number, None, Duration::from_millis(took.unsigned_abs()), self.grace);
                 self.answered_in_turn = 0;
             }
@@ -287,6 +287,11 @@ impl Pair {
             "stands" if is_of_now => self.motion.stood(said.at),
             _ => {}
         }
+    }
+
+    fn compare_clock(&mut self, unix: i64) {
+        let real = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+        self.clock_ahead = unix - real.cast_signed();
     }
 
     /// Its process has ended by itself.

@@ -80,11 +80,11 @@ fn manager() -> Result<()> {
             let began = Instant::now();
             let called = manager.s_unit("agv").map(|peer| peer.call("count", &mut arguments).with(options).wait());
             let took = began.elapsed().as_millis();
+            let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
             if let Ok(Ok(())) = called {
-                let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
                 say(format_args!("answered {number} {took} {} {unix}", arguments.variable("number").unwrap_or(-1)));
             } else {
-                say(format_args!("failed {number} {took}"));
+                say(format_args!("failed {number} {took} {unix}"));
             }
             std::thread::sleep(Duration::from_millis(10));
         }
