@@ -220,10 +220,11 @@ fn a_stop_beside_a_reset_stays_in_effect() {
         let cause = |reason| Latch { by: 7, reason };
         let latch = Arc::new(LatchWord::new());
         latch.inhibit(NOW, cause(1));
-        let (stops, second) = (latch.clone(), cause(2));
-        let stops = thread::spawn(move || stops.inhibit(LATER, second));
-        latch.reset(LATER, END);
-        stops.join().unwrap();
+        let resets = latch.clone();
+        let resets = thread::spawn(move || resets.reset(LATER, END));
+        // Here and not in the other thread: loom tries no switch before a store whose thread has read the same atomic last.
+        latch.inhibit(LATER, cause(2));
+        resets.join().unwrap();
         assert!(latch.is_inhibited(), "the second stop is lost");
         assert!(!latch.is_behind_stop(LATER, END), "what was wanted before it is");
     });
