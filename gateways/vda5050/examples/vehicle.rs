@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use cara_apps::warehouse::Cell;
+use cara_apps::warehouse::{Cell, RAMP};
 use cara_std::{AnyCall, Interfaces, LeaseWatch, ServiceError, Unit};
 use cara_vda5050::message::{ActionStatus, Load};
 use cara_vda5050::stretch::{Leg, Stretch};
@@ -343,6 +343,7 @@ fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Uni
     let unit = builder.state(vehicle.clone()).build()?;
     let is_stopped = vehicle.lock().is_stopped.clone();
     let drive = unit.my_function_list().actuator(move || is_stopped.store(true, Ordering::SeqCst))?;
+    let drive = if options.cell.is_some() { drive.ramp(RAMP) } else { drive };
     vehicle.lock().may_drive = Some(drive.watch());
     // What is handled looks at its order itself: nothing is left for the hook.
     let handling = unit.my_function_list().actuator(|| ())?;

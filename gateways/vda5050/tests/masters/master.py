@@ -81,6 +81,11 @@ async def lap(master, agv, all_are_there):
         await CELLS[to].acquire()
         way = [f"{at}!", f"{to}!", *cells[driven + 2:driven + 3]]
         assert (await master.dispatch(order(agv, "lap", driven, 2 * driven, way), agv)).accepted
+        if driven == 2:
+            await until("it drives", lambda state: state.driving)
+            await master.pause(agv)
+            await until("it stands, between two cells", lambda state: state.paused and not state.driving)
+            await master.resume(agv)
         await until(f"at {to}", lambda state: state.last_node_sequence_id == 2 * driven + 2)
         CELLS[at].release()
     await until("the end", lambda state: not state.node_states and not state.driving)
