@@ -73,6 +73,7 @@ pub struct Builder<T, R> {
     stands_by: bool,
     authority: Option<Box<dyn Authority>>,
     starts_stopped: Option<u16>,
+    core_recordings: Option<PathBuf>,
     state: T,
     role: PhantomData<fn() -> R>,
 }
@@ -116,6 +117,7 @@ impl<R> Builder<(), R> {
             stands_by: false,
             authority: None,
             starts_stopped: None,
+            core_recordings: None,
             state: (),
             role: PhantomData,
         }
@@ -123,6 +125,15 @@ impl<R> Builder<(), R> {
 }
 
 impl<T: Send + 'static> Builder<T, MUnit> {
+    /// Records each link's session with all that it takes in a file of this folder, so that [`rerun`](crate::rerun) does the same
+    /// again: for a fault that is hard to repeat. The files have the arguments and results of calls in the clear, and
+    /// recording takes time. Only in plain mode, [`BuildError::CoreRecordingWithKeys`] otherwise; a recording ends early, and
+    /// says why, where the unit offers functions of its own, has an access table, or renews a call by a [heart](crate::Heart).
+    pub fn record_core(mut self, folder: impl Into<PathBuf>) -> Self {
+        self.core_recordings = Some(folder.into());
+        self
+    }
+
     /// The TCP port on which the m_unit takes connections; one that is free unless set. For s_units that are told a
     /// [`manager_address`](Self::manager_address).
     pub fn tcp_port(mut self, port: u16) -> Self {
@@ -343,6 +354,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             stands_by: self.stands_by,
             authority: self.authority,
             starts_stopped: self.starts_stopped,
+            core_recordings: self.core_recordings,
             state,
             role: PhantomData,
         }
@@ -389,6 +401,9 @@ impl<T: Send + 'static, R> Builder<T, R> {
         }
         if self.authority.is_some() && keys.mode() == Mode::Plain {
             return Err(BuildError::AuthorityWithoutKeys);
+        }
+        if self.core_recordings.is_some() && keys.mode() == Mode::Secured {
+            return Err(BuildError::CoreRecordingWithKeys);
         }
         let discovery_port = self.discovery_port.unwrap_or(keys.mode().port());
         let own_threads = self.threads.is_none();
@@ -447,6 +462,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             stands_by: self.stands_by,
             authority: self.authority,
             starts_stopped: self.starts_stopped,
+            core_recordings: self.core_recordings,
             #[cfg(feature = "control")]
             audit: self.audit,
         };
@@ -483,6 +499,9 @@ pub enum BuildError {
         "a standby needs a folder of state, in which it stores its claim: set CARA_STATE, or --state of `cara node`"
     )]
     StandbyWithoutState,
+    /// A recording of the core in secured mode, which would have what the keys protect, and what leads to them.
+    #[error("sessions of the core are recorded in plain mode only: leave `record_core` out, or call `insecure`")]
+    CoreRecordingWithKeys,
     /// A manager with an authority in plain mode, in which vehicles refuse nobody.
     #[error("an authority needs keys: in plain mode no vehicle refuses the claim of another manager")]
     AuthorityWithoutKeys,

@@ -368,8 +368,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
         let Some((word, order)) = order.order() else { return false };
         let engine = self.engine();
         let mut links = engine.links.all().into_iter();
-        let is_finished =
-            links.any(|link| engine.on_link(&link, |session, cx| session.end_order(cx, &word.lease, order)));
+        let is_finished = links.any(|link| {
+            engine.on_link(&link, |session, cx| {
+                session.unrecorded("an order of the peer has ended").end_order(cx, &word.lease, order)
+            })
+        });
         word.wake();
         is_finished
     }

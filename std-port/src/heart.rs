@@ -48,7 +48,7 @@ impl Heart {
         let unit = Arc::downgrade(engine);
         let release = move |beats| {
             if let Some(engine) = unit.upgrade() {
-                engine.on_each_link(|session, cx| session.release_beats(cx, beats));
+                engine.on_each_link(|session, cx| session.unrecorded("a heart has stopped").release_beats(cx, beats));
             }
         };
         Self { word, beats: word.beats(), clock: engine.driver.clock(), release: Box::new(release) }

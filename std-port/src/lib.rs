@@ -145,6 +145,7 @@ pub use cara_derive::{VariablesStd as Variables, interface_std as interface};
 pub use communication_system::{CallToAll, CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use engine::details::Canceller;
+pub use engine::rerun::{Rerun, RerunError, rerun};
 pub use error::{CallError, HandOverError, StartError};
 pub use event::{Finding, UnitEvent};
 pub use file_name::escape as file_name;

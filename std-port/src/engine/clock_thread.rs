@@ -130,7 +130,7 @@ impl<T: Send + 'static> Engine<T> {
             for link in self.links.all() {
                 let mut state = link.lock();
                 if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
-                    self.with(&link, &mut state, |session, cx| session.revoke(cx));
+                    self.with(&link, &mut state, |session, cx| session.unrecorded("a key was revoked").revoke(cx));
                 }
                 self.settle(&link, state);
             }

@@ -27,7 +27,9 @@ impl<T: Send + 'static> Engine<T> {
         // A link that is kept is read by no thread until its caller is back.
         self.links.read_by(clock.now(), link, &mut state, Cause::NeedsPool);
         loop {
-            match self.with(link, &mut state, |session, cx| session.hand_over(cx, to)) {
+            match self
+                .with(link, &mut state, |session, cx| session.unrecorded("a vehicle is handed over").hand_over(cx, to))
+            {
                 Ok(()) => break,
                 Err(Error::Full(_)) => state = pinging::wait(link, state, clock, deadline)?,
                 Err(error) => return Err(error.into()),

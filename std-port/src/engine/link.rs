@@ -16,7 +16,6 @@ use cara_core::services::Port;
 use cara_core::services::Ticket;
 use cara_core::services::lease::ActuatorState;
 use cara_core::services::requests::CallId;
-use cara_core::services::session::Session;
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 use core::net::SocketAddr;
@@ -25,6 +24,7 @@ use super::details::Details;
 use super::notices::Notices;
 use super::peer_cell::PeerCell;
 use super::reader::{ReadPolicy, Registration};
+use super::tape::TapedSession;
 use crate::locks::{Locked, Rank};
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
@@ -45,7 +45,7 @@ const STALLED: Duration = Duration::from_millis(20);
 
 /// Bytes of sealed frames that wait for a stream at a time: three messages of 20,000 characters go out with one system
 /// call. An emergency that is behind them in the stream has gone out as a datagram as well.
-const SEALED_AHEAD: usize = 64 * 1024;
+pub(super) const SEALED_AHEAD: usize = 64 * 1024;
 
 /// One link of the unit.
 pub(crate) struct LinkCell {
@@ -67,7 +67,7 @@ pub(crate) struct LinkCell {
 
 /// What the lock of a link protects.
 pub(crate) struct LinkState {
-    pub(crate) session: Session<Linux>,
+    pub(crate) session: TapedSession,
     pub(crate) waiters: Vec<Waiter>,
     pub(crate) reading: ReadPolicy,
     /// What the epoll set has been told.
@@ -134,7 +134,7 @@ impl LinkCell {
         id: LinkId,
         serial: u32,
         stream: Stream,
-        session: Session<Linux>,
+        session: TapedSession,
         connecting: bool,
     ) -> Self {
         let state = LinkState {

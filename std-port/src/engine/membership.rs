@@ -19,7 +19,8 @@ use super::link::{LinkCell, LinkState, StdMailman};
 use super::peer_cell::PeerCell;
 use super::reader::Cause;
 use super::streams::Watched;
-use super::tables;
+use super::tables::{self, session_storage};
+use super::tape::{LIMITS, OFFERS, Tape, TapedSession};
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
@@ -43,16 +44,18 @@ impl<T: Send + 'static> Engine<T> {
         let index = links.iter().position(Option::is_none)?;
         let id = LinkId(u16::try_from(index).ok()?);
         let now = self.now();
-        let storage = self.links.session_storage(self.services.own_functions());
-        let (serial, nonce, constraints) = {
+        let storage = session_storage(&self.links.capacities, self.services.own_functions());
+        let (serial, hello, constraints) = {
             let mut cell = self.hub.lock();
             let serial = cell.open(id);
             let node = &mut cell.hub.node;
             if let Some(Dialed(identity)) = dialed {
                 node.dialing(identity, id);
             }
-            (serial, node.nonce(), *node.constraints())
+            let nonce = node.nonce();
+            (serial, node.hello(now, id, nonce), *node.constraints())
         };
+        let nonce = hello.nonce;
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, nonce, constraints };
         let mut session = Session::new(now, config, self.keys().cipher(), storage);
@@ -61,6 +64,14 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(span) = self.key_watch.renews_every() {
             session.renew_every(span);
         }
+        let tape = self.core_recordings.as_ref().and_then(|folder| {
+            let path = folder.join(format!("{serial}.core"));
+            let started = Tape::start(&path, now, &hello, (dialed, address), &constraints, capacities);
+            started
+                .inspect_err(|error| warn_seldom!(path = %path.display(), "no core session is recorded: {error}"))
+                .ok()
+        });
+        let session = TapedSession::new(session, tape);
         stream.spin(self.spin);
         let link = Arc::new(LinkCell::new(self.driver.unit_number()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
@@ -170,7 +181,7 @@ impl<T: Send + 'static> Engine<T> {
         let limit = usize::from(self.hub.lock().hub.node.constraints().maximum_nodes);
         let peer = self.nodes.write().join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
-            self.with(link, state, |session, cx| session.set_constraints(cx, own));
+            self.with(link, state, |session, cx| session.unrecorded(LIMITS).set_constraints(cx, own));
         }
         let _ = link.peer.set(peer);
         // Who publishes from here on finds the peer, and waits for this link's lock to tell it. What was published before,
@@ -325,7 +336,7 @@ impl<T: Send + 'static> Engine<T> {
         let (slot, _) = self.services.functions_mut().remove(name)?;
         self.hub.lock().hub.publications.withdraw(slot);
         self.on_each_link(|session, cx| {
-            session.withdraw(cx, slot);
+            session.unrecorded(OFFERS).withdraw(cx, slot);
         });
         Ok(())
     }
@@ -337,7 +348,7 @@ impl<T: Send + 'static> Engine<T> {
                 continue;
             }
             let mut state = link.lock();
-            if state.session.stream_changed(self.now()) {
+            if state.session.unrecorded(OFFERS).stream_changed(self.now()) {
                 self.settle(&link, state);
             }
         }

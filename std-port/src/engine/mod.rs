@@ -50,6 +50,7 @@ mod pinging;
 mod presence;
 pub(crate) mod reader;
 mod reading;
+pub(crate) mod rerun;
 mod roster;
 pub(crate) mod served;
 mod services;
@@ -60,6 +61,7 @@ pub(crate) mod state;
 pub(crate) mod state_gate;
 pub(crate) mod streams;
 mod tables;
+mod tape;
 #[cfg(feature = "async")]
 mod tasks;
 #[cfg(test)]
@@ -100,7 +102,7 @@ use cara_core::host::secure::Seal;
 use cara_core::services::Context;
 use cara_core::services::access::Access;
 use cara_core::services::lease::Latch;
-use cara_core::services::session::{Event, Session, buffer_bytes};
+use cara_core::services::session::{Event, buffer_bytes};
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 
@@ -134,6 +136,7 @@ use peers::Nodes;
 use presence::SelfSearch;
 use services::Services;
 use sockets::Sockets;
+use tape::{LIMITS, TapedSession};
 
 /// Everything that a unit's threads and handles share.
 pub(crate) struct Engine<T: 'static> {
@@ -145,6 +148,8 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) sockets: Sockets,
     interfaces: interfaces::InterfaceWatch,
     pub(crate) links: Links,
+    /// Where the core's sessions are recorded, if they are.
+    core_recordings: Option<PathBuf>,
     pub(crate) hub: SharedHub,
     pub(crate) nodes: Nodes,
     pub(crate) services: Arc<Services<T>>,
@@ -185,6 +190,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) stands_by: bool,
     pub(crate) authority: Option<Box<dyn Authority>>,
     pub(crate) starts_stopped: Option<u16>,
+    pub(crate) core_recordings: Option<PathBuf>,
     #[cfg(feature = "control")]
     pub(crate) audit: Option<Arc<Audit>>,
 }
@@ -204,6 +210,7 @@ impl<T: Send + 'static> Engine<T> {
             sockets: Sockets::new(parts.datagrams, parts.listener),
             interfaces: interfaces::InterfaceWatch::default(),
             links: Links::new(driver.clone(), parts.maximum_links, parts.capacities),
+            core_recordings: parts.core_recordings,
             services: Arc::new(Services::new(
                 driver.clone(),
                 parts.functions,
@@ -248,7 +255,7 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &LinkCell,
         state: &mut LinkState,
-        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
+        act: impl FnOnce(&mut TapedSession, &mut Context<'_, Linux>) -> R,
     ) -> R {
         self.with_at(self.now(), link, state, act)
     }
@@ -259,7 +266,7 @@ impl<T: Send + 'static> Engine<T> {
         now: Instant,
         link: &LinkCell,
         state: &mut LinkState,
-        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
+        act: impl FnOnce(&mut TapedSession, &mut Context<'_, Linux>) -> R,
     ) -> R {
         self.with_functions(now, &self.services.functions(), link, &mut state.session, act)
     }
@@ -270,8 +277,8 @@ impl<T: Send + 'static> Engine<T> {
         now: Instant,
         functions: &FunctionList<Boxed, Handler<T>>,
         link: &LinkCell,
-        session: &mut Session<Linux>,
-        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
+        session: &mut TapedSession,
+        act: impl FnOnce(&mut TapedSession, &mut Context<'_, Linux>) -> R,
     ) -> R {
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.sockets.datagrams };
         let mut buffers = &self.pool;
@@ -295,7 +302,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn on_link<R>(
         &self,
         link: &Arc<LinkCell>,
-        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
+        act: impl FnOnce(&mut TapedSession, &mut Context<'_, Linux>) -> R,
     ) -> R {
         let mut state = link.lock();
         let result = self.with(link, &mut state, act);
@@ -304,7 +311,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// The same on every link, one after the other.
-    pub(crate) fn on_each_link(&self, mut act: impl FnMut(&mut Session<Linux>, &mut Context<'_, Linux>)) {
+    pub(crate) fn on_each_link(&self, mut act: impl FnMut(&mut TapedSession, &mut Context<'_, Linux>)) {
         self.links.all().iter().for_each(|link| self.on_link(link, &mut act));
     }
 
@@ -332,7 +339,7 @@ impl<T: Send + 'static> Engine<T> {
         for link in self.links.all() {
             let mut state = link.lock();
             let own = link.peer.get().map_or(constraints, |peer| peer.constraints(constraints));
-            self.with(&link, &mut state, |session, cx| session.set_constraints(cx, own));
+            self.with(&link, &mut state, |session, cx| session.unrecorded(LIMITS).set_constraints(cx, own));
             self.settle(&link, state);
         }
         Ok(())
@@ -344,7 +351,9 @@ impl<T: Send + 'static> Engine<T> {
         for link in self.links.all() {
             let mut state = link.lock();
             // One that is not live yet may have told its list.
-            self.with(&link, &mut state, |session, cx| session.access_changed(cx));
+            self.with(&link, &mut state, |session, cx| {
+                session.unrecorded("the access table has changed").access_changed(cx)
+            });
             if state.session.is_live() {
                 state.notices.push(Event::ListChanged);
             }
@@ -371,7 +380,7 @@ impl<T: Send + 'static> Engine<T> {
         let unit = *self.hub.lock().hub.node.constraints();
         peer.set_constraints(unit, constraints)?;
         if let Some(link) = peer.link() {
-            self.on_link(&link, |session, cx| session.set_constraints(cx, constraints));
+            self.on_link(&link, |session, cx| session.unrecorded(LIMITS).set_constraints(cx, constraints));
         }
         Ok(())
     }

@@ -227,6 +227,7 @@ mod tests {
         let config =
             SessionConfig { link: LinkId(0), dialed: true, address, nonce: 1, constraints: Constraints::M_UNIT };
         let session = Session::new(Instant::START, config, Cipher::new(cara_core::config::Mode::Plain), storage);
+        let session = crate::engine::tape::TapedSession::new(session, None);
         Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address, false).unwrap(), session, true))
     }
 

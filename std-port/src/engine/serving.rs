@@ -20,6 +20,7 @@ use super::served::{PAUSE, Reports, Serving};
 use super::services::Parked;
 use super::state_gate::{Access, Entered, Held as StateHeld, Turn};
 #[cfg(feature = "async")]
+use super::tape::OFFERS;
 use super::tasks::Task;
 use super::worker::{Worker, arena};
 use crate::handler::{self, Handler, Run};
@@ -173,7 +174,8 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn dispatch_emergencies(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         while state.session.has_next_emergency() {
             let mut arguments = arena(self.services.call_bytes());
-            let call = self.with(link, state, |session, cx| session.next_emergency(cx, &mut arguments));
+            let call =
+                self.with(link, state, |session, cx| session.unrecorded(OFFERS).next_emergency(cx, &mut arguments));
             let Some(call) = call else { return };
             let started = self.started(&self.services.functions(), link, call);
             self.run_emergency(&self.services.functions(), link, started, arguments);
@@ -355,7 +357,7 @@ impl<T: Send + 'static> Engine<T> {
                 return state;
             }
             if now >= call.deadline {
-                state.session.drop_answer(call.ticket);
+                state.session.unrecorded(OFFERS).drop_answer(call.ticket);
                 return state;
             }
             self.settle(link, state);
@@ -384,8 +386,10 @@ impl<T: Send + 'static> Reports for Engine<T> {
         failure: Option<&Failure>,
     ) -> Result<(), Error> {
         self.with_at(now, link, state, |session, cx| match (result, failure) {
-            (Err(error), Some(failure)) if error == failure.into() => session.answer_failed(cx, ticket, failure),
-            _ => session.answer(cx, ticket, result),
+            (Err(error), Some(failure)) if error == failure.into() => {
+                session.unrecorded(OFFERS).answer_failed(cx, ticket, failure)
+            }
+            _ => session.unrecorded(OFFERS).answer(cx, ticket, result),
         })
     }
 

@@ -13,6 +13,7 @@ use cara_core::time::{Duration, Instant};
 use super::Engine;
 use super::link::{LinkCell, LinkState};
 use super::services;
+use super::tape::OFFERS;
 use crate::locks::Locked;
 
 /// A link on which reading is paused is looked at again after this.
@@ -62,7 +63,8 @@ impl<T: Send + 'static> Engine<T> {
         ticket: Ticket,
         values: &ParametersView,
     ) -> Result<(), Error> {
-        let reported = self.with_at(now, link, state, |session, cx| session.progress(cx, ticket, values));
+        let reported =
+            self.with_at(now, link, state, |session, cx| session.unrecorded(OFFERS).progress(cx, ticket, values));
         state.details.keep_progress(ticket, values, reported)
     }
 

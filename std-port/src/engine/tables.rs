@@ -11,6 +11,7 @@ use cara_core::services::slots_for;
 use super::hub::SharedHub;
 use super::link::{LinkState, Linux};
 use super::links::Links;
+use super::tape::OFFERS;
 use crate::config::Capacities;
 use crate::storage::{Boxed, filled, filled_with};
 use crate::sys::limits;
@@ -42,6 +43,19 @@ pub(crate) fn node_storage(nodes: usize, links: usize) -> NodeStorage<Linux> {
     }
 }
 
+/// The slices that a session begins with, where the unit's own list has so many functions.
+pub(super) fn session_storage(capacities: &Capacities, functions: usize) -> SessionStorage<Boxed> {
+    let &Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } = capacities;
+    SessionStorage {
+        small: filled(LINK_BUFFER_BYTES, 0),
+        pending: filled(first_calls(calls_in_flight), None),
+        running: filled(slots_for(calls_running.min(FIRST_CALLS)), None),
+        publications: filled_with(functions, Default::default),
+        their_functions: filled_with(their_functions.min(FIRST_FUNCTIONS), Entry::empty),
+        their_signatures: filled(their_signature_bytes.min(FIRST_SIGNATURES), 0),
+    }
+}
+
 impl Links {
     /// Longer tables where those of the node are too short for so many. [`Error::BadConstraint`] where the process may not have
     /// as many files open.
@@ -63,19 +77,6 @@ impl Links {
         Ok(())
     }
 
-    /// The slices that a session begins with, where the unit's own list has so many functions.
-    pub(super) fn session_storage(&self, functions: usize) -> SessionStorage<Boxed> {
-        let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } = self.capacities;
-        SessionStorage {
-            small: filled(LINK_BUFFER_BYTES, 0),
-            pending: filled(first_calls(calls_in_flight), None),
-            running: filled(slots_for(calls_running.min(FIRST_CALLS)), None),
-            publications: filled_with(functions, Default::default),
-            their_functions: filled_with(their_functions.min(FIRST_FUNCTIONS), Entry::empty),
-            their_signatures: filled(their_signature_bytes.min(FIRST_SIGNATURES), 0),
-        }
-    }
-
     /// Makes room for as many calls of the peer as it may have here once more than one runs or waits, before the next one comes.
     pub(super) fn make_call_room(&self, state: &mut LinkState) {
         let most = slots_for(self.capacities.calls_running);
@@ -90,7 +91,7 @@ impl Links {
 pub(super) fn make_publication_room(state: &mut LinkState, functions: usize) -> bool {
     let grows = functions > state.session.publication_slots();
     if grows {
-        drop(state.session.lend_publications(filled_with(functions, Default::default)));
+        drop(state.session.unrecorded(OFFERS).lend_publications(filled_with(functions, Default::default)));
     }
     grows
 }

@@ -18,6 +18,7 @@ use super::driving::{Alarm, Driver};
 use super::link::LinkCell;
 use super::nested;
 use super::served::{GivenUp, PAUSE, Reports};
+use super::tape::OFFERS;
 use crate::executor::Executor;
 use crate::handler::{self, Begin, Work};
 use crate::lease::LeaseEnded;
@@ -191,7 +192,7 @@ impl Task {
             }
             None => {
                 if kept.is_err() {
-                    state.session.drop_answer(ticket);
+                    state.session.unrecorded(OFFERS).drop_answer(ticket);
                 }
                 state.await_no_end(ticket);
                 if state.session.has_next_call() {

@@ -16,6 +16,7 @@
 
 mod measured;
 pub mod ports;
+pub mod recorded;
 mod rules;
 pub mod run;
 mod scenario;
