@@ -36,7 +36,7 @@ pub const HELP_BYTES: usize = 160;
 /// Longest unit of a variable, in bytes; a longer one is cut. Stored with the signature, as long as it is.
 pub const UNIT_BYTES: usize = 16;
 /// Deepest nesting of lists and records, the outermost included. Each level costs 32 bytes of stack while a block is checked.
-pub const DEPTH: usize = 4;
+pub const DEPTH: usize = 8;
 /// Default capacity for names and values in a `Parameters`, in bytes.
 pub const PARAMETERS_BYTES: usize = 512;
 

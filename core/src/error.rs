@@ -69,7 +69,7 @@ pub enum Limit {
     #[error("the peer lets this unit subscribe to no more streams: end one, or raise subscriptions_per_peer there")]
     Subscriptions = 13,
     /// Nesting of lists and records.
-    #[error("lists and records are at most 4 deep in each other: make the inner ones arguments of their own")]
+    #[error("lists and records are at most 8 deep in each other: make the inner ones arguments of their own")]
     Depth = 14,
 }
 

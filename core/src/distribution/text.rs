@@ -68,7 +68,7 @@ impl fmt::Display for Expected {
             Self::SameAsArgument => "the type and size of the argument of this name",
             Self::Type if NESTED => "a type: int, float, string, bool, bytes or {…}",
             Self::Type => "a type: int, float, string, bool or bytes",
-            Self::ShallowerType => "at most 4 lists and records inside each other",
+            Self::ShallowerType => "at most 8 lists and records inside each other",
             Self::Size => "a size: a number of 32 bits",
             Self::FewerVariables => "fewer variables",
             Self::ShorterSignature => "a shorter signature",

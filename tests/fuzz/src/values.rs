@@ -16,12 +16,13 @@ use crate::script::Script;
 use crate::unit::FLEET;
 
 /// Signatures whose blocks are read.
-const SIGNATURES: [&str; 6] = [
+const SIGNATURES: [&str; 7] = [
     "f(x: int[3], b: bool)",
     "f(s: string[7], b: bytes[5], f: float)",
     "f(l: int[..4])",
     "f(r: {a: int, s: string[3]})",
     "f(l: {a: int, l: float[..2]}[..3], b: bool[9])",
+    "f(l: {a: {b: {c: int[..2]}[..2]}[..2], d: bool[..1]}[..2], e: int[..1][..2][..1][..2][..1][..2][..1][..2])",
     "f()",
 ];
 

@@ -138,17 +138,17 @@ fn nested_signatures() -> Vec<Vector> {
     let list_of = |inner: &[u8]| [&[1, b'f', 1, 5, 1, 8, 0, 0, 0, b'a'][..], inner, &[0]].concat();
     let lists = |depth| [&[5, 8, 0, 0, 0].repeat(depth)[..], &[0, 1, 0, 0, 0]].concat();
     let mut deepest = json!({ "type": "int", "size": 1 });
-    for _ in 0..4 {
+    for _ in 0..8 {
         deepest = json!({ "type": "list", "size": 8, "element": deepest });
     }
     deepest["name"] = "a".into();
     let deepest = json!({
-        "name": "f", "arguments": [deepest], "results": [], "text": "f(a: int[..8][..8][..8][..8])",
+        "name": "f", "arguments": [deepest], "results": [], "text": "f(a: int[..8][..8][..8][..8][..8][..8][..8][..8])",
     });
     vec![
         made(("signature_order", "a list of records, and a list of lists"), definition(ORDER).as_bytes(), &order),
-        made(("signature_deepest", "four lists in each other"), &list_of(&lists(3)), &deepest),
-        made(("signature_too_deep", "refused: five lists in each other"), &list_of(&lists(4)), &Value::Null),
+        made(("signature_deepest", "eight lists in each other"), &list_of(&lists(7)), &deepest),
+        made(("signature_too_deep", "refused: nine lists in each other"), &list_of(&lists(8)), &Value::Null),
         made(("signature_no_element", "refused: a list of nothing"), &list_of(&[]), &Value::Null),
         made(("signature_empty_element", "refused: elements take no bytes"), &list_of(&[0, 0, 0, 0, 0]), &Value::Null),
         made(("signature_empty_record", "refused: a record without fields"), &list_of(&[6, 0, 0, 0, 0]), &Value::Null),

@@ -7,10 +7,10 @@ use std::vec::Vec;
 
 use proptest::prelude::*;
 
-use crate::config::SIGNATURE_BYTES;
+use crate::config::{DEPTH, SIGNATURE_BYTES};
 use crate::distribution::block::{self, SliceWriter};
 use crate::distribution::function::{Definition, Signature};
-use crate::distribution::parameters::{ListWriter, Parameters, ParametersView, RecordWriter, Type, Value};
+use crate::distribution::parameters::{ListWriter, Parameters, ParametersView, RecordWriter, Slot, Type, Value};
 use crate::distribution::text::{Expected, ParseError};
 use crate::error::{Error, Limit};
 
@@ -66,8 +66,8 @@ fn the_text_form_is_read_and_shown() {
         "f(a: int[..8])",
         "f(a: int[2][..8])",
         "f(a: string[32][..8][..4], b: bool) -> (a: string[32][..8][..4], c: {d: bytes[4]})",
-        "f(a: {b: {c: {d: {e: int}}}})",
-        "f(a: int[..1][..2][..3][..4])",
+        "f(a: {b: {c: {d: {e: {f: {g: {h: {i: int}}}}}}}})",
+        "f(a: int[..1][..2][..3][..4][..5][..6][..7][..8])",
         "f(a: {b: int[..0], c: float}[..4294967295])",
     ] {
         assert_eq!(definition(text).to_string(), text);
@@ -82,9 +82,9 @@ fn what_is_no_type_is_pointed_at() {
     assert_eq!(mistake("f(a: {})"), at(6, Expected::Name));
     assert_eq!(mistake("f(a: {b: int)"), at(12, Expected::CommaOrBrace));
     assert_eq!(mistake("f(a: {b: int, b: int})"), at(2, Expected::NewName));
-    assert_eq!(mistake("f(a: {b: {c: {d: {e: {f: int}}}}})"), at(22, Expected::ShallowerType));
-    assert_eq!(mistake("f(a: int[..1][..2][..3][..4][..5])"), at(2, Expected::ShallowerType));
-    assert_eq!(mistake("f(a: {b: {c: {d: int[..1]}[..2]}})"), at(2, Expected::ShallowerType));
+    assert_eq!(mistake("f(a: {b: {c: {d: {e: {f: {g: {h: {i: {j: int}}}}}}}}})"), at(38, Expected::ShallowerType));
+    assert_eq!(mistake("f(a: int[..1][..2][..3][..4][..5][..6][..7][..8][..9])"), at(2, Expected::ShallowerType));
+    assert_eq!(mistake("f(a: {b: {c: {d: {e: {f: {g: {h: int[..1]}[..2]}}}}}})"), at(2, Expected::ShallowerType));
     assert_eq!(mistake("f(a: string[..8])"), at(12, Expected::Size));
     assert_eq!(mistake("f(a: list[8])"), at(5, Expected::Type));
     // A peer could claim any number of elements that take no bytes.
@@ -112,9 +112,71 @@ fn signatures_are_checked_before_they_are_kept() {
         &[6, 255, 255, 255, 255],
         &[6, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, b' '],
         &[6, 2, 0, 0, 0, 0, 1, 1, 0, 0, 0, b'b', 0, 1, 1, 0, 0, 0, b'b'],
-        &[5, 1, 0, 0, 0, 5, 1, 0, 0, 0, 5, 1, 0, 0, 0, 5, 1, 0, 0, 0, 0, 1, 0, 0, 0],
+        &[&[5, 1, 0, 0, 0].repeat(DEPTH)[..], &[0, 1, 0, 0, 0]].concat(),
     ] {
         assert_eq!(list_of(wrong), Err(Error::Malformed), "{wrong:?}");
+    }
+}
+
+/// A type of `depth` lists and records in each other: a list where the bit of that level is set. Its text, and how it is encoded
+/// behind `f`, with one argument `a`.
+fn tower(depth: usize, lists: usize) -> (String, Vec<u8>) {
+    let (mut text, mut head, mut inner) = ("int".to_string(), (0_u8, 1_u8), vec![]);
+    for level in 0..depth {
+        let (kind, size) = head;
+        if lists >> level & 1 == 1 {
+            text += "[..2]";
+            inner = [&[kind, size, 0, 0, 0][..], &inner].concat();
+            head = (5, 2);
+        } else {
+            text = format!("{{b: {text}}}");
+            inner = [&[kind, 1, size, 0, 0, 0, b'b'][..], &inner].concat();
+            head = (6, 1);
+        }
+    }
+    let bytes = [&[1, b'f', 1, head.0, 1, head.1, 0, 0, 0, b'a'][..], &inner, &[0]].concat();
+    (format!("f(a: {text})"), bytes)
+}
+
+/// Two elements in each list of a [`tower`], the innermost of which count up.
+fn fill(slot: Slot<'_>, depth: usize, lists: usize, next: &mut i64) -> Result<(), Error> {
+    let Some(depth) = depth.checked_sub(1) else {
+        *next += 1;
+        return slot.set(*next);
+    };
+    if lists >> depth & 1 == 0 {
+        return slot.record(|record| record.set_with("b", |slot| fill(slot, depth, lists, next)));
+    }
+    slot.list(|list| (0..2).try_for_each(|_| list.push_with(|slot| fill(slot, depth, lists, next))))
+}
+
+fn sum(value: Value<'_>) -> i64 {
+    match value.kind() {
+        Type::List => value.elements().map(sum).sum(),
+        Type::Record => value.fields().map(|field| sum(field.value)).sum(),
+        _ => value.ints().sum(),
+    }
+}
+
+#[test]
+fn every_order_of_lists_and_records_goes_as_deep_as_the_limit_and_no_deeper() {
+    for lists in 0..1 << DEPTH {
+        let (text, bytes) = tower(DEPTH, lists);
+        let definition = definition(&text);
+        assert_eq!((definition.to_string(), definition.as_bytes()), (text, &bytes[..]));
+        assert_eq!(Signature::decode(&bytes), Ok(definition.signature()));
+        let (mut parameters, mut last) = (laid_out(&definition), 0);
+        parameters.slot_of(0).and_then(|slot| fill(slot, DEPTH, lists, &mut last)).unwrap();
+        assert_eq!(last, 1 << lists.count_ones());
+        let block = encoded(&definition, &parameters);
+        let mut read = laid_out(&definition);
+        assert_eq!(block::read_arguments(definition.signature().arguments(), &block, &mut *read), Ok(()));
+        assert_eq!((&*read, sum(read.value("a").unwrap())), (&*parameters, last * (last + 1) / 2));
+    }
+    for lists in 0..2 << DEPTH {
+        let (text, bytes) = tower(DEPTH + 1, lists);
+        assert_eq!(Definition::parse(&text).unwrap_err().expected, Expected::ShallowerType, "{text}");
+        assert_eq!(Signature::decode(&bytes), Err(Error::Malformed), "{text}");
     }
 }
 
@@ -399,7 +461,7 @@ fn data() -> impl Strategy<Value = Data> {
         "[aäß€]{0,5}".prop_map(|text| Data::Text(15, text)),
         prop::collection::vec(any::<u8>(), 0..12).prop_map(|bytes| Data::Bytes(11, bytes)),
     ];
-    leaf.prop_recursive(4, 24, 4, |inner| {
+    leaf.prop_recursive(8, 24, 4, |inner| {
         prop_oneof![
             (inner.clone(), 0..4_usize, any::<i32>(), 0..3_u32).prop_map(|(element, count, seed, more)| {
                 let mut elements = vec![element.clone()];

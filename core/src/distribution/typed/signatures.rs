@@ -120,7 +120,7 @@ impl<'a> Insides<'a> {
             return Self::wrong("lists and structs in structs need the feature `nested` of the core");
         }
         if depth >= DEPTH {
-            return Self::wrong("lists and structs are in each other at most 4 deep");
+            return Self::wrong("lists and structs are in each other at most 8 deep");
         }
         if matches!(kind, Type::List) { Self::of_list(size, rest, depth) } else { Self::of_record(size, rest, depth) }
     }
