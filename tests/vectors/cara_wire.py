@@ -696,7 +696,7 @@ def least(variable):
 
 def type_text(variable):
     if variable["type"] == "list":
-        return type_text(variable["element"]) + "[..%d]" % variable["size"]
+        return type_text(variable["element"]) + ("?" if variable["size"] == 1 else "[..%d]" % variable["size"])
     if variable["type"] == "record":
         return "{" + ", ".join(field["name"] + ": " + type_text(field) for field in variable["fields"]) + "}"
     short = variable["type"] in FIXED and variable["size"] == 1

@@ -37,9 +37,23 @@ use quote::quote;
 /// ```
 ///
 /// With the feature `nested` of the core, which is always on for Linux, a field whose type is such a struct is a record, `Vec<T>`
-/// and `heapless::Vec<T, N>` are lists, and `Option<T>` is a list of at most one element.
+/// and `heapless::Vec<T, N>` are lists, and `Option<T>` is a list of at most one element. An enum whose variants have one value each
+/// is a choice: a record with an optional field for each variant, exactly one of which is present; any other number of them is refused
+/// as out of range. `Setting` is `{text: string[64]?, number: float?}`, in JSON `{"number": 1.5}`.
 ///
-/// | attribute of a field | means |
+/// ```
+/// # use cara_core::Variables;
+/// #[derive(Variables)]
+/// enum Setting {
+///     #[name = "text"]
+///     #[size(64)]
+///     Text(String),
+///     #[name = "number"]
+///     Number(f64),
+/// }
+/// ```
+///
+/// | attribute of a field or of a choice's variant | means |
 /// |---|---|
 /// | `#[size(200)]` | the most bytes of a `String` or `Vec<u8>`, or elements of a `Vec<T>`; `#[size(50, 32)]` for a `Vec<String>` |
 /// | `#[name = "x-1"]` | the variable's name, if it is not the field's |

@@ -3,7 +3,7 @@
 use proc_macro2::TokenStream;
 use quote::{format_ident, quote};
 use syn::spanned::Spanned;
-use syn::{Data, DataEnum, DeriveInput, Error, Fields, FieldsNamed, Ident, Result};
+use syn::{Data, DataEnum, DeriveInput, Error, Fields, FieldsNamed, Ident, Result, parse_quote};
 
 use crate::attributes::{OfVariable, first_line};
 use crate::kind::Variable;
@@ -25,6 +25,9 @@ fn implement(input: DeriveInput, root: &TokenStream) -> Result<TokenStream> {
                 "variables have names: make it a struct with named fields",
             )),
         },
+        Data::Enum(data) if data.variants.iter().any(|variant| !matches!(variant.fields, Fields::Unit)) => {
+            of_choice(&input.ident, data, root)
+        }
         Data::Enum(data) => of_enum(&input.ident, &data, root),
         Data::Union(union) => {
             Err(Error::new_spanned(union.union_token, "a union cannot be variables: make it a struct"))
@@ -66,6 +69,7 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, help: &str, root: &TokenStream)
         .zip(&names)
         .map(|((variable, place), name)| variable.write(root, &quote!(self.#name), place));
     let (parameters, error) = (quote!(#root::typed::parts::ParametersView), quote!(#root::typed::parts::Error));
+    let inner = inner_of(root, &quote!(<#ident as #typed::Variables>::SPECS));
     Ok(quote! {
         #[automatically_derived]
         impl #root::typed::Variables for #ident {
@@ -96,14 +100,7 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, help: &str, root: &TokenStream)
             impl #typed::Field for #ident {
                 const KIND: #parts::Type = #parts::Type::Record;
                 const SIZE: u32 = <Self as #typed::Variables>::SPECS.len() as u32;
-                const INNER: &'static [u8] = {
-                    const FIELDS: &[#parts::VariableSpec<'static>] = <#ident as #typed::Variables>::SPECS;
-                    const INNER: [u8; #typed::fields_bytes(FIELDS)] = match #typed::fields(FIELDS) {
-                        ::core::result::Result::Ok(inner) => inner,
-                        ::core::result::Result::Err(rule) => ::core::panic!("{}", rule),
-                    };
-                    &INNER
-                };
+                const INNER: &'static [u8] = #inner;
 
                 fn from_field(value: #parts::Value<'_>) -> ::core::result::Result<Self, #error> {
                     let mut fields = #typed::Record::of(value)?;
@@ -121,15 +118,89 @@ fn of_struct(ident: &Ident, fields: FieldsNamed, help: &str, root: &TokenStream)
     })
 }
 
+/// The inner types of a record with these fields.
+fn inner_of(root: &TokenStream, fields: &TokenStream) -> TokenStream {
+    let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
+    quote! {{
+        const FIELDS: &[#parts::VariableSpec<'static>] = #fields;
+        const INNER: [u8; #typed::fields_bytes(FIELDS)] = match #typed::fields(FIELDS) {
+            ::core::result::Result::Ok(inner) => inner,
+            ::core::result::Result::Err(rule) => ::core::panic!("{}", rule),
+        };
+        &INNER
+    }}
+}
+
+/// An enum each of whose variants has one value: a record of optional fields, of which exactly one is present.
+fn of_choice(ident: &Ident, data: DataEnum, root: &TokenStream) -> Result<TokenStream> {
+    let mut names = Vec::new();
+    let mut variables = Vec::new();
+    for mut variant in data.variants {
+        let rust = match &variant.fields {
+            Fields::Unnamed(fields) if fields.unnamed.len() == 1 => fields.unnamed.first().map(|field| &field.ty),
+            _ => None,
+        };
+        let Some(rust) = rust else {
+            let wrong =
+                "the variants of an enum that is a variable have one unnamed value each, or none of them has any";
+            return Err(Error::new_spanned(variant, wrong));
+        };
+        let rust = parse_quote!(::core::option::Option<#rust>);
+        let mut said = OfVariable::take(&mut variant.attrs)?;
+        variables.push(Variable::new(said.name_or(&variant.ident), rust, said)?);
+        names.push(variant.ident);
+    }
+    let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
+    let (result, error) = (quote!(::core::result::Result), quote!(#root::typed::parts::Error));
+    let specs = variables.iter().map(|variable| variable.spec(root));
+    let inner = inner_of(root, &quote!(&[#(#specs),*]));
+    let count = variables.len() as u32;
+    let taken = variables.iter().zip(&names).map(|(variable, variant)| {
+        let (name, rust, read) = (&variable.name, &variable.rust, variable.reader(root));
+        quote! {
+            let one: #rust = fields.take(#name).and_then(#read)?;
+            if one.is_some_and(|one| chosen.replace(Self::#variant(one)).is_some()) {
+                return #result::Err(#error::OutOfRange);
+            }
+        }
+    });
+    let set = variables.iter().zip(&names).map(|(variable, variant)| {
+        let one = quote! {
+            (match self { Self::#variant(one) => ::core::slice::from_ref(one), _ => &[] })
+        };
+        let (name, write) = (&variable.name, variable.writer(root, &one));
+        quote!(record.set_with(#name, |slot| #write)?;)
+    });
+    Ok(quote! {
+        #typed::__nested! {
+            #[automatically_derived]
+            impl #typed::Field for #ident {
+                const KIND: #parts::Type = #parts::Type::Record;
+                const SIZE: u32 = #count;
+                const INNER: &'static [u8] = #inner;
+
+                fn from_field(value: #parts::Value<'_>) -> #result<Self, #error> {
+                    let mut fields = #typed::Record::of(value)?;
+                    let mut chosen = ::core::option::Option::None;
+                    #(#taken)*
+                    chosen.ok_or(#error::OutOfRange)
+                }
+
+                #[allow(unreachable_patterns)]
+                fn to_field(&self, slot: #parts::Slot<'_>) -> #result<(), #error> {
+                    slot.record(|record| {
+                        #(#set)*
+                        #result::Ok(())
+                    })
+                }
+            }
+        }
+    })
+}
+
 fn of_enum(ident: &Ident, data: &DataEnum, root: &TokenStream) -> Result<TokenStream> {
     if data.variants.is_empty() {
         return Err(Error::new_spanned(ident, "an enum that is a variable has a variant at least"));
-    }
-    for variant in &data.variants {
-        if !matches!(variant.fields, Fields::Unit) {
-            let wrong = "an enum that is a variable has no fields: it travels as the number of its variant";
-            return Err(Error::new_spanned(variant, wrong));
-        }
     }
     let variants = data.variants.iter().map(|variant| &variant.ident).collect::<Vec<_>>();
     let numbers = variants.iter().map(|variant| format_ident!("NUMBER_OF_{}", variant)).collect::<Vec<_>>();

@@ -82,8 +82,7 @@ fn taking(order: &Order) -> Definition {
 fn structs_are_records_and_vectors_lists() {
     let place = "{x: float, y-m: float, side: int}";
     let action = "{kind: string[16], lasts: float}";
-    let node =
-        format!("{{id: int, at: {place}[..1], actions: {action}[..3], tags: string[8][..4], photo: bytes[8][..1]}}");
+    let node = format!("{{id: int, at: {place}?, actions: {action}[..3], tags: string[8][..4], photo: bytes[8]?}}");
     let shown = format!(
         "take(id: string[8], start: {place}, nodes: {node}[..5], speeds: float[..3], bends: int[2][..2], flags: bool[..2])"
     );
@@ -208,4 +207,50 @@ fn a_mismatch_tells_the_way_to_the_difference() {
     let long = |kind: &str| format!("f({0}: {{a: {{b{0}: {{c: {kind}}}}}[..2]}})", "n".repeat(31));
     let way = format!("argument {}.a[] is bool there and int here", "n".repeat(31));
     assert_eq!(check(&long("int"), &long("bool")), reported(&way));
+}
+
+#[derive(Variables, Clone, Debug, PartialEq)]
+enum Setting {
+    #[name = "text"]
+    #[size(8)]
+    Text(String),
+    Number(f64),
+    Places(heapless::Vec<Place, 2>),
+    #[size(2)]
+    At(Option<Vec<Place>>),
+}
+
+#[derive(Variables, Clone, Debug, PartialEq)]
+struct Settings {
+    #[size(4)]
+    all: Vec<Setting>,
+    last: Option<Setting>,
+}
+
+#[test]
+fn a_choice_is_a_record_with_one_field_present() {
+    let place = "{x: float, y-m: float, side: int}";
+    let choice = format!("{{text: string[8]?, Number: float?, Places: {place}[..2]?, At: {place}[..2]??}}");
+    let places = heapless::Vec::from_slice(&[self::place(1.0)]).unwrap();
+    let settings = Settings {
+        all: vec![Setting::Text("high".into()), Setting::Number(0.5), Setting::Places(places), Setting::At(None)],
+        last: Some(Setting::At(Some(vec![]))),
+    };
+    let mut parameters = Parameters::<4096>::sized();
+    settings.to_parameters(&mut parameters).unwrap();
+    let take = Definition::new("take").unwrap().arguments(&parameters).unwrap();
+    assert_eq!(take.to_string(), format!("take(all: {choice}[..4], last: {choice}?)"));
+    assert_eq!(Settings::from_parameters(&parameters), Ok(settings));
+    for (count, read) in [(0, Err(Error::OutOfRange)), (1, Ok(())), (2, Err(Error::OutOfRange))] {
+        let several = |list: &mut cara_core::distribution::parameters::ListWriter<'_>| {
+            list.push_record(|record| {
+                record.set_list("text", |list| if count > 0 { list.push("x") } else { Ok(()) })?;
+                record.set_list("Number", |list| if count > 1 { list.push(1.0) } else { Ok(()) })?;
+                record.set_list("Places", |_| Ok(()))?;
+                record.set_list("At", |_| Ok(()))
+            })
+        };
+        parameters.set_list("all", several).unwrap();
+        assert_eq!(Settings::from_parameters(&parameters).map(|_| ()), read, "{count}");
+    }
 }

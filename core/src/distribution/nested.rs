@@ -6,7 +6,7 @@
 //!
 //! Recursion here is at most [`DEPTH`] deep, since signatures are checked before they are stored.
 
-use super::spec::{Bounds, LIST_HEAD, RawSpec, VariableSpecs, can_be, least, padding_after};
+use super::spec::{Bounds, LIST_HEAD, RawSpec, VariableSpec, VariableSpecs, can_be, least, padding_after};
 use super::value::{Type, Value, Variable, saturate};
 use crate::bytes::is_text;
 use crate::config::DEPTH;
@@ -216,6 +216,11 @@ impl<'a> Value<'a> {
     /// The field with this name; [`Error::UnknownVariable`] if there is none.
     pub fn field(&self, name: &str) -> Result<Value<'a>, Error> {
         self.fields().find(|field| field.name == name).map(|field| field.value).ok_or(Error::UnknownVariable)
+    }
+
+    /// Its type, as a variable without a name.
+    pub const fn spec(&self) -> VariableSpec<'a> {
+        VariableSpec { name: "", kind: self.kind, size: self.size, inner: self.inner }
     }
 
     pub(super) const fn raw_spec(&self) -> RawSpec<'a> {

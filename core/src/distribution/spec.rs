@@ -370,7 +370,7 @@ pub(super) const fn padding_after(length: usize) -> usize {
     length.wrapping_neg() & 7
 }
 
-/// The text form of a type: `int[2]`, `{x: float}[..8]`.
+/// The text form of a type: `int[2]`, `{x: float}[..8]`, `int?` for `int[..1]`.
 fn show(f: &mut fmt::Formatter<'_>, spec: RawSpec<'_>) -> fmt::Result {
     show_at(f, spec, 0)
 }
@@ -386,7 +386,7 @@ fn show_at(f: &mut fmt::Formatter<'_>, spec: RawSpec<'_>, depth: usize) -> fmt::
     let deeper = depth.saturating_add(1);
     if let Some(element) = spec.element() {
         show_at(f, element, deeper)?;
-        return write!(f, "[..{}]", spec.size);
+        return if spec.size == 1 { f.write_str("?") } else { write!(f, "[..{}]", spec.size) };
     }
     f.write_str("{")?;
     for (index, field) in spec.fields().raw().enumerate() {

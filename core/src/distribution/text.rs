@@ -2,7 +2,8 @@
 //!
 //! `pos_info(position: int[2]) -> (position: int[2])`; `int`, `float` and `bool` alone have the size 1; a function without
 //! results has no arrow. `progress (left: float)` and `fails (at: int[2])` may follow. A list of at most 8 `int` is `int[..8]`, a
-//! record `{id: string[32], x: float}`. Spaces between words are ignored.
+//! record `{id: string[32], x: float}`. A list of at most one, `int[..1]`, is an optional value, `int?`. Spaces between words are
+//! ignored.
 
 use core::fmt;
 
@@ -201,11 +202,15 @@ impl<'a> Parser<'a> {
             if self.take(b"{") { (Type::Record, self.fields(inner, depth)?) } else { self.type_and_size()? };
         loop {
             self.skip_spaces();
-            if !self.take(b"[..") {
+            let most = if self.take(b"?") {
+                1
+            } else if self.take(b"[..") {
+                let most = self.size()?;
+                self.character(']')?;
+                most
+            } else {
                 return Ok((kind, size));
-            }
-            let most = self.size()?;
-            self.character(']')?;
+            };
             insert(inner, start, &[kind as u8]).map_err(|()| too_long(at))?;
             insert(inner, start.saturating_add(1), &size.to_le_bytes()).map_err(|()| too_long(at))?;
             (kind, size) = (Type::List, most);

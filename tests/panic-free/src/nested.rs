@@ -30,7 +30,7 @@ entry!(nested_read, {
     let value: &Value<'static> = unknown();
     drain(value.elements());
     drain(value.fields());
-    keep(value.field(unknown_text()));
+    keep((value.field(unknown_text()), value.spec()));
 });
 
 entry!(nested_written, {

@@ -133,6 +133,12 @@ fn nested_signatures() -> Vec<Vector> {
         "results": [],
         "text": ORDER,
     });
+    let optional = json!({
+        "name": "f",
+        "arguments": [{ "name": "a", "type": "list", "size": 1, "element": { "type": "int", "size": 1 } }],
+        "results": [],
+        "text": "f(a: int?)",
+    });
     let made =
         |names, bytes: &[u8], value: &Value| Vector::new(names, Kind::Signature, Context::default(), bytes, value);
     let list_of = |inner: &[u8]| [&[1, b'f', 1, 5, 1, 8, 0, 0, 0, b'a'][..], inner, &[0]].concat();
@@ -147,6 +153,11 @@ fn nested_signatures() -> Vec<Vector> {
     });
     vec![
         made(("signature_order", "a list of records, and a list of lists"), definition(ORDER).as_bytes(), &order),
+        made(
+            ("signature_optional", "a value that may be absent"),
+            &[1, b'f', 1, 5, 1, 1, 0, 0, 0, b'a', 0, 1, 0, 0, 0, 0],
+            &optional,
+        ),
         made(("signature_deepest", "eight lists in each other"), &list_of(&lists(7)), &deepest),
         made(("signature_too_deep", "refused: nine lists in each other"), &list_of(&lists(8)), &Value::Null),
         made(("signature_no_element", "refused: a list of nothing"), &list_of(&[]), &Value::Null),

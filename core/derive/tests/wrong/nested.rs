@@ -26,8 +26,8 @@ struct Twice {
 
 #[derive(Variables)]
 struct Deep {
-    #[size(2, 2, 2)]
-    x: Vec<Vec<Vec<i64>>>,
+    #[size(2, 2, 2, 2, 2, 2, 2)]
+    x: Vec<Vec<Vec<Vec<Vec<Vec<Vec<i64>>>>>>>,
 }
 
 #[interface]

@@ -67,11 +67,16 @@ fn the_text_form_is_read_and_shown() {
         "f(a: int[2][..8])",
         "f(a: string[32][..8][..4], b: bool) -> (a: string[32][..8][..4], c: {d: bytes[4]})",
         "f(a: {b: {c: {d: {e: {f: {g: {h: {i: int}}}}}}}})",
-        "f(a: int[..1][..2][..3][..4][..5][..6][..7][..8])",
+        "f(a: int?[..2][..3][..4][..5][..6][..7][..8])",
+        "f(a: int?, b: string[8]?[..2]?, c: {d: bool[2]?, e: int??}?)",
         "f(a: {b: int[..0], c: float}[..4294967295])",
     ] {
         assert_eq!(definition(text).to_string(), text);
     }
+    assert_eq!(
+        definition("f(a: int[..1], b: { c: string[2] ? } [ ..2])").to_string(),
+        "f(a: int?, b: {c: string[2]?}[..2])"
+    );
     assert_eq!(definition("f(a:{b:int , c : float [ 2 ] } [..3])").to_string(), "f(a: {b: int, c: float[2]}[..3])");
 }
 
