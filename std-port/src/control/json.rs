@@ -2,6 +2,9 @@
 //!
 //! A single int, float or bool is a number or truth value, several are an array, text is text, and bytes are text of
 //! two hexadecimal digits each. A float that JSON has no number for is `"NaN"`, `"inf"` or `"-inf"`.
+//!
+//! An optional value, `T?` or `T[..1]`, is the value alone or null, and a field of a record that has none is left out. As an
+//! argument it may also be an array of at most one. `T??` is an array.
 
 use std::fmt::Write;
 
@@ -35,9 +38,39 @@ pub fn to_json(value: &Value<'_>) -> Json {
         Type::Bool => several(value.bools().map(Json::from).collect()),
         Type::String => value.text().unwrap_or_default().into(),
         Type::Bytes => value.raw().iter().fold(String::new(), hexadecimal).into(),
+        Type::List if is_optional(value.spec()) => {
+            value.elements().next().map_or(Json::Null, |element| to_json(&element))
+        }
         Type::List => value.elements().map(|element| to_json(&element)).collect(),
-        Type::Record => value.fields().map(|field| (field.name.to_owned(), to_json(&field.value))).collect(),
+        Type::Record => {
+            let fields = value.fields().map(|field| (field.name.to_owned(), field.value));
+            let present = fields.filter(|(_, value)| !is_optional(value.spec()) || !value.elements().is_empty());
+            present.map(|(name, value)| (name, to_json(&value))).collect()
+        }
     }
+}
+
+/// Whether a variable is a value that may be absent. An optional value that is itself optional remains a list, or nothing would
+/// tell which of the two is absent.
+pub fn is_optional(spec: VariableSpec<'_>) -> bool {
+    let is_one = |spec: VariableSpec<'_>| spec.kind == Type::List && spec.size == 1;
+    is_one(spec) && !spec.element().is_some_and(is_one)
+}
+
+/// The elements of a list, and their type; `None` for JSON that is no list, or is too long.
+fn listed<'s, 'j>(spec: VariableSpec<'s>, json: &'j Json) -> Option<(VariableSpec<'s>, &'j [Json])> {
+    let element = spec.element()?;
+    let elements = match json {
+        Json::Null if is_optional(spec) => &[],
+        // `[x]` for one value, unless the array itself is the value.
+        Json::Array(one) if is_optional(spec) && (one.len() > 1 || check(element, json).is_ok()) => {
+            std::slice::from_ref(json)
+        }
+        Json::Array(elements) => elements,
+        _ if is_optional(spec) => std::slice::from_ref(json),
+        _ => return None,
+    };
+    (elements.len() <= spec.size as usize).then_some((element, elements))
 }
 
 /// Sets the variable that `spec` names; [`BadValue`] as an error of its own, before anything is set.
@@ -66,11 +99,13 @@ pub fn check(spec: VariableSpec<'_>, json: &Json) -> Result<(), BadValue> {
 
 fn check_at(spec: VariableSpec<'_>, json: &Json, path: &mut String) -> Result<(), BadValue> {
     let length = path.len();
-    match (spec.kind, spec.element(), json) {
-        (Type::List, Some(element), Json::Array(elements)) if elements.len() <= spec.size as usize => {
+    match (spec.kind, listed(spec, json), json) {
+        (Type::List, Some((element, elements)), _) => {
             for (index, json) in elements.iter().enumerate() {
-                // Writing to a string does not fail.
-                let _ = write!(path, "[{index}]");
+                if !is_optional(spec) {
+                    // Writing to a string does not fail.
+                    let _ = write!(path, "[{index}]");
+                }
                 check_at(element, json, path)?;
                 path.truncate(length);
             }
@@ -82,6 +117,7 @@ fn check_at(spec: VariableSpec<'_>, json: &Json, path: &mut String) -> Result<()
                 path.push_str(field.name);
                 match object.get(field.name) {
                     Some(json) => check_at(field, json, path)?,
+                    None if is_optional(field) => {}
                     None => return Err(bad(path, field, "nothing".to_owned())),
                 }
                 path.truncate(length);
@@ -122,7 +158,7 @@ fn found(spec: VariableSpec<'_>, json: &Json) -> String {
 }
 
 fn elements(list: &mut ListWriter<'_>, spec: VariableSpec<'_>, json: &Json) -> Result<(), Error> {
-    let (Some(element), Json::Array(values)) = (spec.element(), json) else { return Ok(()) };
+    let Some((element, values)) = listed(spec, json) else { return Ok(()) };
     values.iter().try_for_each(|json| match element.kind {
         Type::List => list.push_list(|list| elements(list, element, json)),
         Type::Record => list.push_record(|record| fields(record, element, json)),
@@ -249,5 +285,54 @@ mod tests {
         assert_eq!(with("y", json!(null)), "nodes[3].y: expected no such field, got null");
         assert_eq!(reported(json!([{ "id": "a" }])), "nodes[0].x: expected float, got nothing");
         assert!(reported(json!({})).ends_with("got a record"));
+    }
+
+    /// What becomes of a JSON value that is set and shown again.
+    fn there_and_back(kind: &str, json: Json) -> Json {
+        let definition = Definition::parse(&format!("f(a: {kind})")).unwrap();
+        let spec = definition.signature().arguments().named("a").unwrap();
+        let mut parameters = Parameters::<4096>::sized();
+        parameters.add_spec(spec).unwrap();
+        assert_eq!(set(&mut parameters, spec, &json), Ok(Ok(())), "{kind}: {json}");
+        to_json(&parameters.value("a").unwrap())
+    }
+
+    #[test]
+    fn an_optional_value_is_the_value_or_null_or_left_out() {
+        let same = |kind, json: Json| assert_eq!(there_and_back(kind, json.clone()), json, "{kind}");
+        same("int?", json!(null));
+        same("int?", json!(7));
+        same("int?[..3]", json!([1, null, 3]));
+        same("int[2]?", json!([1, 2]));
+        same("string[4][..2]?", json!(null));
+        same("string[4][..2]?", json!([]));
+        same("string[4][..2]?", json!(["a"]));
+        same("int[..2][..2]?", json!([[]]));
+        same("int??", json!([null]));
+        same("{a: int?, b: {c: bool?}?, d: int??}", json!({ "b": {}, "d": [] }));
+        same("{a: int?, b: {c: bool?}?, d: int??}", json!({ "a": 1, "b": { "c": true }, "d": [5] }));
+        // A choice.
+        same("{text: string[8]?, number: float?}[..2]", json!([{ "text": "high" }, { "number": 0.5 }]));
+        // As programs write it that know lists only.
+        for (kind, list, one) in [
+            ("int[..1]", json!([]), json!(null)),
+            ("int[..1]", json!([7]), json!(7)),
+            ("int[2][..1]", json!([[1, 2]]), json!([1, 2])),
+            ("{a: string[4][..1]}", json!({ "a": ["x"] }), json!({ "a": "x" })),
+            ("{a: string[4]?}", json!({ "a": null }), json!({})),
+        ] {
+            assert_eq!(there_and_back(kind, list), one, "{kind}");
+        }
+    }
+
+    #[test]
+    fn a_wrong_optional_value_is_told_as_what_it_would_be() {
+        let definition = Definition::parse("f(a: {b: int?, c: {d: float?}?[..2]})").unwrap();
+        let spec = definition.signature().arguments().named("a").unwrap();
+        let reported = |json: Json| check(spec, &json).map_err(|bad| bad.to_string()).unwrap_err();
+        assert_eq!(reported(json!({ "b": "x", "c": [] })), "a.b: expected int, got string");
+        assert_eq!(reported(json!({ "b": [1, 2], "c": [] })), "a.b: expected int, got a list of 2");
+        assert_eq!(reported(json!({ "c": [null, { "d": "x" }] })), "a.c[1].d: expected float, got string");
+        assert_eq!(reported(json!({ "b": 1 })), "a.c: expected {d: float?}?[..2], got nothing");
     }
 }

@@ -14,6 +14,8 @@ pub(super) fn parameters(arguments: &[Argument], specs: VariableSpecs<'_>) -> Re
         put(&mut made, specs, argument)
             .map_err(|failure| failure.and(format_args!("the argument is '{}'", argument.name)))?;
     }
+    let is_given = |name: &str| arguments.iter().any(|argument| argument.name == name);
+    specs.filter(|spec| json::is_optional(*spec) && !is_given(spec.name)).try_for_each(|spec| made.add_spec(spec))?;
     Ok(made)
 }
 

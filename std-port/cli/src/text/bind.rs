@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use cara_std::control::json::is_optional;
 use cara_std::control::protocol::{Argument, ArgumentValue, Number};
 use cara_std::{Signature, Type, VariableSpec};
 use serde_json::Value as Json;
@@ -34,6 +35,9 @@ fn check_names(written: &Written, signature: &Signature) -> Result<(), Mistake> 
 fn argument(written: &Written, spec: VariableSpec) -> Result<Argument, Mistake> {
     let found = written.arguments.iter().find(|(name, _)| name.value == spec.name);
     let Some((_, value)) = found else {
+        if is_optional(spec) {
+            return Ok(Argument { name: spec.name.to_owned(), size: 1, value: ArgumentValue::List(Json::Null) });
+        }
         let what = format!("the argument `{}` is missing", spec.name);
         let example = format!("{}: {}", spec.name, example(spec));
         let expected = if written.text.contains('(') { example } else { format!("({example})") };
@@ -76,6 +80,18 @@ fn bound(value: &Placed<Value>, spec: VariableSpec) -> Result<ArgumentValue, Mis
 /// A value inside a list or record, whose name is its path: `nodes[3].x`.
 fn nested(value: &Placed<Value>, spec: VariableSpec) -> Result<Json, Mistake> {
     Ok(match (spec.kind, &value.value) {
+        (Type::List, written) if is_optional(spec) => {
+            let Some(element) = spec.element() else { return Err(wrong_type(&value.at, spec)) };
+            let element = VariableSpec { name: spec.name, ..element };
+            match (written, nested(value, element)) {
+                (Value::One(Literal::Null), _) => Json::Null,
+                // A list of at most one, unless it is itself the value.
+                (Value::Several(list), Err(_)) if list.len() <= 1 => {
+                    list.first().map_or(Ok(Json::Null), |one| nested(one, element))?
+                }
+                (_, one) => one?,
+            }
+        }
         (Type::List, Value::Several(several)) => {
             let Some(element) = spec.element() else { return Err(wrong_type(&value.at, spec)) };
             if several.len() > spec.size as usize {
@@ -100,7 +116,9 @@ fn nested(value: &Placed<Value>, spec: VariableSpec) -> Result<Json, Mistake> {
                     return Err(Mistake::new(name.at.clone(), what, "each field once"));
                 }
             }
-            let fields = spec.fields().map(|field| {
+            let is_written = |name: &str| written.iter().any(|(written, _)| written.value == name);
+            let needed = spec.fields().filter(|field| !is_optional(*field) || is_written(field.name));
+            let fields = needed.map(|field| {
                 let path = format!("{}.{}", spec.name, field.name);
                 let Some((_, value)) = written.iter().find(|(name, _)| name.value == field.name) else {
                     let end = value.at.end.saturating_sub(1)..value.at.end;
@@ -245,6 +263,7 @@ fn describe(spec: VariableSpec) -> String {
         }
         Type::String => format!("text of at most {}", print::plural(size, "byte")),
         Type::Bytes => format!("at most {}, two hexadecimal digits each", print::plural(size, "byte")),
+        Type::List if is_optional(spec) => "a value or null".into(),
         Type::List => format!("at most {}", print::plural(size, "element")),
         Type::Record => print::plural(size, "field"),
     };
@@ -259,7 +278,8 @@ fn example(spec: VariableSpec) -> String {
         Type::String => return "\"text\"".into(),
         Type::Bytes => return "0x01ff".into(),
         Type::List => {
-            return spec.element().map_or_else(String::new, |element| format!("[{}]", self::example(element)));
+            let element = spec.element().map_or_else(String::new, self::example);
+            return if is_optional(spec) { element } else { format!("[{element}]") };
         }
         Type::Record => {
             let fields = spec.fields().map(|field| format!("{}: {}", field.name, self::example(field)));

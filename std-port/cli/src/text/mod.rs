@@ -8,7 +8,8 @@
 //! - `true` or `false`, for `bool`,
 //! - text in double quotes with the escapes of JSON, for `string`,
 //! - bytes as `0x` and two hexadecimal digits each, for `bytes`,
-//! - several of the first three in brackets, as `[1, 2]`, where the signature has a size other than 1.
+//! - several of the first three in brackets, as `[1, 2]`, where the signature has a size other than 1,
+//! - `null`, or nothing at all, for an optional value that is absent.
 
 mod bind;
 mod interface;

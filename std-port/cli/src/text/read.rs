@@ -6,7 +6,7 @@ use cara_std::DEPTH;
 
 use super::Mistake;
 
-const A_VALUE: &str = "a number, true, false, \"text\", 0x…, [ … ] or { … }";
+const A_VALUE: &str = "a number, true, false, null, \"text\", 0x…, [ … ] or { … }";
 
 /// Lists and records inside each other that are read: one more than a signature has, for the arguments themselves and for
 /// arrays of a fixed size.
@@ -47,6 +47,8 @@ pub(crate) enum Literal<'t> {
     Number(&'t str),
     Truth(bool),
     Text(String),
+    /// An optional value that is absent.
+    Null,
 }
 
 /// Reads a call.
@@ -173,6 +175,7 @@ impl<'t> Reader<'t> {
             "" => return Err(Mistake::new(self.here(), "a value is missing", A_VALUE)),
             "true" => Literal::Truth(true),
             "false" => Literal::Truth(false),
+            "null" => Literal::Null,
             number if looks_like_a_number(number) => Literal::Number(number),
             other => {
                 let what = format!("`{other}` is no value; text goes in double quotes");

@@ -86,6 +86,24 @@ fn a_mistake_in_a_list_is_told_with_its_path() {
 }
 
 #[test]
+fn an_optional_value_is_the_value_or_null_or_nothing() {
+    let signature = "f(a: int?, b: {c: string[4]?, d: int[2]?}, e: int[..3]?)";
+    for (text, shown) in [
+        ("f(b: {})", "f(a: null, b: {}, e: null)"),
+        ("f(a: 7, b: {c: \"x\", d: [1, 2]}, e: [3])", "f(a: 7, b: {c: \"x\", d: [1, 2]}, e: [3])"),
+        ("f(a: [7], b: {c: [\"x\"], d: [[1, 2]]}, e: [])", "f(a: 7, b: {c: \"x\", d: [1, 2]}, e: [])"),
+        (r#"f {"a": null, "b": {"c": null}, "e": [[]]}"#, "f(a: null, b: {c: null}, e: [])"),
+    ] {
+        let arguments = parse(text, signature).unwrap();
+        assert_eq!(show_call("f", &arguments), shown);
+        let sent: Vec<Argument> = serde_json::from_str(&serde_json::to_string(&arguments).unwrap()).unwrap();
+        assert_eq!(sent, arguments);
+    }
+    assert!(mistake("f(a: true, b: {})", signature).1.starts_with("`a` is an int, and this is not"));
+    assert!(mistake("f(a: 7, b: null)", signature).1.starts_with("`b` is a record, and this is not"));
+}
+
+#[test]
 fn floats_may_be_no_numbers() {
     let read = |text: &str| parse(&format!("f(x: {text})"), "f(x: float)").unwrap().remove(0).value;
     for (text, word) in [("NaN", "NaN"), ("inf", "inf"), ("-inf", "-inf")] {

@@ -62,8 +62,8 @@ fn the_printed_trait_is_the_one_that_was_published() {
     );
     assert_eq!(
         published[5].signature,
-        "plan(nodes: {id: string[32], at-m: float[2], actions: {kind: string[8], type: int}[..4], note: string[20][..1]}[..50], \
-         start: {x: float}, speed: float[..1]) -> (last: {x: float}[..1], photos: bytes[3][..1])"
+        "plan(nodes: {id: string[32], at-m: float[2], actions: {kind: string[8], type: int}[..4], note: string[20]?}[..50], \
+         start: {x: float}, speed: float?) -> (last: {x: float}?, photos: bytes[3]?)"
     );
     assert_eq!(published[6].signature, "dock(call: int) progress (left: float) fails (at: int[2], by: string[8])");
     assert_eq!(published[8].signature, "lift() fails (at: int[2], by: string[8])");

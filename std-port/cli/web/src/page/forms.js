@@ -266,8 +266,11 @@ function textField(input, more) {
 
 // A type that this page has no fields for, as lists and records: its value as JSON, which the server reads.
 function anything(input, more) {
-  const made = frame(input.name, `${input.type}${input.size > 1 ? `[${input.size}]` : ""}`, ["as JSON", more].filter(Boolean).join(", "));
+  const optional = input.type === "list" && input.size === 1;
+  const type = optional ? "optional" : `${input.type}${input.size > 1 ? `[${input.size}]` : ""}`;
+  const made = frame(input.name, type, ["as JSON", more].filter(Boolean).join(", "));
   const area = made.add(make("textarea", { className: "long code", rows: 3, spellcheck: false }));
-  const check = () => { try { JSON.parse(area.value); return null; } catch (error) { return error.message; } };
-  return made.done(check, () => argument(input, ["list", "record"].includes(input.type) ? area.value : JSON.parse(area.value)));
+  const written = () => (optional && area.value.trim() === "" ? "null" : area.value);
+  const check = () => { try { JSON.parse(written()); return null; } catch (error) { return error.message; } };
+  return made.done(check, () => argument(input, ["list", "record"].includes(input.type) ? written() : JSON.parse(written())));
 }
