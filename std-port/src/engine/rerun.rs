@@ -23,7 +23,7 @@ use cara_secure::link::Cipher;
 
 use super::link::{Linux, SEALED_AHEAD};
 use super::tables::{node_storage, session_storage};
-use super::tape::{HEAD, Outputs, REASONS};
+use super::tape::{HEAD, Outputs, REASONS, values};
 use super::{arena, message_buffer_bytes};
 use crate::config::{Capacities, check};
 use crate::handler::Handler;
@@ -291,7 +291,9 @@ fn act(
         "connected" => format!("{:?}", session.connected(cx)),
         "receive" => {
             let arguments = (next::<u8>(words)? == 1).then_some(arguments);
-            format!("{:?}", session.receive(cx, &mut bytes(words)?, arguments))
+            let mut lent = bytes(words)?;
+            let receipt = session.receive(cx, &mut lent, arguments);
+            format!("{:?}", (receipt, values(session, receipt.event.as_ref(), &lent)))
         }
         "datagram" => format!("{:?}", session.datagram(cx, next(words)?, next(words)?, &mut bytes(words)?)),
         "failure" => format!("{:?}", session.failure(&bytes(words)?)),

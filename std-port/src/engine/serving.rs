@@ -19,8 +19,8 @@ use super::nested;
 use super::served::{PAUSE, Reports, Serving};
 use super::services::Parked;
 use super::state_gate::{Access, Entered, Held as StateHeld, Turn};
-#[cfg(feature = "async")]
 use super::tape::OFFERS;
+#[cfg(feature = "async")]
 use super::tasks::Task;
 use super::worker::{Worker, arena};
 use crate::handler::{self, Handler, Run};

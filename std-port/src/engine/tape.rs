@@ -1,8 +1,8 @@
 //! Records what one session takes, so that it can be [run again](super::rerun): a text file for each link of a manager in plain
 //! mode. All inputs pass here in the order in which the session takes them, since the link's lock is held.
 //!
-//! Each line has the time in microseconds, a hash of all that came of the input (bytes, datagrams, what the call returned, the
-//! next deadline), what the network did with the bytes, and the input. An input that has no text ends the recording with a line
+//! Each line has the time in microseconds, a hash of all that came of the input (bytes, datagrams, what the call returned, what
+//! the session shows: deadline, peer, its list, counters), what the network did with the bytes, and the input. An input that has no text ends the recording with a line
 //! `cut` that says why.
 
 use std::fmt::{Debug, Write as _};
@@ -14,7 +14,7 @@ use std::path::Path;
 use cara_core::config::{Constraints, Mode, Priority};
 use cara_core::distribution::connection_handler::Directive;
 use cara_core::distribution::failure::Failure;
-use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::function_list::{Function, Slot};
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
@@ -101,7 +101,14 @@ impl Outputs {
     }
 
     pub(super) fn end(mut self, returned: &dyn Debug, session: &Session<Linux>) -> u64 {
-        self.0.update(format!("{returned:?} {}", session.deadline().as_micros()).as_bytes());
+        let (deadline, hears, heard) = (session.deadline().as_micros(), session.hears_datagrams(), session.is_heard());
+        let (hello, counters) = (session.hello(), session.counters());
+        let seen = format!("{returned:?} {deadline} {hears:?} {heard} {hello:?} {counters:?}");
+        self.0.update(seen.as_bytes());
+        for function in session.their_function_list().iter() {
+            let Function { slot, generation, signature, attributes, .. } = function;
+            self.0.update(format!("{slot:?} {generation:?} {signature:?} {attributes:?}").as_bytes());
+        }
         self.0.finalize()
     }
 }
@@ -329,6 +336,17 @@ fn request(
     Ok(text)
 }
 
+/// The values that come with an event.
+pub(super) fn values(session: &Session<Linux>, event: Option<&Event>, lent: &[u8]) -> Vec<u8> {
+    let block = match event {
+        Some(Event::Reply(_, Ok(results))) => session.results(results, lent),
+        Some(Event::Sample(sample)) => session.results(&sample.values, lent),
+        Some(Event::Progress(_, values)) => session.progress_values(values, lent),
+        _ => return Vec::new(),
+    };
+    block.map_or_else(|_| Vec::new(), |block| block.bytes().to_vec())
+}
+
 impl Deref for TapedSession {
     type Target = Session<Linux>;
 
@@ -394,7 +412,12 @@ impl TapedSession {
     ) -> Receipt {
         // Before the session takes them, as it may change them.
         let input = self.tape.is_some().then(|| format!("receive {} {}", u8::from(arguments.is_some()), hex_of(bytes)));
-        self.put(cx, || Ok(input.unwrap_or_default()), |session, cx| session.receive(cx, bytes, arguments))
+        let is_taped = self.tape.is_some();
+        let act = |session: &mut Session<Linux>, cx: &mut Context<'_, Linux>| {
+            let receipt = session.receive(cx, bytes, arguments);
+            (receipt, if is_taped { values(session, receipt.event.as_ref(), bytes) } else { Vec::new() })
+        };
+        self.put(cx, || Ok(input.unwrap_or_default()), act).0
     }
 
     pub(crate) fn datagram(
