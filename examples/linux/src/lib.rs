@@ -1,6 +1,7 @@
 //! What the examples share on Linux: options, output, signals. Their logic is in `cara-apps`.
 
 mod events;
+pub mod messages;
 mod options;
 mod output;
 mod stop;
