@@ -1,7 +1,12 @@
 //! `cara call`: a function of one node, or of all that offer it.
 
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
+
+use anyhow::Context;
 
 use cara_std::control::Closer;
 use cara_std::control::protocol::{Answer, Argument, CallQuestion, Failure, FunctionInfo, Question};
@@ -24,7 +29,7 @@ use cara_tools::units::{parse_time, show_micros};
 /// A call is written with its arguments by name, as 'go_to(position: [1, 2])', and checked against what the node has
 /// published before anything is sent. Texts go in double quotes, bytes are written as 0x01ff, several numbers and lists in
 /// brackets, records in braces: 'order(nodes: [{id: "a", x: 1.5}])'. Arguments may be a JSON object of their own as well:
-/// order '{"nodes": [{"id": "a", "x": 1.5}]}'.
+/// order '{"nodes": [{"id": "a", "x": 1.5}]}', also from a file: order --arguments order.json.
 #[derive(clap::Args)]
 #[command(override_usage = "cara call [OPTIONS] <NODE> <CALL> [JSON]\n       cara call [OPTIONS] --all <CALL> [JSON]")]
 pub(crate) struct Arguments {
@@ -32,6 +37,9 @@ pub(crate) struct Arguments {
     /// alone where there are no arguments, or where they follow as a JSON object.
     #[arg(required = true, num_args = 1..=3, value_names = ["NODE", "CALL", "JSON"])]
     words: Vec<String>,
+    /// The arguments as a JSON object from this file, or from standard input (-).
+    #[arg(long, value_name = "FILE")]
+    arguments: Option<PathBuf>,
     /// Call every node, with an outcome for each s_unit of the roster; it fails where one is missing.
     #[arg(long)]
     all: bool,
@@ -76,11 +84,44 @@ impl Arguments {
     }
 }
 
+/// As much as the control socket takes in one line.
+const LONGEST_ARGUMENTS: u64 = 4 << 20;
+
+/// The text of a file, or of standard input.
+fn text_of(file: &Path) -> anyhow::Result<String> {
+    let mut text = String::new();
+    let source: Box<dyn Read> =
+        if file == Path::new("-") { Box::new(std::io::stdin()) } else { Box::new(File::open(file)?) };
+    source.take(LONGEST_ARGUMENTS + 1).read_to_string(&mut text)?;
+    if text.len() as u64 > LONGEST_ARGUMENTS {
+        anyhow::bail!("it is longer than {LONGEST_ARGUMENTS} bytes");
+    }
+    Ok(text)
+}
+
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let (node, text) = arguments.node_and_call()?;
+    let (node, mut text) = arguments.node_and_call()?;
     let is_attended = arguments.hold && !arguments.detached;
     if is_attended {
         Attended::check("--hold")?;
+    }
+    if let Some(file) = &arguments.arguments {
+        if text.contains(['(', '{']) {
+            return Err(Ended::usage("with --arguments the call is the function's name alone"));
+        }
+        if is_attended && file == Path::new("-") {
+            return Err(Ended::usage(
+                "--hold watches standard input: put the arguments into a file, or add --detached",
+            ));
+        }
+        let from_file = text_of(file).with_context(|| format!("the arguments cannot be read from {}", file.display()));
+        text = format!("{text} {}", from_file.map_err(|error| Ended::usage(format!("{error:#}")))?.trim());
+        if !text.ends_with('}') {
+            return Err(Ended::usage(format!(
+                "{} is no JSON object: it begins with {{ and ends with }}",
+                file.display()
+            )));
+        }
     }
     let text = text.as_str();
     let written = read(text).map_err(|mistake| wrong(&mistake, text, None))?;

@@ -1,6 +1,9 @@
 //! `cara functions` and `cara call`.
 
-use crate::support::{FUNCTIONS, Stage};
+use std::io::Write;
+use std::process::Stdio;
+
+use crate::support::{FUNCTIONS, Ran, Stage, private_folder};
 
 #[test]
 fn functions_are_shown_as_they_are_called() {
@@ -44,6 +47,60 @@ fn results_can_be_pasted_back() {
     assert_eq!(reported["text"], "go_to(position: [1, -2])");
     assert_eq!(reported["node"], "agv-1/11");
     assert_eq!(reported["results"][0]["value"], serde_json::json!([1, -2]));
+}
+
+#[test]
+fn what_may_be_absent_is_null_or_left_out_and_comes_back_so() {
+    let stage = Stage::with(&["agv-1"]);
+    for (call, back) in [
+        ("set_up(load: {})", "set_up(speed: null, load: {})"),
+        ("set_up(speed: 1.5, load: {kg: 2.5, name: null})", "set_up(speed: 1.5, load: {kg: 2.5})"),
+        (r#"set_up(speed: [0.5], load: {name: "box"})"#, r#"set_up(speed: 0.5, load: {name: "box"})"#),
+    ] {
+        assert_eq!(stage.ends(0, &["call", "agv-1", call]).out.trim(), back);
+        assert_eq!(stage.ends(0, &["call", "agv-1", back]).out.trim(), back);
+    }
+    let reported = stage.ends(0, &["call", "agv-1", "set_up(load: {kg: 1.0})", "--json"]).json();
+    assert_eq!(reported["results"][0]["value"], serde_json::Value::Null);
+    assert_eq!(reported["results"][1]["value"], serde_json::json!({ "kg": 1.0 }));
+    stage.ends(2, &["call", "agv-1", "set_up(speed: true, load: {})"]).says("`speed` is a float, and this is not");
+}
+
+#[test]
+fn arguments_come_from_a_file_or_standard_input() {
+    let stage = Stage::with(&["agv-1"]);
+    let folder = private_folder();
+    let file = folder.path().join("arguments.json");
+    fn call<'a>(more: &[&'a str]) -> Vec<&'a str> {
+        [&["call", "agv-1", "set_up", "--arguments"], more].concat()
+    }
+    let path = file.to_str().unwrap();
+    std::fs::write(&file, "\n{ \"load\": { \"kg\": 3.0 },\n  \"speed\": null }\n").unwrap();
+    let back = "set_up(speed: null, load: {kg: 3.0})\n";
+    assert_eq!(stage.ends(0, &call(&[path])).out, back);
+
+    let piped = |more: &[&str]| {
+        let mut command = stage.command(&call(more));
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    };
+    let mut child = piped(&["-"]);
+    child.stdin.take().unwrap().write_all(&std::fs::read(&file).unwrap()).unwrap();
+    let ran = Ran::of(child.wait_with_output().unwrap());
+    assert_eq!((ran.code, &*ran.out), (0, back), "{}", ran.everything());
+
+    stage.ends(2, &["call", "agv-1", "set_up()", "--arguments", path]).says("the function's name alone");
+    let mut held = piped(&["-", "--hold"]);
+    let open = held.stdin.take();
+    let ran = Ran::of(held.wait_with_output().unwrap());
+    drop(open);
+    assert_eq!(ran.code, 2);
+    ran.says("--hold watches standard input");
+    std::fs::write(&file, "{ \"load\": { \"kg\": true } }").unwrap();
+    stage.ends(2, &call(&[path])).says("`load.kg` is a float");
+    std::fs::write(&file, "[1]").unwrap();
+    stage.ends(2, &call(&[path])).says("no JSON object");
+    std::fs::remove_file(&file).unwrap();
+    stage.ends(2, &call(&[path])).says("cannot be read from");
 }
 
 #[test]

@@ -20,10 +20,11 @@ use tempfile::TempDir;
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// What an AGV of these tests offers.
-pub(crate) const FUNCTIONS: [&str; 6] = [
+pub(crate) const FUNCTIONS: [&str; 7] = [
     "go_to(position: int[2]) -> (position: int[2])",
     "echo(text: string[20000]) -> (text: string[20000])",
     "mix(f: float, fs: float[2], b: bool, data: bytes[4]) -> (f: float, fs: float[2], b: bool, data: bytes[4])",
+    "set_up(speed: float?, load: {name: string[8]?, kg: float?}) -> (speed: float?, load: {name: string[8]?, kg: float?})",
     "fail()",
     "slow()",
     "swallow(text: string[100])",
