@@ -10,7 +10,6 @@ mod commands;
 mod node;
 mod nodes;
 mod operator;
-mod recording;
 mod statistics;
 mod text;
 

@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use crate::node::black_box::FOLDER;
-use crate::recording::Reading;
+use cara_recording::Reading;
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output::{self, PLAIN, Rows};

@@ -11,12 +11,13 @@ use anyhow::Context;
 use cara_std::control::Closer;
 use cara_std::control::protocol::{Answer, Argument, CallQuestion, Failure, FunctionInfo, Question};
 use cara_std::{Definition, Priority, Shown};
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::attended::Attended;
 use crate::nodes::{self, Chosen};
 use crate::operator::{Need, Operator, exit_of};
 use crate::text::{Mistake, Written, bind, read, show_call};
+use cara_recording::values;
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::interrupt;
@@ -221,24 +222,6 @@ pub(super) fn of_its_lease(failure: Failure, function: &str, ended_us: Option<u6
         failure.text
     );
     Failure { text, ..failure }
-}
-
-/// The results, of which those of size 1 are a value and no list of one.
-pub(crate) fn values(results: &[Argument]) -> Vec<Value> {
-    let one = |value: Value| match value {
-        Value::Array(list) if list.len() == 1 => list.into_iter().next().unwrap_or_default(),
-        value => value,
-    };
-    let as_value = |result: &Argument| {
-        let mut value = json!(result);
-        if result.size == 1
-            && let Some(inner) = value.get_mut("value")
-        {
-            *inner = one(inner.take());
-        }
-        value
-    };
-    results.iter().map(as_value).collect()
 }
 
 /// What came of the call of one node, in the form that is asked for.

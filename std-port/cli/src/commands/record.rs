@@ -13,7 +13,7 @@ use serde_json::json;
 use super::logs::Texts;
 use crate::nodes;
 use crate::operator::{Need, Operator, Way};
-use crate::recording::{Limits, Recorder};
+use cara_recording::{Limits, Recorder, StartError};
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::interrupt::Asked;
@@ -70,7 +70,11 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let Arguments { file, stream, rate, every, max_size, keep, span } = arguments;
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let unit = operator.unit()?;
-    let recorder = Recorder::start(&file, Limits { size: max_size, keep: keep.into() }, about(&unit))?;
+    let recorder = Recorder::start(&file, Limits { size: max_size, keep: keep.into() }, about(&unit));
+    let recorder = recorder.map_err(|error| match &error {
+        StartError::Refused { .. } => Ended::usage(error.to_string()),
+        StartError::Failed { .. } => Ended::failed("Failed", error.to_string()),
+    })?;
     let way = operator.way();
     let mut questions = vec![Question::Commands];
     if !stream.is_empty() {

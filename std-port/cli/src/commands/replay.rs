@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use crate::recording::{Reading, ReadingEnd, Stage, event_of};
+use cara_recording::{Reading, ReadingEnd, Stage, event_of};
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output;

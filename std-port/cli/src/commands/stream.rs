@@ -7,10 +7,10 @@ use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Argument, Failure, Question};
 use serde_json::json;
 
-use super::call::values;
 use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::text::show_call;
+use cara_recording::values;
 use cara_tools::exit::Exit;
 use cara_tools::global::Global;
 use cara_tools::output::{self, BAD, FAINT};

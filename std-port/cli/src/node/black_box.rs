@@ -13,7 +13,7 @@ use cara_std::control::{described, state_folder};
 use cara_std::{Identity, LeaseEnd, UnitEvent};
 
 use super::settings::Settings;
-use crate::recording::{self, Line, Ring};
+use cara_recording::{self as recording, Line, Ring};
 
 /// The folder in the folder of state.
 pub(crate) const FOLDER: &str = "black-box";
@@ -286,7 +286,7 @@ mod tests {
     use std::sync::mpsc::{channel, sync_channel};
 
     use super::*;
-    use crate::recording::{Reading, event_of};
+    use cara_recording::{Reading, event_of};
 
     const LONG: Duration = Duration::from_secs(20);
     const SHORT: Times = Times { after: Duration::ZERO, between: Duration::ZERO, last: Duration::from_millis(20) };

@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use cara_tools::exit::Ended;
 use mcap::records::MessageHeader;
 use mcap::write::{Metadata, NoSeek};
 use mcap::{McapResult, WriteOptions};
@@ -23,13 +22,34 @@ const MOST_CHANNELS: usize = 10_000;
 /// Bytes after which a chunk ends although its second has not passed.
 const CHUNK: u64 = 1 << 20;
 
+/// Why a recording does not begin.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// What is there is no recording, or is being written.
+    #[error("{} {why}: name another file", path.display())]
+    Refused {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        why: &'static str,
+    },
+    /// The system refuses something.
+    #[error("{}: {error}", path.display())]
+    Failed {
+        /// The file.
+        path: PathBuf,
+        /// Its reason.
+        error: io::Error,
+    },
+}
+
 /// How much is kept.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Limits {
+pub struct Limits {
     /// Bytes after which the next file begins.
-    pub(crate) size: u64,
+    pub size: u64,
     /// Files besides the one that is written, at least one.
-    pub(crate) keep: usize,
+    pub keep: usize,
 }
 
 /// The file that is written, and those before it.
@@ -55,10 +75,10 @@ impl Files {
         limits: Limits,
         about: BTreeMap<String, String>,
         state: Arc<State>,
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self, StartError> {
         let about = Metadata { name: "cara".to_owned(), metadata: about };
         let mut files = Self { path: path.to_owned(), limits, about, state, open: None };
-        let failed = |error: io::Error| Ended::failed("Failed", format!("{}: {error}", path.display()));
+        let failed = |error| StartError::Failed { path: path.to_owned(), error };
         if files.is_there()? {
             shift(path, limits.keep).map_err(failed)?;
         }
@@ -67,18 +87,19 @@ impl Files {
         Ok(files)
     }
 
-    fn is_there(&self) -> anyhow::Result<bool> {
-        let (path, shown) = (&self.path, self.path.display());
-        let refused = |why: &str| Ended::usage(format!("{shown} {why}: name another file"));
+    fn is_there(&self) -> Result<bool, StartError> {
+        let path = &self.path;
+        let refused = |why| StartError::Refused { path: path.clone(), why };
+        let failed = |error| StartError::Failed { path: path.clone(), error };
         let found = match fs::metadata(path) {
             Ok(found) => found,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
-            Err(error) => return Err(Ended::failed("Failed", format!("{shown}: {error}"))),
+            Err(error) => return Err(failed(error)),
         };
         if !found.is_file() {
             return Err(refused("is no file"));
         }
-        let mut file = File::open(path).map_err(|error| Ended::failed("Failed", format!("{shown}: {error}")))?;
+        let mut file = File::open(path).map_err(failed)?;
         if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
             return Err(refused("is being recorded into by another process"));
         }

@@ -13,8 +13,8 @@ use mcap::McapResult;
 use serde::Serialize;
 use serde_json::json;
 
-use super::file::{Files, Limits};
-use super::layout::{self, Message};
+use super::file::{Files, Limits, StartError};
+use super::layout::{self, Elsewhere, MQTT, Message};
 
 /// Longest message; a longer one is lost. With the 1024 lines of the queue this bounds its memory to 256 MiB.
 const LONGEST: usize = 256 * 1024;
@@ -26,36 +26,52 @@ const TIME: usize = size_of::<u64>();
 
 /// Writes a recording. Its clones write the same one.
 #[derive(Clone)]
-pub(crate) struct Recorder {
+pub struct Recorder {
     queue: LineQueue,
     state: Arc<State>,
 }
 
 /// What has come of a recording.
-pub(crate) struct Outcome {
-    pub(crate) messages: u64,
-    pub(crate) lost: u64,
+pub struct Outcome {
+    /// Messages that the files have.
+    pub messages: u64,
+    /// And those that they have not.
+    pub lost: u64,
     /// The last file is whole; otherwise what the disk said, if it said something.
-    pub(crate) whole: Result<(), Option<String>>,
+    pub whole: Result<(), Option<String>>,
 }
 
 impl Recorder {
     /// Begins a file with `about` as its metadata.
-    pub(crate) fn start(path: &Path, limits: Limits, about: BTreeMap<String, String>) -> anyhow::Result<Self> {
+    pub fn start(path: &Path, limits: Limits, about: BTreeMap<String, String>) -> Result<Self, StartError> {
         let state = Arc::<State>::default();
         let files = Files::open(path, limits, about, state.clone())?;
         let mut writer = Writer { files, state: state.clone(), lost: 0, unflushed: 0, is_over: false };
-        Ok(Self { queue: LineQueue::new("recorder", move |line, lost| writer.take(line, lost))?, state })
+        let queue = LineQueue::new("recorder", move |line, lost| writer.take(line, lost));
+        let queue = queue.map_err(|error| StartError::Failed { path: path.to_owned(), error })?;
+        Ok(Self { queue, state })
     }
 
     /// Records an answer. Never waits: what finds no place is counted.
-    pub(crate) fn take(&self, answer: &Answer) {
+    pub fn take(&self, answer: &Answer) {
         self.write(line_of(answer));
     }
 
     /// Records what a node offers, likewise.
-    pub(crate) fn take_functions(&self, node: &str, functions: &[FunctionInfo]) {
+    pub fn take_functions(&self, node: &str, functions: &[FunctionInfo]) {
         self.write(line_of(&(node, functions)));
+    }
+
+    /// Records a message of MQTT, likewise. A payload that is no text is recorded as hexadecimal digits.
+    pub fn take_mqtt(&self, is_sent: bool, topic: &str, is_retained: bool, payload: &[u8]) {
+        let text = std::str::from_utf8(payload).ok();
+        let hex = || payload.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+        let hex = if text.is_none() { Some(hex()) } else { None };
+        let direction = if is_sent { "sent" } else { "received" };
+        let body = json!({
+            "direction": direction, "topic": topic, "retained": is_retained, "payload": text, "payload_hex": hex,
+        });
+        self.write(line_of(&Elsewhere { topic: format!("{MQTT}{topic}"), body }));
     }
 
     fn write(&self, line: Option<Vec<u8>>) {
@@ -66,7 +82,7 @@ impl Recorder {
     }
 
     /// Ends the chunk; to be called every second.
-    pub(crate) fn flush(&self) {
+    pub fn flush(&self) {
         // A full queue is a disk that takes nothing now, and is flushed when it does.
         if self.state.held_up().is_none() {
             self.queue.write(FLUSH);
@@ -74,22 +90,22 @@ impl Recorder {
     }
 
     /// Messages that the disk did not take, or not in time.
-    pub(crate) fn lost(&self) -> u64 {
+    pub fn lost(&self) -> u64 {
         self.queue.lost() + self.state.too_long.load(Ordering::Relaxed) + self.state.unwritten.load(Ordering::Relaxed)
     }
 
     /// Why nothing is written at this moment, as far as the system says.
-    pub(crate) fn held_up(&self) -> Option<String> {
+    pub fn held_up(&self) -> Option<String> {
         self.state.held_up()
     }
 
     /// Which file of the recording is written: each has to begin with the state of everything.
-    pub(crate) fn file(&self) -> u64 {
+    pub fn file(&self) -> u64 {
         self.state.file.load(Ordering::Relaxed)
     }
 
     /// Ends the recording. A disk that takes nothing is waited for twice for so long, and then given up.
-    pub(crate) fn end(self, at_most: Duration) -> Outcome {
+    pub fn end(self, at_most: Duration) -> Outcome {
         let in_time = self.queue.flush(at_most) && {
             self.queue.write(END);
             self.queue.flush(at_most)
@@ -238,6 +254,10 @@ pub(super) fn message_of(line: &[u8]) -> io::Result<Option<(Message, u64)>> {
     if body.starts_with(b"[") {
         let (node, functions): (String, Vec<FunctionInfo>) = serde_json::from_slice(body)?;
         return Ok(Some((layout::functions(&node, &functions, came), came)));
+    }
+    if body.starts_with(Elsewhere::BEGIN) {
+        let elsewhere: Elsewhere = serde_json::from_slice(body)?;
+        return Ok(Some((elsewhere.message(came), came)));
     }
     let answer = serde_json::from_slice(body)?;
     Ok(layout::message(&answer, came).map(|message| (message, came)))

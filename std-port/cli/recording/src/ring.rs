@@ -14,13 +14,13 @@ use super::file::{Open, create};
 use super::recorder::{came, line_of, message_of};
 
 /// An answer, as the recorder's queue has it.
-pub(crate) type Line = Arc<[u8]>;
+pub type Line = Arc<[u8]>;
 
 /// What an entry takes beyond its bytes.
 const OVERHEAD: u64 = 64;
 
 /// The newest answers, of at most so many bytes and so much time.
-pub(crate) struct Ring {
+pub struct Ring {
     lines: VecDeque<Line>,
     bytes: u64,
     most: u64,
@@ -28,17 +28,18 @@ pub(crate) struct Ring {
 }
 
 impl Ring {
-    pub(crate) fn new(most: u64, span: Duration) -> Self {
+    /// Holds so many bytes and so much time.
+    pub fn new(most: u64, span: Duration) -> Self {
         Self { lines: VecDeque::new(), bytes: 0, most, span }
     }
 
     /// An answer that comes now, in the form that [`push`](Self::push) takes; `None` if it is too long. Needs no lock of the ring.
-    pub(crate) fn line(answer: &Answer) -> Option<Line> {
+    pub fn line(answer: &Answer) -> Option<Line> {
         line_of(answer).map(Arc::from)
     }
 
     /// Takes the newest, and forgets the oldest for it.
-    pub(crate) fn push(&mut self, line: Line) {
+    pub fn push(&mut self, line: Line) {
         let begin = came(&line).unwrap_or_default().saturating_sub(self.span.as_nanos() as u64);
         self.bytes += size(&line);
         self.lines.push_back(line);
@@ -51,7 +52,7 @@ impl Ring {
     }
 
     /// All that it holds, the oldest first.
-    pub(crate) fn lines(&self) -> Vec<Line> {
+    pub fn lines(&self) -> Vec<Line> {
         self.lines.iter().cloned().collect()
     }
 }
@@ -61,7 +62,7 @@ fn size(line: &Line) -> u64 {
 }
 
 /// Writes a recording of its own. The file is there once it is whole and on the disk.
-pub(crate) fn write(path: &Path, about: BTreeMap<String, String>, lines: &[Line]) -> McapResult<()> {
+pub fn write(path: &Path, about: BTreeMap<String, String>, lines: &[Line]) -> McapResult<()> {
     let part = path.with_extension("part");
     let written = write_part(&part, about, lines).and_then(|()| Ok(fs::rename(&part, path)?));
     if written.is_err() {

@@ -198,6 +198,25 @@ fn a_message_that_is_too_long_is_counted_and_the_recording_says_so() {
 }
 
 #[test]
+fn messages_of_mqtt_go_both_ways_and_each_topic_is_a_channel() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    recorder.take_mqtt(false, "uagv/order", true, b"{\"orderId\":\"o1\"}");
+    recorder.take_mqtt(true, "uagv/state", false, &[0xff, 0]);
+    assert_eq!(whole(recorder), 2);
+    let found: Vec<_> = Reading::open(&path).unwrap().filter(|message| message.topic.starts_with("/mqtt/")).collect();
+    let topics: Vec<_> = found.iter().map(|message| message.topic.as_str()).collect();
+    assert_eq!(topics, ["/mqtt/uagv/order", "/mqtt/uagv/state"]);
+    let body = |index: usize| serde_json::from_slice::<Value>(&found[index].body).unwrap();
+    assert_eq!(
+        body(0),
+        serde_json::json!({ "direction": "received", "topic": "uagv/order", "retained": true, "payload": "{\"orderId\":\"o1\"}" })
+    );
+    assert_eq!((&body(1)["direction"], &body(1)["payload_hex"]), (&"sent".into(), &"ff00".into()));
+}
+
+#[test]
 fn where_the_keys_are_is_not_recorded() {
     let unit = serde_json::json!({
         "answer": "unit", "name": "depot", "id": 1, "role": "m_unit", "fleet": 0, "version": 2,

@@ -5,13 +5,14 @@
 use std::borrow::Cow;
 
 use cara_std::control::protocol::{Answer, Argument, FunctionInfo, UnitInfo};
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
-
-use crate::commands::call::values as values_of;
 
 const EVENTS: &str = "/events";
 const COMMANDS: &str = "/commands";
 pub(super) const FUNCTIONS: &str = "/functions";
+/// Begins the channels of MQTT, before its own topic.
+pub(super) const MQTT: &str = "/mqtt/";
 
 /// A message, and the channel that it belongs to.
 pub(super) struct Message {
@@ -51,6 +52,23 @@ pub(super) fn message(answer: &Answer, came: u64) -> Option<Message> {
     Some(of(topic, published, json!(answer)))
 }
 
+/// What was said elsewhere than between units of CARA, as over MQTT.
+#[derive(Serialize, Deserialize)]
+pub(super) struct Elsewhere {
+    /// Of the channel. It comes first, by which a line of the queue is told from an answer.
+    pub(super) topic: String,
+    pub(super) body: Value,
+}
+
+impl Elsewhere {
+    /// How its line begins.
+    pub(super) const BEGIN: &[u8] = b"{\"topic\"";
+
+    pub(super) fn message(self, came: u64) -> Message {
+        Message { topic: Cow::Owned(self.topic), form: String::new(), body: without_nulls(self.body), published: came }
+    }
+}
+
 /// What a node offers.
 pub(super) fn functions(node: &str, functions: &[FunctionInfo], came: u64) -> Message {
     of(FUNCTIONS, came, json!({ "node": node, "functions": functions }))
@@ -62,7 +80,7 @@ pub(super) fn about_itself(body: Value, at: u64) -> Message {
 }
 
 /// The event that a message of a recording holds; of a command, one that tells it.
-pub(crate) fn event_of(topic: &str, body: &[u8]) -> Option<Answer> {
+pub fn event_of(topic: &str, body: &[u8]) -> Option<Answer> {
     if ![EVENTS, COMMANDS].contains(&topic) {
         return None;
     }
@@ -95,8 +113,26 @@ fn without_keys(unit: &UnitInfo) -> UnitInfo {
 
 fn named(values: &[Argument]) -> Map<String, Value> {
     let read =
-        values_of(values).into_iter().map(|mut value| value.get_mut("value").map(Value::take).unwrap_or_default());
+        self::values(values).into_iter().map(|mut value| value.get_mut("value").map(Value::take).unwrap_or_default());
     values.iter().map(|value| value.name.clone()).zip(read).collect()
+}
+
+/// Values as `cara` shows them in JSON: what is one value is no list.
+pub fn values(results: &[Argument]) -> Vec<Value> {
+    let one = |value: Value| match value {
+        Value::Array(list) if list.len() == 1 => list.into_iter().next().unwrap_or_default(),
+        value => value,
+    };
+    let as_value = |result: &Argument| {
+        let mut value = json!(result);
+        if result.size == 1
+            && let Some(inner) = value.get_mut("value")
+        {
+            *inner = one(inner.take());
+        }
+        value
+    };
+    results.iter().map(as_value).collect()
 }
 
 fn without_nulls(value: Value) -> Value {
@@ -126,6 +162,10 @@ pub(super) fn schema(message: &Message) -> (String, Value) {
         }
         "/unit" => ("cara.Unit", message.body.clone()),
         "/counters" => ("cara.Counters", with(&message.body, "node", json!(""))),
+        topic if topic.starts_with(MQTT) => {
+            let message = json!({ "direction": "", "topic": "", "retained": false, "payload": "", "payload_hex": "" });
+            ("mqtt.Message", message)
+        }
         topic => (topic, with(&message.body, "error", json!({ "error": "", "text": "" }))),
     };
     (name.to_owned(), schema_of(&members))

@@ -13,7 +13,7 @@ use mcap::{McapError, parse_record};
 const LONGEST: usize = 64 << 20;
 
 /// The messages of a file, in its order.
-pub(crate) struct Reading<R> {
+pub struct Reading<R> {
     from: R,
     reader: LinearReader,
     topics: HashMap<u16, String>,
@@ -28,16 +28,18 @@ pub(crate) struct Reading<R> {
 
 /// A message.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Message {
-    pub(crate) topic: String,
+pub struct Message {
+    /// Of its channel.
+    pub topic: String,
     /// Nanoseconds since 1970, when it was recorded.
-    pub(crate) came: u64,
-    pub(crate) body: Vec<u8>,
+    pub came: u64,
+    /// JSON.
+    pub body: Vec<u8>,
 }
 
 /// How the reading of a file has ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum End {
+pub enum End {
     /// All messages were read.
     Whole,
     /// It ends in the middle, as after the end of the process or the host that recorded it.
@@ -47,13 +49,15 @@ pub(crate) enum End {
 }
 
 impl Reading<BufReader<File>> {
-    pub(crate) fn open(path: &Path) -> io::Result<Self> {
+    /// Opens a file.
+    pub fn open(path: &Path) -> io::Result<Self> {
         Ok(Self::of(BufReader::new(File::open(path)?)))
     }
 }
 
 impl<R: Read> Reading<R> {
-    pub(crate) fn of(from: R) -> Self {
+    /// Reads what comes.
+    pub fn of(from: R) -> Self {
         let options = LinearReaderOptions::default().with_emit_chunks(true).with_record_length_limit(LONGEST);
         let reader = LinearReader::new_with_options(options);
         Self {
@@ -68,12 +72,12 @@ impl<R: Read> Reading<R> {
     }
 
     /// How it has ended, once there are no more messages.
-    pub(crate) fn end(&self) -> Option<&End> {
+    pub fn end(&self) -> Option<&End> {
         self.end.as_ref()
     }
 
     /// What the recording says of itself, once the first message has been read.
-    pub(crate) fn about(&self) -> &BTreeMap<String, String> {
+    pub fn about(&self) -> &BTreeMap<String, String> {
         &self.about
     }
 

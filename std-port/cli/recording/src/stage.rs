@@ -30,7 +30,7 @@ const PATIENCE: Duration = Duration::from_secs(2);
 
 /// What was so at that moment. Its clones show the same.
 #[derive(Clone, Default)]
-pub(crate) struct Stage(Arc<Mutex<State>>);
+pub struct Stage(Arc<Mutex<State>>);
 
 #[derive(Default)]
 struct State {
@@ -55,7 +55,7 @@ enum Watched {
 
 impl Stage {
     /// Listens at a path, at which nothing may be but the socket of a process that has ended.
-    pub(crate) fn open(&self, path: &Path) -> io::Result<()> {
+    pub fn open(&self, path: &Path) -> io::Result<()> {
         let is_left =
             || path.metadata().is_ok_and(|found| found.file_type().is_socket()) && UnixStream::connect(path).is_err();
         let listener = match UnixListener::bind(path) {
@@ -71,12 +71,12 @@ impl Stage {
     }
 
     /// Whether it is known whose recording it is, without which nobody can ask.
-    pub(crate) fn has_unit(&self) -> bool {
+    pub fn has_unit(&self) -> bool {
         self.lock().unit.is_some()
     }
 
     /// Shows a message of the recording.
-    pub(crate) fn show(&self, message: &Message) {
+    pub fn show(&self, message: &Message) {
         let mut state = self.lock();
         if message.topic == "/counters" {
             if let Some((node, counters)) = counters_of(&message.body) {
