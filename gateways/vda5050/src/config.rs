@@ -21,6 +21,8 @@ pub struct Config {
     pub manager: Manager,
     /// Where the master is.
     pub broker: Broker,
+    /// What goes over MQTT, as MCAP.
+    pub recording: Option<Recording>,
     /// How vehicles are shown to it.
     pub vda5050: Vda5050,
     /// What they can do.
@@ -81,6 +83,27 @@ pub struct Broker {
     /// Milliseconds without a probe coming back after which the broker counts as away.
     #[serde(default = "probe_timeout")]
     pub probe_timeout: u64,
+}
+
+/// A recording, as `cara record` makes them.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recording {
+    /// The file. The one before becomes FILE.1.
+    pub file: PathBuf,
+    /// Bytes after which the next file begins.
+    #[serde(default = "max_size")]
+    pub max_size: u64,
+    /// Files that are kept besides the one that is written.
+    #[serde(default = "keep")]
+    pub keep: u16,
+}
+
+const fn max_size() -> u64 {
+    256 << 20
+}
+const fn keep() -> u16 {
+    3
 }
 
 const fn port() -> u16 {
@@ -173,11 +196,14 @@ impl Config {
         let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
         let mut config: Self = toml::from_str(&text).with_context(|| file.display().to_string())?;
         let folder = file.parent().unwrap_or(Path::new(""));
-        let Self { manager, broker, vda5050, .. } = &mut config;
+        let Self { manager, broker, recording, vda5050, .. } = &mut config;
         let files =
             [&mut broker.password_file, &mut broker.ca_file, &mut broker.certificate_file, &mut broker.key_file];
         let files = files.into_iter().chain([&mut manager.key_file, &mut manager.shared_records]).flatten();
         files.chain([&mut manager.state_folder, &mut vda5050.factsheet]).for_each(|path| *path = folder.join(&*path));
+        if let Some(recording) = recording {
+            recording.file = folder.join(&recording.file);
+        }
         config.check().with_context(|| file.display().to_string())?;
         Ok(config)
     }
@@ -220,6 +246,11 @@ impl Config {
         }
         let metrics = self.manager.metrics;
         ensure!(metrics.is_none_or(|at| at.ip().is_loopback()), "metrics are served at a loopback address only");
+        let recording = self.recording.as_ref();
+        ensure!(
+            recording.is_none_or(|one| one.max_size >= 64 * 1024 && one.keep >= 1),
+            "recording: max_size is at least 65536 bytes, and keep at least 1"
+        );
         ensure!(broker.keep_alive >= 5, "keep_alive is 5 s at least");
         ensure!(broker.probe == 0 || broker.probe_timeout > broker.probe, "probe_timeout is longer than probe");
         ensure!(

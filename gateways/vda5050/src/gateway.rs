@@ -21,6 +21,7 @@ use crate::message::{
 use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, Link, Place};
 use crate::record::{RecordLock, Store};
+use crate::recording::Recording;
 use crate::tls::Whose;
 use crate::vehicle::Linked;
 use crate::version::Version;
@@ -53,6 +54,7 @@ pub fn run(
     vehicle: &config::Vehicle,
     system: &CommunicationSystem,
     seen: &Arc<Seen>,
+    recording: &Recording,
     end: &End,
 ) -> Result<()> {
     let is_shared = config.manager.shared_records.is_some();
@@ -69,7 +71,7 @@ pub fn run(
             std::thread::sleep(TURN);
             continue;
         }
-        let mut gateway = Gateway::start(config, vehicle, system, &peer, seen.clone(), lock)?;
+        let mut gateway = Gateway::start(config, vehicle, system, &peer, (seen.clone(), recording.clone()), lock)?;
         let has_left = || is_shared && !peer.is_connected();
         while !end.is_due.load(Ordering::SeqCst) && !gateway.is_mended() && !has_left() {
             let turn = Instant::now();
@@ -116,6 +118,7 @@ struct Gateway {
     visualized: Instant,
     /// For metrics.
     seen: Arc<Seen>,
+    recording: Recording,
     /// Within how many days certificates expire, as it was logged, and when that was looked at.
     expires: [Option<u64>; 2],
     looked: Instant,
@@ -129,7 +132,7 @@ impl Gateway {
         vehicle: &config::Vehicle,
         system: &CommunicationSystem,
         peer: &Peer,
-        seen: Arc<Seen>,
+        (seen, recording): (Arc<Seen>, Recording),
         lock: Option<RecordLock>,
     ) -> Result<Self> {
         let config = &Config { broker: config.broker.of(vehicle), ..config.clone() };
@@ -160,6 +163,7 @@ impl Gateway {
             client_id,
             prefix: prefix.clone(),
             will: Box::new(last_words),
+            recording: recording.clone(),
             expiry: seen.expiry.clone(),
         })?;
         let now = Instant::now();
@@ -183,6 +187,7 @@ impl Gateway {
             tried,
             folder,
             seen,
+            recording,
             expires: [None; 2],
             looked: now,
             reported: None,
@@ -477,14 +482,9 @@ impl Gateway {
     fn send(&self, topic: &str, quality: QoS, is_retained: bool, message: &impl Serialize) -> Option<()> {
         let client = self.client.as_ref()?;
         self.seen.sent.fetch_add(1, Ordering::Relaxed);
-        client
-            .try_publish(
-                format!("{}/{topic}", self.prefix),
-                quality,
-                is_retained,
-                write(self.config.version(), message),
-            )
-            .ok()
+        let (topic, payload) = (format!("{}/{topic}", self.prefix), write(self.config.version(), message));
+        self.recording.take(true, &topic, is_retained, &payload);
+        client.try_publish(topic, quality, is_retained, payload).ok()
     }
 
     /// Says what `connection` is from now on, and waits until that has arrived. What moves stops, as its heart goes.

@@ -2,7 +2,7 @@
 //!
 //! [`machine`] decides, and has no I/O: orders ([`order`]), actions ([`actions`]), errors ([`errors`]) and the state that is reported
 //! ([`state`]), by the rules of a [`version`]. [`driver`] writes its record ([`record`]) and tells the vehicle ([`vehicle`], [`stretch`]), [`mqtt`] and [`tls`] are the broker, [`gateway`] joins
-//! them, [`config`] is its file, [`metrics`] is for Prometheus. `docs/vda5050.md` says what of the standard is there.
+//! them, [`recording`] records what goes over it, [`config`] is its file, [`metrics`] is for Prometheus. `docs/vda5050.md` says what of the standard is there.
 
 pub mod actions;
 pub mod config;
@@ -15,6 +15,7 @@ pub mod metrics;
 pub mod mqtt;
 pub mod order;
 pub mod record;
+pub mod recording;
 pub mod state;
 pub mod stretch;
 pub mod tls;

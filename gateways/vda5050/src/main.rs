@@ -13,6 +13,7 @@ use cara_std::{StartError, UnitEvent};
 use cara_vda5050::config::{Config, Vehicle};
 use cara_vda5050::gateway::{self, End};
 use cara_vda5050::metrics::{self, Seen};
+use cara_vda5050::recording::Recording;
 use clap::Parser;
 
 /// Vehicles of CARA under VDA 5050 2.0, 2.1 and, as a preview, 3.0, over an MQTT broker.
@@ -61,13 +62,16 @@ fn main() -> Result<ExitCode> {
         let text = move || metrics::text(&unit.upgrade().map(|unit| unit.metrics()).unwrap_or_default(), &seen);
         std::thread::Builder::new().name("metrics".into()).spawn(move || metrics::serve(&listener, text))?;
     }
+    let recording = Recording::start(&config)?;
     let is_fenced = std::thread::scope(|scope| -> Result<bool> {
         for (vehicle, seen) in config.vehicle.iter().zip(&seen) {
-            let (config, system) = (&config, &system);
+            let (config, system, recording) = (&config, &system, &recording);
             std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
                 // What ends one vehicle's loop is no reason to stop the others: it stops by its lease, and is begun anew.
                 while !END.is_due.load(Ordering::SeqCst) {
-                    match catch_unwind(AssertUnwindSafe(|| gateway::run(config, vehicle, system, seen, &END))) {
+                    match catch_unwind(AssertUnwindSafe(|| {
+                        gateway::run(config, vehicle, system, seen, recording, &END)
+                    })) {
                         Ok(Ok(())) => return,
                         Ok(Err(error)) => eprintln!("{}: {error:#}", vehicle.serial_number),
                         Err(_) => eprintln!("{}: its loop has panicked", vehicle.serial_number),
@@ -78,6 +82,7 @@ fn main() -> Result<ExitCode> {
         }
         println!("up with {} vehicles", config.vehicle.len());
         while !END.is_due.load(Ordering::SeqCst) {
+            recording.turn();
             let event = events.recv_timeout(Duration::from_millis(200));
             // Another gateway speaks for these vehicles now: this one says nothing more.
             if matches!(event, Ok(UnitEvent::Fenced { .. })) {
@@ -89,5 +94,6 @@ fn main() -> Result<ExitCode> {
         Ok(false)
     })?;
     system.stop();
+    recording.end();
     Ok(if is_fenced { ExitCode::from(StartError::FENCED_EXIT) } else { ExitCode::SUCCESS })
 }

@@ -12,6 +12,7 @@ use anyhow::{Context, Result};
 use rumqttc::{Client, Event, LastWill, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
 
 use crate::config;
+use crate::recording::Recording;
 use crate::tls::{self, Expiry};
 
 /// The largest message that is read, in bytes.
@@ -47,6 +48,8 @@ pub struct Place {
     pub prefix: String,
     /// The message on topic `connection` if it goes away.
     pub will: Box<dyn Fn() -> Vec<u8> + Send>,
+    /// Where what comes is recorded.
+    pub recording: Recording,
     /// What is seen of certificates.
     pub expiry: Arc<Expiry>,
 }
@@ -115,6 +118,7 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
             Event::Incoming(Packet::Publish(message)) => {
                 let topic = message.topic.strip_prefix(&place.prefix).and_then(|topic| topic.strip_prefix('/'));
                 let Some(topic) = topic else { continue };
+                place.recording.take(false, &message.topic, message.retain, &message.payload);
                 Heard::Message(topic.to_owned(), message.retain, message.payload.to_vec())
             }
             Event::Incoming(Packet::Disconnect) | Event::Outgoing(rumqttc::Outgoing::Disconnect) => return Ok(()),
@@ -127,7 +131,7 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
 }
 
 fn options(place: &Place) -> Result<MqttOptions> {
-    let Place { broker, client_id, prefix, will, expiry } = place;
+    let Place { broker, client_id, prefix, will, expiry, .. } = place;
     let mut options = MqttOptions::new(client_id, &broker.host, broker.port);
     options.set_keep_alive(Duration::from_secs(broker.keep_alive.into()));
     options.set_clean_session(true).set_max_packet_size(LARGEST, LARGEST_SENT);

@@ -1,0 +1,92 @@
+//! A recording of what goes over MQTT: a message waits in the recorder's bounded queue, and a thread of its own writes it. A disk that
+//! is full, hangs or cannot be opened costs the recording alone.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use cara_recording::{Limits, Recorder};
+
+use crate::config::Config;
+
+/// What is recorded can be read after this time.
+const CHUNK: Duration = Duration::from_secs(1);
+/// Between two warnings about losses.
+const WARN: Duration = Duration::from_secs(10);
+/// A disk that takes nothing is waited for so long at the end, once or twice.
+const LAST: Duration = Duration::from_secs(2);
+/// Topic of the messages that tell whether the broker is there: they are not recorded.
+const PROBE: &str = "/cara-probe";
+
+/// Its clones write into the same one. Without a setting it takes nothing.
+#[derive(Clone, Default)]
+pub struct Recording(Option<Arc<Shared>>);
+
+struct Shared {
+    file: PathBuf,
+    /// Once its file is open.
+    recorder: OnceLock<Recorder>,
+    /// When its chunk ended last; how many messages were lost at the last warning, and when that was.
+    turned: Mutex<(Instant, u64, Option<Instant>)>,
+}
+
+impl Recording {
+    /// Opens the file in a thread of its own, as its disk may hang. Fails if there is no such thread.
+    pub fn start(config: &Config) -> Result<Self> {
+        let Some(settings) = config.recording.clone() else { return Ok(Self::default()) };
+        let turned = Mutex::new((Instant::now(), 0, None));
+        let shared = Arc::new(Shared { file: settings.file.clone(), recorder: OnceLock::new(), turned });
+        let limits = Limits { size: settings.max_size, keep: settings.keep.into() };
+        let about = [
+            ("unit", format!("{}/{}", config.manager.name, config.manager.id)),
+            ("fleet", config.manager.fleet.to_string()),
+            ("vda5050", config.vda5050.version.clone()),
+            ("recorded_by", format!("cara-vda5050 {}", env!("CARGO_PKG_VERSION"))),
+        ];
+        let about = about.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
+        let own = shared.clone();
+        let open = move || match Recorder::start(&settings.file, limits, about) {
+            Ok(recorder) => drop(own.recorder.set(recorder)),
+            Err(error) => eprintln!("nothing is recorded: {error}"),
+        };
+        std::thread::Builder::new().name("recording".into()).spawn(open)?;
+        Ok(Self(Some(shared)))
+    }
+
+    /// Records a message. Never waits: what finds no place is counted.
+    pub fn take(&self, is_sent: bool, topic: &str, is_retained: bool, payload: &[u8]) {
+        let recorder = self.0.as_ref().and_then(|shared| shared.recorder.get());
+        if let Some(recorder) = recorder.filter(|_| !topic.ends_with(PROBE)) {
+            recorder.take_mqtt(is_sent, topic, is_retained, payload);
+        }
+    }
+
+    /// Ends a chunk if that is due, and warns of losses. To be called several times a second.
+    pub fn turn(&self) {
+        let Some((shared, recorder)) = self.opened() else { return };
+        let mut turned = shared.turned.lock().unwrap_or_else(PoisonError::into_inner);
+        let (flushed, lost, warned) = &mut *turned;
+        if flushed.elapsed() >= CHUNK {
+            *flushed = Instant::now();
+            recorder.flush();
+        }
+        if recorder.lost() > *lost && warned.is_none_or(|warned| warned.elapsed() >= WARN) {
+            (*lost, *warned) = (recorder.lost(), Some(Instant::now()));
+            let why = recorder.held_up().map(|why| format!(": {why}")).unwrap_or_default();
+            eprintln!("{}: {lost} messages are not recorded until now{why}", shared.file.display());
+        }
+    }
+
+    /// Ends the file.
+    pub fn end(&self) {
+        let Some((shared, recorder)) = self.opened() else { return };
+        let outcome = recorder.clone().end(LAST);
+        eprintln!("{}: {} messages recorded, {} lost", shared.file.display(), outcome.messages, outcome.lost);
+    }
+
+    fn opened(&self) -> Option<(&Shared, &Recorder)> {
+        let shared = self.0.as_deref()?;
+        Some((shared, shared.recorder.get()?))
+    }
+}
