@@ -137,7 +137,7 @@ fn the_page_shows_a_recording_at_any_speed() {
         write!(page, "GET /api/stream HTTP/1.1\r\nhost: {address}\r\nauthorization: Bearer {key}\r\n\r\n").unwrap();
         let (mut told, mut piece, start) = (Vec::new(), [0; 4096], Instant::now());
         // Its nodes, and a stream with its value.
-        let wanted = ["\"agv-1/11@s_unit\":{", "\"late-1/12@s_unit\":{", "pose() -> (x: int)", "[[\"x\",[7]"];
+        let wanted = ["\"agv-1/11@s_unit\":{", "\"late-1/12@s_unit\":{", "pose() -> (x: int)", "[[\"x\",[\"7\"]]"];
         while !wanted.iter().all(|part| String::from_utf8_lossy(&told).contains(part)) {
             let read = page.read(&mut piece).unwrap_or_default();
             assert!(read > 0 && start.elapsed() < PATIENCE, "at speed {speed} only {}", String::from_utf8_lossy(&told));
