@@ -29,7 +29,7 @@ const PARTS: [(&str, &[&str]); 4] = [
             "std-port/cli/keys/src",
             "std-port/cli/line/src",
             "std-port/cli/provision/src",
-            "std-port/cli/recording/src",
+            "std-port/recording/src",
             "std-port/cli/web/src",
             "std-port/map/src",
         ],

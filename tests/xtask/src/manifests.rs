@@ -38,6 +38,8 @@ enum Place {
     /// What a program adds to the Linux port, which does not know it.
     Provider,
     CommandLine,
+    /// Recordings, for programs on the Linux port.
+    Recording,
     /// Speaks for units of CARA to what a plant has.
     Gateway,
     Examples,
@@ -118,6 +120,7 @@ impl Manifest {
             ("core", _) => Some(Place::CoreMember),
             ("std-port", "etcd") => Some(Place::Provider),
             ("std-port", "cli") => Some(Place::CommandLine),
+            ("std-port", "recording") => Some(Place::Recording),
             ("std-port" | "embassy-port", _) => Some(Place::Port),
             ("gateways", _) => Some(Place::Gateway),
             ("examples", _) => Some(Place::Examples),
@@ -185,14 +188,17 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (Place::CoreMember, to) => matches!(to, Place::Core | Place::CoreMember),
         (Place::Port, Place::Core | Place::CoreMember) => true,
         // What tests of ports stand on: networks, processes, applications.
-        (Place::Port | Place::Provider | Place::CommandLine | Place::Gateway, Place::Tests | Place::Examples) => {
-            for_tests
-        }
+        (
+            Place::Port | Place::Provider | Place::Recording | Place::CommandLine | Place::Gateway,
+            Place::Tests | Place::Examples,
+        ) => for_tests,
         (Place::Port, _) => false,
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.
         (Place::Examples, Place::Tests) => for_tests,
-        (Place::Provider | Place::CommandLine, Place::Provider) | (Place::Provider, Place::CommandLine) => false,
+        (Place::Provider | Place::Recording, Place::Provider | Place::Recording | Place::CommandLine) => false,
+        (Place::CommandLine, Place::Provider) => false,
+        (_, Place::Recording) => true,
         (_, Place::Provider) | (Place::CommandLine, Place::CommandLine) => true,
         (Place::Examples, Place::Examples) | (Place::Tests, Place::Tests | Place::Examples) => true,
         (Place::Tests | Place::Examples | Place::Gateway, Place::CommandLine) | (_, Place::Gateway) => false,
