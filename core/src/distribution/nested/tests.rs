@@ -74,7 +74,7 @@ fn the_text_form_is_read_and_shown() {
         assert_eq!(definition(text).to_string(), text);
     }
     assert_eq!(
-        definition("f(a: int[..1], b: { c: string[2] ? } [ ..2])").to_string(),
+        definition("f(a: int[..1], b: { c: string[2] ? } [..2])").to_string(),
         "f(a: int?, b: {c: string[2]?}[..2])"
     );
     assert_eq!(definition("f(a:{b:int , c : float [ 2 ] } [..3])").to_string(), "f(a: {b: int, c: float[2]}[..3])");
@@ -389,6 +389,7 @@ impl Data {
             Self::Bools(bools) => format!("bool[{}]", bools.len()),
             Self::Text(most, _) => format!("string[{most}]"),
             Self::Bytes(most, _) => format!("bytes[{most}]"),
+            Self::List(1, elements) => format!("{}?", elements[0].text()),
             Self::List(most, elements) => format!("{}[..{most}]", elements[0].text()),
             Self::Record(fields) => {
                 let fields = fields.iter().enumerate().map(|(index, field)| format!("f{index}: {}", field.text()));
