@@ -126,8 +126,8 @@ impl<R> Builder<(), R> {
 
 impl<T: Send + 'static> Builder<T, MUnit> {
     /// Records each link's session with all that it takes in a file of this folder, so that [`rerun`](crate::rerun) does the same
-    /// again: for a fault that is hard to repeat. The files have the arguments and results of calls in the clear, and
-    /// recording takes time. Only in plain mode, [`BuildError::CoreRecordingWithKeys`] otherwise; a recording ends early, and
+    /// again: for a fault that is hard to repeat. The files have the arguments and results of calls in the clear, none is written
+    /// over, and recording takes time: a disk that hangs holds up the unit, and its stops. Only in plain mode, [`BuildError::CoreRecordingWithKeys`] otherwise; a recording ends early, and
     /// says why, where the unit offers functions of its own, has an access table, or renews a call by a [heart](crate::Heart).
     pub fn record_core(mut self, folder: impl Into<PathBuf>) -> Self {
         self.core_recordings = Some(folder.into());

@@ -483,8 +483,9 @@ impl Gateway {
         let client = self.client.as_ref()?;
         self.seen.sent.fetch_add(1, Ordering::Relaxed);
         let (topic, payload) = (format!("{}/{topic}", self.prefix), write(self.config.version(), message));
+        client.try_publish(&topic, quality, is_retained, payload.clone()).ok()?;
         self.recording.take(true, &topic, is_retained, &payload);
-        client.try_publish(topic, quality, is_retained, payload).ok()
+        Some(())
     }
 
     /// Says what `connection` is from now on, and waits until that has arrived. What moves stops, as its heart goes.

@@ -231,8 +231,10 @@ impl Machine {
             let text = "an action of this id is here";
             return Err(Refusal::new(Kind::Validation, text).about("actionId", &twice.action_id));
         }
-        if sent.len() + kept.len() > self.policy.can.max_actions {
-            return Err(Refusal::new(Kind::Space, "too many actions").about("actions", sent.len() + kept.len()));
+        // Those at once that have ended give way.
+        let held = kept.iter().filter(|entry| entry.is_of_order() || !entry.status.has_ended()).count();
+        if sent.len() + held > self.policy.can.max_actions {
+            return Err(Refusal::new(Kind::Space, "too many actions").about("actions", sent.len() + held));
         }
         Ok(())
     }
@@ -409,7 +411,7 @@ impl Machine {
 
     /// What a mode does by itself, beside ending an order.
     fn enter(&mut self, mode: OperatingMode) {
-        let was_controlled = self.status.as_ref().is_none_or(|status| is_controlled(status.mode));
+        let was_controlled = self.status.as_ref().is_some_and(|status| is_controlled(status.mode));
         let known = self.record.errors.len();
         if is_controlled(mode) && !was_controlled {
             // In 2.x this is one of the errors that last until an order is taken.

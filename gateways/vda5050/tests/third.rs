@@ -284,3 +284,30 @@ fn a_record_of_another_version_is_read() {
     pair.machine.order(order("o1", 1, 2, "b! d!"));
     assert_eq!(pair.errors(), ["SAME_ORDER_UPDATE_ID"]);
 }
+
+/// In both versions: neither an order nor what stops it fails for actions at once that have ended.
+#[test]
+fn what_has_ended_takes_no_place() {
+    for version in [Version::V2, Version::V3] {
+        let mut pair = Pair::of("a", version);
+        let ask = |pair: &mut Pair, from: u32| {
+            (from..from + 80)
+                .for_each(|number| pair.machine.instant_actions(instant("stateRequest", &format!("s{number}"))));
+        };
+        ask(&mut pair, 0);
+        // As many actions as the vehicle holds.
+        let all = ["beep"; 20].join(",");
+        let mut full = order("o1", 0, 0, &format!("a! b! c!:{all}"));
+        let actions = full.nodes[2].actions.iter_mut();
+        actions.enumerate().for_each(|(number, action)| action.action_id = format!("b{number}"));
+        pair.machine.order(full);
+        assert_eq!(pair.errors(), Vec::<&str>::new(), "{version:?}");
+        ask(&mut pair, 100);
+        pair.machine.instant_actions(instant("startPause", "p1"));
+        pair.machine.instant_actions(instant("cancelOrder", "c1"));
+        pair.turns(10);
+        assert_eq!(pair.errors(), Vec::<&str>::new(), "{version:?}");
+        let report = pair.machine.report().unwrap();
+        assert_eq!((report.paused, pair.left().as_str()), (Some(true), ""), "{version:?}");
+    }
+}

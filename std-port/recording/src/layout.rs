@@ -4,7 +4,7 @@
 
 use std::borrow::Cow;
 
-use cara_std::control::protocol::{Answer, Argument, FunctionInfo, UnitInfo};
+use cara_std::control::protocol::{Answer, Argument, ArgumentValue, FunctionInfo, UnitInfo};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
@@ -126,6 +126,7 @@ pub fn values(results: &[Argument]) -> Vec<Value> {
     let as_value = |result: &Argument| {
         let mut value = json!(result);
         if result.size == 1
+            && matches!(result.value, ArgumentValue::Int(_) | ArgumentValue::Float(_) | ArgumentValue::Bool(_))
             && let Some(inner) = value.get_mut("value")
         {
             *inner = one(inner.take());

@@ -65,7 +65,8 @@ impl Recorder {
     /// Records a message of MQTT, likewise. A payload that is no text is recorded as hexadecimal digits.
     pub fn take_mqtt(&self, is_sent: bool, topic: &str, is_retained: bool, payload: &[u8]) {
         let text = std::str::from_utf8(payload).ok();
-        let hex = || payload.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+        // A longer one is lost: `write` counts it.
+        let hex = || payload.iter().take(LONGEST).map(|byte| format!("{byte:02x}")).collect::<String>();
         let hex = if text.is_none() { Some(hex()) } else { None };
         let direction = if is_sent { "sent" } else { "received" };
         let body = json!({

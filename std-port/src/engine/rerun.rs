@@ -115,9 +115,12 @@ struct Player {
 
 /// Runs a recorded session again, as the text of its file has it.
 pub fn rerun(recording: &str) -> Result<Rerun, RerunError> {
-    let mut lines = (1..).zip(recording.lines());
+    // A process that was killed leaves half a line.
+    let (whole, half) = recording.rsplit_once('\n').unwrap_or(("", recording));
+    let mut lines = (1..).zip(whole.lines());
     let mut player = Player::new(&mut lines)?;
-    let (mut inputs, mut hash, mut cut) = (0, Outputs::new(), None);
+    let (mut inputs, mut hash) = (0, Outputs::new());
+    let mut cut = (!half.is_empty()).then(|| "the process ended".to_owned());
     for (number, line) in lines {
         if let Some(why) = line.strip_prefix("cut ") {
             cut = Some(why.to_owned());

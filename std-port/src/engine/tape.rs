@@ -6,9 +6,10 @@
 //! `cut` that says why.
 
 use std::fmt::{Debug, Write as _};
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Write as _};
 use std::ops::Deref;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 use cara_core::config::{Constraints, Mode, Priority};
@@ -179,7 +180,7 @@ impl Tape {
     ) -> std::io::Result<Self> {
         let mut bytes = [0; HELLO_BYTES];
         let length = hello.encode(Mode::Plain, &mut bytes).unwrap_or(0);
-        let mut file = BufWriter::new(File::create(path)?);
+        let mut file = BufWriter::new(OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?);
         let micros = now.as_micros();
         writeln!(file, "{HEAD}")?;
         writeln!(file, "session {micros} {} {address} {}", u8::from(dialed), hex::encode(&bytes[..length]))?;

@@ -24,7 +24,11 @@ impl Machine {
             if !self.is_due(&action, &stamp) {
                 continue;
             }
-            if self.record.actions.len() >= self.policy.can.max_actions + INSTANT_ACTIONS {
+            self.forget_instant_actions(INSTANT_ACTIONS - 1);
+            // What stops finds a place where nothing else does.
+            let is_stop = matches!(action.action_type.as_str(), "startPause" | "cancelOrder");
+            let most = self.policy.can.max_actions + INSTANT_ACTIONS * (1 + usize::from(is_stop));
+            if self.record.actions.len() >= most {
                 self.refuse(&Refusal::new(Kind::Space, "too many actions").about("actionId", &action.action_id));
                 continue;
             }

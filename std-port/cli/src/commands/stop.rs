@@ -20,6 +20,8 @@ use cara_tools::units::show_micros;
 const TAKING_OVER: Duration = Duration::from_secs(15);
 /// Likewise, where no manager ran to begin with: one may have died just before.
 const APPEARING: Duration = Duration::from_secs(4);
+/// A manager that answers is asked again for so long while nodes are missing: they join a new one after the other.
+const JOINING: Duration = Duration::from_secs(3);
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Calls each function with the attribute `stop`, at once and as an emergency: what they stop stands until a reset.
@@ -60,7 +62,7 @@ impl Of {
 
 pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCode> {
     of.check("stop")?;
-    let mut until = None;
+    let (mut until, mut answered) = (None, None);
     loop {
         let ended = run(&of, Operator::open_to_stop, |node| Question::Stop { node }, global);
         if until.is_none()
@@ -72,6 +74,9 @@ pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCod
                 let span = span.as_secs();
                 output::warning(format_args!("{error:#}. Asking again for {span} s, should a standby take over"));
             }
+        }
+        if let (Ok(Exit::Failed), Some(end)) = (&ended, &mut until) {
+            *end = *answered.get_or_insert_with(|| (Instant::now() + JOINING).min(*end));
         }
         if matches!(ended, Ok(Exit::Done)) || until.is_none_or(|until| until < Instant::now()) {
             return ended.map(Into::into);
