@@ -27,7 +27,6 @@ use cara_core::services::heart::Renew;
 use cara_core::services::requests::{CallId, Made, Pending};
 use cara_core::services::session::{Delivery, Event, Incoming, Receipt, RequestOptions, Session};
 use cara_core::time::{Duration, Instant};
-use cara_secure::link::Cipher;
 use core::net::SocketAddr;
 use crc::{CRC_64_XZ, Crc, Digest};
 
@@ -396,7 +395,8 @@ impl TapedSession {
     }
 
     /// The link's cipher, which nothing is asked of here.
-    pub(crate) const fn cipher(&mut self) -> &Cipher {
+    #[cfg(feature = "control")]
+    pub(crate) const fn cipher(&mut self) -> &cara_secure::link::Cipher {
         self.session.cipher()
     }
 
