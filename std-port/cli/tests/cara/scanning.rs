@@ -106,11 +106,13 @@ fn called<'l>(list: &'l Value, key: &str, name: &str) -> &'l Value {
 
 const ALL_MANAGERS: [&str; 4] = ["scan", "--all-managers", "--listen", "2s"];
 
-/// Until its datagrams have shown `far/3` and whom `agv-5` looks for.
+/// Until its datagrams have shown `far/3` and whom `agv-5` looks for, which searches every 8 to 16 s in the end.
 fn scan_all(stage: &Stage, more: &[&str]) -> Ran {
     let mut ran = None;
+    let mut times = ["2s", "17s"].into_iter();
     until("they are heard", || {
-        let scan = ran.insert(stage.ends(0, &[&ALL_MANAGERS, more].concat()));
+        let listen = ["scan", "--all-managers", "--listen", times.next().unwrap_or("17s")];
+        let scan = ran.insert(stage.ends(0, &[&listen, more].concat()));
         scan.out.contains("far/3") && scan.out.contains("nobody/9")
     });
     ran.unwrap()
