@@ -2,8 +2,8 @@
 //! mode. All inputs pass here in the order in which the session takes them, since the link's lock is held.
 //!
 //! Each line has the time in microseconds, a hash of all that came of the input (bytes, datagrams, what the call returned, what
-//! the session shows: deadline, peer, its list, counters), what the network did with the bytes, and the input. An input that has no text ends the recording with a line
-//! `cut` that says why.
+//! the session shows: deadline, peer, its list, counters), what the network did with the bytes, and the input. An input that has
+//! no text ends the recording with a line `cut` that says why.
 
 use std::fmt::{Debug, Write as _};
 use std::fs::{File, OpenOptions};
