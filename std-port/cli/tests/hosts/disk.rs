@@ -66,8 +66,8 @@ impl Disk {
         match way {
             Way::Full => Ok(std::fs::remove_file(self.filler())?),
             Way::ReadOnly => {
-                run(&format!("umount -l {}", path.display()))?;
-                // The old one stays in use as long as a process has a file open there.
+                // The failed one stays below it: a manager that starts between the two would make a new folder of state at the mount
+                // point, and claim anew. Vehicles refuse that claim for 3 s.
                 let image = self.folder.path().join(format!("image-{}", self.images));
                 std::fs::copy(&self.image, &image)?;
                 (self.image, self.images) = (image, self.images + 1);
@@ -95,6 +95,8 @@ impl Drop for Disk {
         if self.is_frozen {
             let _ = run(&format!("fsfreeze -u {}", path.display()));
         }
-        let _ = run(&format!("umount -l {}", path.display()));
+        for _ in 0..self.images {
+            let _ = run(&format!("umount -l {}", path.display()));
+        }
     }
 }
