@@ -144,6 +144,7 @@ pub use cara_core::typed::{self, AnyCall, AsyncState, Mismatch, TypedCall, Varia
 pub use cara_derive::{VariablesStd as Variables, interface_std as interface};
 pub use communication_system::{CallToAll, CommunicationSystem, WeakSystem};
 pub use config::Capacities;
+pub use engine::clocks::ClockOffset;
 pub use engine::details::Canceller;
 pub use engine::rerun::{Rerun, RerunError, rerun};
 pub use error::{CallError, HandOverError, StartError};

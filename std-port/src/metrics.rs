@@ -5,6 +5,7 @@
 //! | `cara_node_*_total` | discovery and membership | `unit` |
 //! | `cara_links_*_total` | all links, those that have ended included | `unit` |
 //! | `cara_link_*_total` | the links to one node | `unit`, `peer`, `role` |
+//! | `cara_clock_*_seconds` | how far the clock of a node is from the unit's, where the node tells it, and the error of that | `unit`, `peer`, `role` |
 //! | `cara_unit_*` | the port: buffers, links, calls, events | `unit` |
 //!
 //! A name is the counter's in the API, as `RequestsSent`, in lower case: `cara_link_requests_sent_total`.
@@ -21,6 +22,7 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::Registry;
 
+use crate::engine::clocks::ClockOffset;
 use crate::engine::{Engine, Group, Reading};
 
 /// The content type of [`metrics`](crate::CommunicationSystem::metrics), for the HTTP response.
@@ -51,6 +53,13 @@ struct PeerSnapshot {
     role: &'static str,
     connected: bool,
     readings: Vec<Reading>,
+    clock: Option<ClockOffset>,
+}
+
+impl PeerSnapshot {
+    fn labels<'s>(&'s self, unit: &'s str) -> [(&'static str, &'s str); 3] {
+        [("unit", unit), ("peer", self.peer.as_str()), ("role", self.role)]
+    }
 }
 
 impl Snapshot {
@@ -67,6 +76,7 @@ impl Snapshot {
             role: cell.identity.role().as_str(),
             connected: cell.is_connected(),
             readings: engine.accounts.of_peer(cell),
+            clock: cell.clock_offset(),
         });
         Self { unit: unit.to_string(), uptime: engine.uptime(), peers: peers.collect(), readings: engine.readings() }
     }
@@ -83,9 +93,8 @@ impl Snapshot {
         let name = name(first);
         let mut family = encoder.encode_descriptor(&name, first.help, None, MetricType::Counter)?;
         for peer in &self.peers {
-            let labels = [("unit", self.unit.as_str()), ("peer", peer.peer.as_str()), ("role", peer.role)];
             if let Some(reading) = peer.readings.get(index) {
-                encode_value(reading, family.encode_family(&labels)?)?;
+                encode_value(reading, family.encode_family(&peer.labels(&self.unit))?)?;
             }
         }
         Ok(())
@@ -99,10 +108,27 @@ impl Snapshot {
         let help = "Whether the node is connected.";
         let mut family = encoder.encode_descriptor("cara_link_connected", help, None, MetricType::Gauge)?;
         for peer in &self.peers {
-            let labels = [("unit", self.unit.as_str()), ("peer", peer.peer.as_str()), ("role", peer.role)];
-            ConstGauge::new(i64::from(peer.connected)).encode(family.encode_family(&labels)?)?;
+            ConstGauge::new(i64::from(peer.connected)).encode(family.encode_family(&peer.labels(&self.unit))?)?;
         }
         Ok(())
+    }
+
+    /// Nothing of nodes that do not tell their clocks.
+    fn encode_clocks(
+        &self,
+        encoder: &mut DescriptorEncoder<'_>,
+        name: &str,
+        help: &str,
+        micros: impl Fn(&ClockOffset) -> f64,
+    ) -> fmt::Result {
+        let mut clocks = self.peers.iter().filter_map(|peer| peer.clock.as_ref().map(|clock| (peer, clock))).peekable();
+        if clocks.peek().is_none() {
+            return Ok(());
+        }
+        let mut family = encoder.encode_descriptor(name, help, None, MetricType::Gauge)?;
+        clocks.try_for_each(|(peer, clock)| {
+            ConstGauge::new(micros(clock) / 1e6).encode(family.encode_family(&peer.labels(&self.unit))?)
+        })
     }
 }
 
@@ -115,7 +141,11 @@ impl Collector for Snapshot {
         for (index, reading) in first.iter().enumerate() {
             self.encode_peers(&mut encoder, index, reading)?;
         }
-        self.encode_state(&mut encoder)
+        self.encode_state(&mut encoder)?;
+        let help = "How far the node's clock is ahead of the unit's.";
+        self.encode_clocks(&mut encoder, "cara_clock_offset_seconds", help, |clock| clock.offset_us as f64)?;
+        let help = "By how much the offset of the node's clock may be wrong.";
+        self.encode_clocks(&mut encoder, "cara_clock_error_seconds", help, |clock| clock.error.as_micros() as f64)
     }
 }
 

@@ -11,9 +11,9 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 
 use crate::actuator::Actuator;
-use crate::engine::{Engine, arena_bytes};
+use crate::engine::{Engine, arena_bytes, clocks};
 use crate::executor::Executor;
-use crate::handler::{Handler, Hook, IntoHandler, Safe, ServiceOptions};
+use crate::handler::{Handler, Hook, IntoHandler, Safe, Served, ServiceOptions};
 use crate::lease::{LeaseWatch, ServiceLease};
 use crate::safe_hook::{Parts, SafeHook};
 use crate::storage::Boxed;
@@ -165,6 +165,17 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         self.engine.latch.start(move || services.upgrade().map(|services| services.latched()))?;
         let look = Arc::new(move |change| engine.upgrade().into_iter().for_each(|engine| engine.latch_changed(change)));
         Ok(Actuator { lease, safe, clock, look })
+    }
+
+    /// Adds the function `clock() -> (unix_us: int)`, which tells this host's time in microseconds since 1970. Managers to which the
+    /// list is published call it now and then, and show how far this clock is from theirs.
+    ///
+    /// What [`add_service`](Self::add_service) refuses.
+    pub fn add_clock(&self) -> Result<(), Error> {
+        let definition = Definition::parse(clocks::SIGNATURE).map_err(|_| Error::BadName)?;
+        let tell =
+            |_: &Served, parameters: &mut ParametersView| Ok(parameters.set_value(clocks::UNIX_US, clocks::unix_us())?);
+        self.add_service(&definition, ServiceOptions::new().idempotent(), tell).map(|_| ())
     }
 
     /// Removes a function; peers are told.

@@ -21,6 +21,7 @@ use core::net::SocketAddr;
 use crate::config;
 #[cfg(feature = "control")]
 use crate::control::protocol::{CipherInfo, DatagramsInfo, LinkInfo};
+use crate::engine::clocks::ClockOffset;
 use crate::engine::link::LinkCell;
 use crate::engine::peer_cell::PeerCell;
 use crate::engine::{Engine, pairs};
@@ -208,6 +209,12 @@ impl<T: Send + 'static> Peer<T> {
     /// [`Error::TimedOut`] when no answer comes in time.
     pub fn ping(&self, timeout: impl Into<Duration>) -> Result<Duration, Error> {
         self.engine.ping(&self.link()?, timeout.into())
+    }
+
+    /// How far the node's clock is from this manager's, while it is connected and where it [tells](crate::MyFunctionList::add_clock)
+    /// that; `None` also at an s_unit, which does not ask. It is measured when the node has joined, and each minute.
+    pub fn clock_offset(&self) -> Option<ClockOffset> {
+        self.cell.clock_offset()
     }
 
     /// Hands this vehicle over to another manager while nothing of it moves: it leaves this one, and is back within about ten seconds

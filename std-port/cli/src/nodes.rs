@@ -195,7 +195,7 @@ mod tests {
     fn node(name: &str, id: u32, connected: bool) -> NodeInfo {
         let (role, functions) = ("s_unit".into(), 0);
         let name = name.into();
-        let (address, version, epoch, connected_ms, limits, link) = (None, None, None, None, None, None);
+        let (address, version, epoch, connected_ms, limits, link, clock) = (None, None, None, None, None, None, None);
         let (left_ms, left_reason, left_text, searched_ms, searched_from) = (None, None, None, None, None);
         NodeInfo {
             name,
@@ -214,6 +214,7 @@ mod tests {
             searched_from,
             limits,
             link,
+            clock,
             functions,
         }
     }

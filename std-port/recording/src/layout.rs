@@ -194,6 +194,7 @@ fn node() -> Value {
             "silent_ms": 0, "calls": 0, "calls_here": 0, "queued_bytes": 0, "stream_ms": 0, "datagrams": "", "segment": 0,
             "cipher": "",
         },
+        "clock": { "offset_us": 0, "error_us": 0, "age_ms": 0 },
     })
 }
 

@@ -10,8 +10,8 @@ use cara_core::time::Duration;
 
 use super::failure::name_of;
 use super::protocol::{
-    Answer, ConstraintsInfo, FunctionInfo, InhibitedInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo, OrderInfo,
-    RefusedInfo, SchedulingInfo, UnitInfo, unix_ms,
+    Answer, ClockInfo, ConstraintsInfo, FunctionInfo, InhibitedInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo,
+    OrderInfo, RefusedInfo, SchedulingInfo, UnitInfo, unix_ms,
 };
 use crate::keys::LiveRing;
 use crate::{CommunicationSystem, Interface, Limits, Peer, Refusal, TheirFunction, UnitEvent};
@@ -75,6 +75,7 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInf
         searched_from: searched.map(|(_, from)| from.to_string()),
         limits: limits.map(self::limits),
         link: peer.link_info(),
+        clock: peer.clock_offset().map(ClockInfo::of),
         functions: peer.their_function_list().len(),
     }
 }

@@ -13,6 +13,7 @@ mod attributes;
 mod audit;
 mod call;
 mod client;
+mod clock;
 mod commands;
 mod constraint;
 mod describe;

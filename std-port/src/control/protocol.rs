@@ -11,6 +11,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
+pub use super::clock::ClockInfo;
 use super::role::Role;
 
 /// In the manager's first line, so that an older command recognises a newer manager.
@@ -589,6 +590,9 @@ pub struct NodeInfo {
     /// Its link, while it is connected; absent where the unit is older than this.
     #[serde(default)]
     pub link: Option<LinkInfo>,
+    /// How far its clock is from the unit's, while it is connected and if it tells that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clock: Option<ClockInfo>,
     /// Functions that it has published to this unit.
     pub functions: usize,
 }

@@ -321,7 +321,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
             self.notify(UnitEvent::NetworkChanged { up });
         }
         let unjoined = self.unjoined.warn(self.now(), &self.hub, self.sockets.datagrams.discovery_port());
-        interfaces.min(self.watch_keys()).min(unjoined)
+        interfaces.min(self.watch_keys()).min(unjoined).min(self.measure_clocks())
     }
 
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {

@@ -20,6 +20,7 @@ use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 use core::net::SocketAddr;
 
+use super::clocks::ClockWatch;
 use super::details::Details;
 use super::notices::Notices;
 use super::peer_cell::PeerCell;
@@ -90,6 +91,8 @@ pub(crate) struct LinkState {
     /// The state of what functions of the peer move, as far as it has told.
     pub(crate) actuators: BTreeMap<Slot, ActuatorState>,
     pub(crate) details: Details,
+    /// The measurements of the peer's clock, where it offers that.
+    pub(super) clock: Option<Box<ClockWatch>>,
 }
 
 /// Bytes that were read and cannot be looked at yet, because calls that wait leave no room for more.
@@ -153,6 +156,7 @@ impl LinkCell {
             notices: Notices::default(),
             actuators: BTreeMap::new(),
             details: Details::default(),
+            clock: None,
         };
         Self {
             unit_number,

@@ -220,6 +220,7 @@ impl<T: Send + 'static> Engine<T> {
                 // What is read of it is subscribed to.
                 if let Some(peer) = link.peer.get() {
                     peer.streams.all().iter().for_each(|watched| self.tell_interval_on(link, peer, watched));
+                    self.look_for_clock(link);
                 }
             }
             _ => {}

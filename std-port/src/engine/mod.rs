@@ -14,7 +14,7 @@
 //! | `settling`, `inbound` | its methods for a link that a thread has locked |
 //! | `calling`, `serving`, `workers` | for requests of this unit, those of its peers, and the threads of the pool |
 //! | `membership`, `clock_thread` | for links that come and go, and for the thread that keeps time |
-//! | `awaiting` | calls that are futures: built on all of it, as the handles are |
+//! | `awaiting`, `clocks` | calls that are futures, and those that measure clocks: built on all of it, as the handles are |
 //!
 //! Locks are taken in the order of [`Rank`](crate::locks::Rank), which a debug build asserts: the accounts, the table of
 //! links, a link, the functions, the node, then any other; never two links. Handlers, hooks and subscribers run without
@@ -29,6 +29,7 @@ mod awaiting;
 mod calling;
 pub(crate) mod claims;
 mod clock_thread;
+pub(crate) mod clocks;
 pub(crate) mod details;
 mod driving;
 mod events;
@@ -165,6 +166,7 @@ pub(crate) struct Engine<T: 'static> {
     notes: Notes,
     pub(crate) events: Events,
     unjoined: unjoined::Unjoined,
+    clocks: Arc<clocks::Clocks>,
     /// For threads that look for themselves at what has happened.
     pub(crate) news: News,
 }
@@ -236,6 +238,7 @@ impl<T: Send + 'static> Engine<T> {
             },
             events: Events::default(),
             unjoined: unjoined::Unjoined::default(),
+            clocks: Arc::default(),
             news: News::default(),
         })
     }

@@ -13,6 +13,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::requests::CallId;
 use cara_core::time::Duration;
 
+use super::clocks::{ClockOffset, Measured};
 use super::link::LinkCell;
 use super::streams::Streams;
 use crate::locks::lock;
@@ -38,6 +39,8 @@ pub(crate) struct PeerCell {
     pub(crate) streams: Streams,
     /// What its earlier links have counted.
     earlier: Mutex<Option<Box<LinkCounters>>>,
+    /// How far its clock is from this unit's, while it is connected and tells it.
+    clock: Mutex<Option<Box<Measured>>>,
     /// It has told what it offers since it has its place, on this link or an earlier one.
     pub(super) introduced: AtomicBool,
     /// The operator has taken it off the roster.
@@ -124,9 +127,20 @@ impl PeerCell {
             orders: Mutex::default(),
             streams: Streams::default(),
             earlier: Mutex::new(None),
+            clock: Mutex::new(None),
             introduced: AtomicBool::new(false),
             retired: AtomicBool::new(false),
         })
+    }
+
+    /// How far its clock is from this unit's, while it is connected and where it tells that.
+    pub(crate) fn clock_offset(&self) -> Option<ClockOffset> {
+        self.link()?;
+        lock(&self.clock).as_deref().map(Measured::offset)
+    }
+
+    pub(super) fn set_clock(&self, measured: Option<Measured>) {
+        *lock(&self.clock) = measured.map(Box::new);
     }
 
     /// Whether it has ever joined.
@@ -176,6 +190,7 @@ impl PeerCell {
         self.retired.store(false, Ordering::Relaxed);
         *current = Some(link);
         *lock(&self.searched) = None;
+        *lock(&self.clock) = None;
     }
 
     /// The link has ended; a newer one stays.

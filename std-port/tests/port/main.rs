@@ -11,6 +11,7 @@ mod asynchronous;
 mod authority;
 mod callbacks;
 mod claims;
+mod clocks;
 mod constraints;
 mod details;
 mod growing;

@@ -248,7 +248,14 @@ fn record_changed(
 ) -> Option<String> {
     let (key, lasting, is_sampled, offers) = match &answer {
         Answer::Node(node) => {
-            let lasting = NodeInfo { connected_ms: None, left_ms: None, searched_ms: None, link: None, ..node.clone() };
+            let lasting = NodeInfo {
+                connected_ms: None,
+                left_ms: None,
+                searched_ms: None,
+                link: None,
+                clock: None,
+                ..node.clone()
+            };
             let name = format!("{}/{}", node.name, node.id);
             let key = format!("{name}@{}", node.role);
             (key, Answer::Node(lasting), node.connected, Some(name).filter(|_| node.connected))

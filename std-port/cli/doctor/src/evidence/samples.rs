@@ -141,6 +141,7 @@ pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
         searched_from: None,
         limits: None,
         link: None,
+        clock: None,
         functions: 0,
     }
 }

@@ -114,10 +114,10 @@ fn joined(nodes: &[NodeInfo]) -> Rows {
                 node.name.clone(),
                 node.id.to_string(),
                 node.role.clone(),
-                match node.link.and_then(|link| link.trouble()) {
-                    Some(trouble) => format!("{state}, {trouble}"),
-                    None => state,
-                },
+                [node.link.and_then(|link| link.trouble()), node.clock.and_then(|clock| clock.trouble())]
+                    .into_iter()
+                    .flatten()
+                    .fold(state, |state, trouble| format!("{state}, {trouble}")),
                 or_dash(node.address.clone()),
                 or_dash(node.version.map(|version| version.to_string())),
                 node.functions.to_string(),

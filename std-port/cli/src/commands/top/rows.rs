@@ -418,6 +418,16 @@ fn node(app: &App, now: Now) -> Vec<Row> {
             said.push(("cipher".into(), cell(cipher.name())));
         }
     }
+    if let Some(clock) = node.clock {
+        let text = format!(
+            "{} \u{b1} {}, {} ago",
+            signed_micros(clock.offset_us),
+            show_micros(clock.error_us as f64),
+            span(ms(clock.age_ms) + age)
+        );
+        let tone = if clock.trouble().is_some() { Tone::Bad } else { Tone::Plain };
+        said.push(("clock offset".into(), cell(text).toned(tone)));
+    }
     if let Some(limits) = node.limits {
         let text = format!("{} a message, {} calls", show_bytes(limits.message_size.into()), limits.calls);
         said.push(("it takes".into(), cell(text)));
@@ -445,6 +455,11 @@ fn node(app: &App, now: Now) -> Vec<Row> {
         }
     }
     said.into_iter().enumerate().map(|(at, (what, cell))| line(watched, &what, cell, at)).collect()
+}
+
+/// `+1.50 ms`.
+fn signed_micros(us: i64) -> String {
+    format!("{}{}", if us < 0 { '-' } else { '+' }, show_micros(us.unsigned_abs() as f64))
 }
 
 fn line(node: &str, what: &str, text: Cell, at: usize) -> Row {

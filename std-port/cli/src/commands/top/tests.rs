@@ -47,6 +47,7 @@ fn node(name: &str, id: u32) -> NodeInfo {
             segment: None,
             cipher: Some(CipherInfo::AesGcm),
         }),
+        clock: None,
         functions: 2,
     }
 }
