@@ -10,7 +10,8 @@ use std::slice;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, Served, ServiceError, Unit,
+    CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, Served, ServiceError, ServiceOptions,
+    Unit,
 };
 
 use keyed::keyed;
@@ -178,4 +179,45 @@ fn every_counter_of_the_api_is_in_the_text_with_its_value() {
 
     let agv = parse(&agvs[1].metrics());
     assert!(agv.keys().any(|(name, labels)| name == "cara_link_requests_received_total" && labels[1].1 == unit));
+}
+
+#[test]
+fn the_clock_of_a_node_is_in_the_text_if_the_node_tells_it() {
+    let fleet = RandomState::new().build_hasher().finish() as u32;
+    let own = Identity::m_unit("manager", 1).unwrap();
+    let others = [1, 2].map(|id| Identity::s_unit("agv", id).unwrap());
+    let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::Loopback);
+    let manager = keyed(manager, fleet, &own, &others).build().unwrap();
+    manager.start().unwrap();
+    assert!(!manager.metrics().contains("cara_clock"));
+    let _agvs = others.each_ref().map(|other| {
+        let agv = Unit::builder("agv", other.id(), "manager", 1).unwrap().interfaces(Interfaces::Loopback);
+        let agv = keyed(agv, fleet, other, slice::from_ref(&own)).build().unwrap();
+        let tell = |_: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
+            let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+            Ok(view.set_value("unix_us", now.as_micros() as i64 - 3_000_000)?)
+        };
+        if other.id() == 1 {
+            let clock = "clock() -> (unix_us: int)".parse().unwrap();
+            agv.my_function_list().add_service(&clock, ServiceOptions::new(), tell).unwrap();
+        }
+        agv.publish_my_function_list().unwrap();
+        agv.start().unwrap();
+        agv
+    });
+    until("both have come", || manager.number_of_s_units() == 2);
+    until("one is measured", || manager.s_units().iter().any(|peer| peer.clock_offset().is_some()));
+    let samples = parse(&manager.metrics());
+    let clocks: HashMap<&str, f64> = samples
+        .iter()
+        .filter(|((name, _), _)| name.starts_with("cara_clock"))
+        .map(|((name, labels), value)| {
+            let labels: Vec<_> = labels.iter().map(|(label, value)| (label.as_str(), value.as_str())).collect();
+            assert_eq!(labels, [("unit", "manager/1"), ("peer", "agv/1"), ("role", "s_unit")]);
+            (name.as_str(), *value)
+        })
+        .collect();
+    let (offset, error) = (clocks["cara_clock_offset_seconds"], clocks["cara_clock_error_seconds"]);
+    assert_eq!(clocks.len(), 2);
+    assert!((offset + 3.0).abs() <= error + 1e-5 && (0.0..1.0).contains(&error), "{offset} {error}");
 }

@@ -748,7 +748,7 @@ fn an_s_unit_is_a_node_too() {
     let manager = Node::start("");
     let vehicle = TempDir::new().unwrap();
     let file = format!(
-        "name = \"agv\"\nid = 7\nrole = \"s_unit\"\nfleet = {}\ninterfaces = \"lo\"\n[manager]\nname = \"plant\"\nid = 1\n\
+        "name = \"agv\"\nid = 7\nrole = \"s_unit\"\nfleet = {}\ninterfaces = \"lo\"\nclock = true\n[manager]\nname = \"plant\"\nid = 1\n\
          [[functions]]\nsignature = \"echo(text: string[20000]) -> (text: string[20000])\"\nanswer = \"echo\"\n",
         manager.fleet
     );
@@ -761,6 +761,8 @@ fn an_s_unit_is_a_node_too() {
         (asked.status.success(), text(&asked.stdout))
     };
     until("its function is there", || ask(&["functions", "agv/7"]).1.contains("echo"));
+    until("its clock is measured", || ask(&["scan", "--json"]).1.contains("\"offset_us\":"));
+    assert!(ask(&["scan"]).1.contains(" connected "), "its clock is that of its manager");
     let (called, results) = ask(&["call", "agv/7", "echo(text: \"there and back\")"]);
     assert!(called && results.contains("there and back"), "{results}");
     let (measured, times) = ask(&["ping", "agv/7", "--count", "2", "--interval", "1ms", "--json"]);

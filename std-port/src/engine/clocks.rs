@@ -40,7 +40,9 @@ const FEW: u8 = 4;
 /// Between the ends of two of these measurements.
 const PERIOD: Duration = Duration::from_secs(60);
 /// How long an answer is waited for, and a slot for calls is in use.
-const PATIENCE: Duration = Duration::from_millis(250);
+const PATIENCE: Duration = Duration::from_millis(500);
+/// Before the second try where the first call has failed, as it may in a busy moment. It is a period before the third.
+const AGAIN: Duration = Duration::from_secs(5);
 /// Calls without an answer in a row after which the node is asked no more until it joins again: each of them may still run there.
 const MOST_FAILURES: u8 = 3;
 /// Before the next try where the link has no room for a call.
@@ -122,7 +124,7 @@ impl ClockWatch {
     /// How far the clock is that has answered this, if it is the best of these few.
     fn answered(&mut self, now: Instant, asked: &Asked, theirs: i64) -> Option<Measured> {
         self.failures = 0;
-        // Zero before the thread that has read it has come to that: it is no later than now.
+        // Zero where the thread that has read the answer has not called the waker yet: it came no later than now.
         let came = match asked.answer.at.load(Ordering::Acquire) {
             0 => now,
             micros => Instant::from_micros(micros),
@@ -146,9 +148,13 @@ impl ClockWatch {
     /// Whether the node is asked no more.
     fn fails(&mut self, now: Instant) -> bool {
         self.failures += 1;
-        let gives_up = self.failures >= MOST_FAILURES;
-        (self.answers, self.due) = (0, if gives_up { Instant::FAR_FUTURE } else { now + PERIOD });
-        gives_up
+        self.answers = 0;
+        self.due = match self.failures {
+            1 => now + AGAIN,
+            MOST_FAILURES.. => Instant::FAR_FUTURE,
+            _ => now + PERIOD,
+        };
+        self.failures >= MOST_FAILURES
     }
 }
 
@@ -305,7 +311,7 @@ mod tests {
     #[test]
     fn a_node_that_does_not_answer_is_asked_thrice() {
         let mut watch = ClockWatch::default();
-        assert_eq!((watch.fails(at(1)), watch.due), (false, at(1) + PERIOD));
+        assert_eq!((watch.fails(at(1)), watch.due), (false, at(1) + AGAIN));
         assert_eq!((watch.fails(at(2)), watch.due), (false, at(2) + PERIOD));
         assert_eq!((watch.fails(at(3)), watch.due), (true, Instant::FAR_FUTURE));
     }

@@ -2,9 +2,9 @@
 
 use std::ops::ControlFlow;
 
-use cara_std::Parameters;
 use cara_std::control::execute;
 use cara_std::control::protocol::{Answer, ArgumentValue, CallQuestion, Failure, Number, Question};
+use cara_std::{Parameters, ParametersView, Served, ServiceError, ServiceOptions};
 
 use crate::support::{Depot, argument, ask, call, ping, refused, until};
 
@@ -292,4 +292,37 @@ fn who_follows_commands_gets_arguments_and_outcomes_also_of_the_program() {
     let Some(Answer::Called { error: Some(failure), .. }) = outcome.as_deref() else { panic!("{outcome:?}") };
     assert_eq!(failure.error, "Service");
     agv.stop();
+}
+
+/// The manager asks for it, and nobody who follows commands is told of that.
+#[test]
+fn the_clock_of_a_vehicle_is_shown_and_its_measurement_is_no_command() {
+    let depot = Depot::new();
+    let (mut following, mut other) = (depot.client(), depot.client());
+    let mut answers = following.ask(&Question::Commands).unwrap();
+    assert!(matches!(answers.next().unwrap().unwrap(), Answer::Event { event, .. } if event == "watching"));
+    let agv = depot.agv("agv", 7);
+    let tell = |_: &Served, view: &mut ParametersView| -> Result<(), ServiceError> {
+        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap().as_micros() as i64;
+        Ok(view.set_value("unix_us", now - 2_000_000)?)
+    };
+    let clock = "clock() -> (unix_us: int)".parse().unwrap();
+    agv.my_function_list().add_service(&clock, ServiceOptions::new(), tell).unwrap();
+    agv.publish_my_function_list().unwrap();
+    let mut shown = || {
+        let nodes = ask(&mut other, Question::Nodes { offering: None }).unwrap();
+        nodes.into_iter().find_map(|answer| if let Answer::Node(node) = answer { node.clock } else { None })
+    };
+    until("it is measured", || shown().is_some());
+    let measured = shown().unwrap();
+    assert!((measured.offset_us + 2_000_000).unsigned_abs() <= measured.error_us + 10, "{measured:?}");
+    assert!(measured.error_us < 1_000_000 && measured.age_ms < 60_000, "{measured:?}");
+    assert!(measured.trouble().unwrap().ends_with("s behind"), "{measured:?}");
+    let peer = depot.system.s_unit("agv").unwrap();
+    assert!(peer.block_request("fail", &mut Parameters::new()).is_err());
+    let mut commands = answers.filter_map(|answer| match answer.unwrap() {
+        Answer::Command { question, .. } => Some(*question),
+        _ => None,
+    });
+    assert!(matches!(commands.next(), Some(Question::Call(call)) if call.function == "fail"));
 }

@@ -329,6 +329,9 @@ async fn values(browser: &Browser, stage: &mut Stage) -> Result<()> {
     browser.wait("one node is left", "document.querySelectorAll('#nodes tr').length === 1").await?;
     browser.click("#nodes tr:first-child button").await?;
     browser.says("#functions summary", "load").await?;
+    browser.says("#nodes td.warn", "s behind").await?;
+    browser.says("#alarms li", "box/20 clock").await?;
+    browser.says("#node-facts", "Clock").await?;
     let form = open(browser, "load").await?;
     let load = r#"{"stamp":1460549358372198212,"at":[{"x":-9223372036854775808},{"x":9007199254740993}],"kg":1.0}"#;
     browser.fill(&format!("{form} textarea"), load).await?;

@@ -29,6 +29,9 @@ manager = { name = 'depot', id = 1 }
 [[functions]]
 signature = 'load(l: {stamp: int, at: {x: int}[..2], kg: float}) -> (l: {stamp: int, at: {x: int}[..2], kg: float})'
 answer = 'echo'
+[[functions]]
+signature = 'clock() -> (unix_us: int)'
+run = ['printf', '{\"unix_us\": 1}']
 ";
 
 /// All processes but the browser.

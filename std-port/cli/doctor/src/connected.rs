@@ -35,6 +35,7 @@ pub(crate) fn check(seen: &Evidence, unit: &Running, node: &NodeInfo) -> Vec<Fin
     found.extend(restarting(&name, &lives));
     found.extend(lossy(unit, node));
     found.extend(ways(unit, node));
+    found.extend(clock(unit, node));
     if found.iter().any(|finding| finding.severity != Severity::Info) {
         return found;
     }
@@ -85,6 +86,16 @@ pub(crate) fn lossy(unit: &Running, node: &NodeInfo) -> Option<Finding> {
                       A node or manager that was suspended, or whose processor is overloaded, looks the same";
         Finding::warning(Id::LossyLink, found, advice).about(node)
     })
+}
+
+/// A clock that differs from the manager's.
+pub(crate) fn clock(unit: &Running, node: &NodeInfo) -> Option<Finding> {
+    let name = full_name(node);
+    let trouble = node.clock?.trouble()?;
+    let found = format!("{name}: {trouble}, compared with that of {}", unit.name());
+    let advice = "look on both hosts whether the clock is set by NTP or PTP (`timedatectl`): until then times of their logs and \
+                  recordings do not fit together. Leases and time-outs do not depend on it";
+    Some(Finding::warning(Id::ClockWrong, found, advice).about(&name))
 }
 
 /// Which way to a connected node is blocked, as far as either end knows.
@@ -142,7 +153,7 @@ pub(crate) fn ways(unit: &Running, node: &NodeInfo) -> Vec<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use cara_std::control::protocol::LinkInfo;
+    use cara_std::control::protocol::{ClockInfo, LinkInfo};
     use cara_std::survey::Heard;
     use cara_std::{Claim, Epoch};
 
@@ -225,6 +236,17 @@ mod tests {
         fresh.link = Some(LinkInfo { datagrams: Some(DatagramsInfo::ToUnit), ..link });
         seen.running[0].count("agv/7", &[("StreamsDied", 0)]);
         assert_eq!(ids(&seen), [Id::Connected]);
+    }
+
+    #[test]
+    fn a_clock_that_is_wrong_is_told() {
+        let mut seen = connected();
+        for (offset_us, expected) in
+            [(100_000, Id::Connected), (2_000_000, Id::ClockWrong), (-2_000_000, Id::ClockWrong)]
+        {
+            seen.running[0].nodes[0].clock = Some(ClockInfo { offset_us, error_us: 100, age_ms: 5 });
+            assert_eq!(ids(&seen), [expected], "{offset_us}");
+        }
     }
 
     #[test]

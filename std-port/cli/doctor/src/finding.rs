@@ -84,6 +84,8 @@ pub(crate) enum Id {
     DatagramsBlocked,
     /// The stream of the node's link was dead though the node was heard.
     StreamDead,
+    /// The node's clock differs from its manager's.
+    ClockWrong,
     /// Too few files may be open for the nodes that may connect.
     FewDescriptors,
     /// A unit's access table has a mistake, so that an earlier one is in force.
@@ -105,7 +107,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 41] = [
+    pub(crate) const ALL: [Self; 42] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -139,6 +141,7 @@ impl Id {
         Self::LossyLink,
         Self::DatagramsBlocked,
         Self::StreamDead,
+        Self::ClockWrong,
         Self::FewDescriptors,
         Self::AccessTable,
         Self::ClaimNotStored,
@@ -185,6 +188,7 @@ impl Id {
             Self::LossyLink => "lossy-link",
             Self::DatagramsBlocked => "datagrams-blocked",
             Self::StreamDead => "stream-dead",
+            Self::ClockWrong => "clock-wrong",
             Self::FewDescriptors => "few-descriptors",
             Self::AccessTable => "access-table",
             Self::ClaimNotStored => "claim-not-stored",

@@ -10,7 +10,7 @@ use super::causes::{
     dial_of, duplicate, duplicate_managers, full, missing_manager, no_manager, one_way, other_version, refusal,
     restarting, tcp_blocked, text_of,
 };
-use super::connected::{came_later, lossy, ways};
+use super::connected::{came_later, clock, lossy, ways};
 use super::evidence::Evidence;
 use super::finding::{Finding, Id, Severity};
 use super::host;
@@ -146,7 +146,8 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     found.extend(refusals.take(MOST).map(|finding| Finding { severity: Severity::Warning, ..finding }));
     let connected = unit.nodes.iter().filter(|node| node.connected);
     found.extend(connected.clone().filter_map(|node| lossy(unit, node)).take(MOST));
-    found.extend(connected.flat_map(|node| ways(unit, node)).take(MOST));
+    found.extend(connected.clone().flat_map(|node| ways(unit, node)).take(MOST));
+    found.extend(connected.filter_map(|node| clock(unit, node)).take(MOST));
     found.extend(returns(unit));
     found.extend(left::all(seen, unit).into_iter().take(MOST));
     found

@@ -29,6 +29,7 @@ pub(super) struct File {
     pub(super) discovery_port: Maybe<u16>,
     pub(super) tcp_port: Maybe<u16>,
     pub(super) spin: Maybe<Time>,
+    pub(super) clock: Option<bool>,
     pub(super) manager: Maybe<Manager>,
     pub(super) m_units: Maybe<Vec<Spanned<String>>>,
     pub(super) access: Maybe<String>,

@@ -45,6 +45,9 @@ pub(super) fn run(
     if let Some(log) = logging.stream() {
         node.my_function_list().add_log(log).map_err(|error| Ended::usage(format!("[log] stream: {error}")))?;
     }
+    if settings.tells_clock {
+        node.my_function_list().add_clock().map_err(|error| Ended::usage(format!("clock: {error}")))?;
+    }
     offer_all(&node, &settings, &programs, black_box)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     let (ending, fenced) = (signals.handle(), Arc::new(OnceLock::new()));

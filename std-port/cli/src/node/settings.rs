@@ -40,6 +40,8 @@ pub(super) struct Settings {
     pub(super) tcp_port: Option<Placed<u16>>,
     /// How long a thread polls before it sleeps.
     pub(super) spin: Duration,
+    /// It offers to tell its clock.
+    pub(super) tells_clock: bool,
     pub(super) constraints: Constraints,
     pub(super) capacities: Capacities,
     pub(super) control: Control,
@@ -158,6 +160,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
         spin: limits::spin(&file.spin, mistakes),
+        tells_clock: file.clock.unwrap_or_default(),
         constraints: limits::constraints(&file.constraints, limits::defaults(role, over.stands_by), mistakes),
         control: control(&file.control, role, mistakes),
         audit: audit(&file.control, mistakes),

@@ -7,7 +7,7 @@ use std::process::Stdio;
 
 use cara_std::control::Control;
 use cara_std::keys::{FleetKeys, Store, location};
-use cara_std::{Fleet, Identity, Interfaces, Unit};
+use cara_std::{Fleet, Identity, Interfaces, ParametersView, Served, ServiceError, ServiceOptions, Unit};
 
 use serde_json::{Value, json};
 
@@ -49,6 +49,32 @@ fn a_scan_shows_who_was_refused_and_why() {
     }
     stage.ends(0, &["scan"]).says("DuplicateIdentity").says("give each node its own");
     duplicate.stop();
+}
+
+/// A vehicle whose clock is behind is shown with that by scan and doctor, and its offset is recorded.
+#[test]
+fn a_clock_that_is_wrong_is_shown_and_recorded() {
+    let stage = Stage::with(&[]);
+    stage.know("late-1", 12);
+    let agv = stage.vehicle("late-1", 12).build().unwrap();
+    let tell =
+        |_: &Served, view: &mut ParametersView| -> Result<(), ServiceError> { Ok(view.set_value("unix_us", 1)?) };
+    let clock = "clock() -> (unix_us: int)".parse().unwrap();
+    agv.my_function_list().add_service(&clock, ServiceOptions::new(), tell).unwrap();
+    agv.publish_my_function_list().unwrap();
+    agv.start().unwrap();
+    until("it is shown", || stage.cara(&["scan"]).out.contains("connected, clock "));
+    let reported = stage.ends(0, &["scan", "--json"]).json();
+    let clock = &reported["nodes"][0]["clock"];
+    assert!(clock["offset_us"].as_i64() < Some(-1_000_000_000_000_000) && clock["error_us"].is_u64(), "{clock}");
+    assert!(clock["age_ms"].is_u64(), "{clock}");
+    stage.cara(&["doctor", "late-1"]).says("clock-wrong").says("s behind, compared with that of manager/1");
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a.mcap");
+    stage.ends(0, &["record", file.to_str().unwrap(), "--for", "1s"]);
+    let recorded = std::fs::read(&file).unwrap();
+    assert!(recorded.windows(14).any(|bytes| bytes == b"\"offset_us\":-1"), "the recording has no offset");
+    agv.stop();
 }
 
 #[test]

@@ -74,6 +74,7 @@ impl Connection for Way {
                 let node = json!({
                     "answer": "node", "name": "agv", "id": 1, "role": "s_unit", "connected": true, "expected": true,
                     "address": null, "version": 1, "epoch": "a", "connected_ms": 5, "limits": null, "functions": 1,
+                    "clock": { "offset_us": -300_000, "error_us": 50, "age_ms": 7 },
                 });
                 let _ = each(serde_json::from_value(node)?);
             }
@@ -472,6 +473,13 @@ fn pages_are_told_what_is_known_up_to_their_number() {
         stage.send("GET", "/api/stream", &[], "").read_exact(&mut first).unwrap();
         &first == b"HTTP/1.1 200"
     });
+}
+
+/// Its age changes by itself, and would be told with each look.
+#[test]
+fn the_page_is_told_how_far_a_clock_is_off() {
+    let clock = json!({ "offset_us": -300_000, "error_us": 50, "trouble": "clock 0.300 s behind" });
+    stage().follow(|message| message["nodes"]["rows"]["agv/1@s_unit"]["clock"] == clock);
 }
 
 /// Waits until something is so.

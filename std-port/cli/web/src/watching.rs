@@ -6,7 +6,7 @@ use std::sync::{Arc, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use cara_std::control::protocol::{Answer, NodeInfo, Question};
+use cara_std::control::protocol::{Answer, ClockInfo, NodeInfo, Question};
 use serde_json::{Map, Value, json};
 
 use crate::picture::Section;
@@ -128,6 +128,12 @@ fn of_nodes(answers: &[Answer], now: u64, since: &mut Map<String, Value>) -> Vec
             if let Some(reported) = reported.as_object_mut() {
                 ["connected_ms", "left_ms"].iter().for_each(|name| drop(reported.remove(*name)));
                 reported.insert("since".to_owned(), at.into());
+                // Without its age, as that changes by itself.
+                if let Some(clock) = node.clock {
+                    let ClockInfo { offset_us, error_us, .. } = clock;
+                    let clock = json!({ "offset_us": offset_us, "error_us": error_us, "trouble": clock.trouble() });
+                    reported.insert("clock".to_owned(), clock);
+                }
             }
             (key, reported)
         })

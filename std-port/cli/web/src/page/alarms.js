@@ -27,6 +27,7 @@ function wrong() {
   const found = new Map();
   for (const { node, name } of nodes()) {
     if (node.expected && !node.connected) found.set(`node ${name}`, [name, node.since === null ? "has not joined" : "is lost"]);
+    if (node.connected && node.clock?.trouble) found.set(`clock ${name}`, [name, node.clock.trouble]);
   }
   for (const order of Object.values(state.orders).filter((one) => one.inhibited)) {
     const { by, reason } = order.inhibited;

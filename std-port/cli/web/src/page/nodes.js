@@ -6,6 +6,7 @@ import * as alarms from "./alarms.js";
 import * as forms from "./forms.js";
 
 const about = (one) => (one.inhibited ? "stopped" : one.runs ? `${one.node.connected ? "" : "was running "}${one.runs.function}` : "–");
+const offset = ({ offset_us: us, error_us: error }) => `${us < 0 ? "−" : "+"}${span(Math.abs(us) / 1000)} ± ${span(error / 1000)}`;
 const since = (node) => (node.since === null ? "" : span(now() - node.since));
 
 function stateOf({ node }) {
@@ -87,6 +88,7 @@ function drawChosen() {
   const { node } = one;
   const told = [["State", stateOf(one) + (node.left_text && !node.connected ? `: ${node.left_text}` : "")], ["Role", node.role]];
   if (node.connected) told.push(["Address", node.address ?? "–"], ["Run", node.epoch ?? "–"]);
+  if (node.connected && node.clock) told.push(["Clock", offset(node.clock)]);
   if (one.inhibited) told.push(["Stopped", one.inhibited.inhibited.by ? `by unit ${one.inhibited.inhibited.by}` : `by itself, reason ${one.inhibited.inhibited.reason}`]);
   facts($("node-facts"), told);
   facts($("streams"), Object.entries(state.streams).filter(([, stream]) => stream.node === one.name).map(([number, stream]) => {
