@@ -66,6 +66,13 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         lock(&self.owner.server).as_ref()?.path()
     }
 
+    /// Shows operators a log at the [control socket](crate::control): `cara logs`, the page and recordings have it. The first one
+    /// counts. Each reader has what is kept of it, the newest 16 KiB; one that is slow loses lines, and sees how many bytes.
+    #[cfg(feature = "control")]
+    pub fn show_log(&self, log: &crate::Log) {
+        let _ = self.engine().log().set(log.clone());
+    }
+
     #[cfg(feature = "control")]
     pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
         let engine = self.engine();

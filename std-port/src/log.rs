@@ -1,4 +1,5 @@
-//! The log of a unit over its link: a stream whose values are pieces of the log, as those of boards.
+//! The log of a unit: over its link a stream whose values are pieces of the log, as those of boards, and the same pieces for the
+//! operators of an m_unit.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -29,7 +30,8 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// As boards publish it, without their build id: the position of the first byte in the log, and bytes of the log.
 const STREAM: &str = "log(at: int, piece: bytes[960])";
 
-/// The log of this program as a stream of its unit, for `cara logs`.
+/// The log of this program for `cara logs`: of an s_unit as a stream ([`add_log`](MyFunctionList::add_log)), of an m_unit at its
+/// control socket (`CommunicationSystem::show_log`).
 ///
 /// The newest 16 KiB wait until a subscriber takes them, in pieces, behind everything else that the link sends; the lines before
 /// are lost, and the reader sees how many bytes. Writing never waits for the link. A write of more than 4 KiB is cut off.
@@ -90,6 +92,15 @@ impl Kept {
         (at, self.bytes.drain(..bytes).collect())
     }
 
+    /// The piece behind a position, and where it begins: with the oldest byte that is kept if those before are lost or not `seen`.
+    #[cfg(feature = "control")]
+    fn after(&self, seen: Option<u32>) -> Option<(u32, Vec<u8>)> {
+        let ahead = seen.map_or(0, |seen| seen.wrapping_sub(self.at) as usize);
+        let from = if ahead <= self.bytes.len() { ahead } else { 0 };
+        let piece: Vec<u8> = self.bytes.range(from..).take(PIECE).copied().collect();
+        (!piece.is_empty()).then(|| (self.at.wrapping_add(from as u32), piece))
+    }
+
     /// The next piece and its position, unless the one before waits.
     fn piece(&mut self) -> Option<(u32, Vec<u8>)> {
         if self.waits || self.bytes.is_empty() {
@@ -109,6 +120,21 @@ impl Shared {
     fn taken(&self) {
         self.lock().waits = false;
         self.changed.notify_all();
+    }
+}
+
+/// Of an m_unit, whose operators each read as far as they are.
+#[cfg(feature = "control")]
+impl Log {
+    /// The signature of a piece.
+    pub(crate) fn definition() -> Result<Definition, Error> {
+        Definition::stream(STREAM).map_err(|_| Error::BadName)
+    }
+
+    /// As values, the piece behind a position, and where the next one begins. Nothing is taken from other readers.
+    pub(crate) fn after(&self, seen: Option<u32>) -> Option<(Box<ParametersView>, u32)> {
+        let (at, piece) = self.0.lock().after(seen)?;
+        Some((values(at, &piece).ok()?, at.wrapping_add(piece.len() as u32)))
     }
 }
 
@@ -218,6 +244,22 @@ mod tests {
         assert!(kept.len() == LONGEST + CUT.len() && kept.into_iter().skip(LONGEST).eq(CUT.iter().copied()));
         (0..100).for_each(|_| log.write_all(&[b'x'; 1000]).unwrap());
         assert!(log.0.lock().bytes.len() <= KEPT);
+    }
+
+    #[cfg(feature = "control")]
+    #[test]
+    fn each_operator_reads_as_far_as_it_is_and_one_that_is_late_goes_on_with_what_is_kept() {
+        let mut log = Log::default();
+        let after = |log: &Log, seen| log.0.lock().after(seen);
+        assert_eq!(after(&log, None), None);
+        log.write_all(b"one\n").unwrap();
+        assert_eq!(after(&log, None), Some((0, b"one\n".to_vec())));
+        assert_eq!((after(&log, Some(4)), after(&log, Some(2))), (None, Some((2, b"e\n".to_vec()))));
+        (0..KEPT / 8).for_each(|number| writeln!(log, "{number:08}").unwrap());
+        let (at, piece) = after(&log, Some(4)).unwrap();
+        let line = (at - 4) / 9;
+        assert!(at > 4 && piece.starts_with(format!("{line:08}\n").as_bytes()) && piece.len() == PIECE, "{at}");
+        assert_eq!(after(&log, Some(at + PIECE as u32)).unwrap().0, at + PIECE as u32);
     }
 
     #[test]

@@ -40,7 +40,7 @@ pub(crate) enum Verb {
     BlackBox(commands::black_box::Arguments),
     Counters(commands::counters::Arguments),
     Ping(commands::ping::Arguments),
-    Web(cara_web::Arguments),
+    Web(commands::web::Arguments),
     Node(node::Arguments),
     Line(cara_line::Arguments),
     Doctor(cara_doctor::Arguments),

@@ -46,7 +46,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
 // --- mistakes
 
 /// A file, where its mistake is, and a part of what is said about it.
-const MISTAKES: [(&str, &str, &str); 51] = [
+const MISTAKES: [(&str, &str, &str); 50] = [
     ("name = \"a", "1:10", "expected `\"`"),
     ("name = \"a\"\nid = \n", "2:6", "value"),
     ("name = \"a\"\nid = 1\nid = 2", "3:1", "duplicate key"),
@@ -101,7 +101,6 @@ const MISTAKES: [(&str, &str, &str); 51] = [
         "6:11",
         "an s_unit reads no streams",
     ),
-    ("name = \"a\"\nid = 1\n[log]\nstream = true", "4:10", "an m_unit streams no log"),
     ("name = \"a\"\nid = 1\n[[functions]]\nanswer = \"echo\"", "3:1", "no signature"),
     ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f(n: integer)\"\nanswer = \"echo\"", "4:19", "a type"),
     ("name = \"a\"\nid = 1\n[[functions]]\nsignature = '''f(ä: int)'''\nanswer = \"echo\"", "4:18", "a name"),

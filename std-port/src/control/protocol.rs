@@ -114,17 +114,18 @@ pub enum Question {
     /// Values of a stream of a node as they come, until the connection is closed: an [`Answer::Value`] for each. Without a name
     /// the last value of each of its streams, or that there is none.
     Stream {
-        /// `NAME`, `NAME/ID` or `#ID`.
+        /// `NAME`, `NAME/ID` or `#ID`; `.` for the unit's own log, the stream `log`.
         node: String,
         /// The stream.
         name: Option<String>,
         /// Least time between two values; 0 for each that the node grants, also where they are read late.
         interval_ms: u64,
     },
-    /// Values of all streams of all nodes as they come, also of nodes that join later, until the connection is closed: an
-    /// [`Answer::Value`] for each. Streams that the operator may not call are left out.
+    /// Values of all streams of all nodes as they come, also of nodes that join later, and of the unit's own log, until the
+    /// connection is closed: an [`Answer::Value`] for each. Streams that the operator may not call are left out.
     Streams {
-        /// Least time between two values of a stream; 0 for each that the node grants, also where they are read late.
+        /// Least time between two values of a stream; 0 for each that the node grants, also where they are read late. Of the stream
+        /// `log` each comes in any case.
         interval_ms: u64,
         /// Streams of these names alone; of all names if empty.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]

@@ -235,6 +235,8 @@ impl<T: Send + 'static> Engine<T> {
                 audit: parts.audit,
                 #[cfg(feature = "control")]
                 commands: Arc::default(),
+                #[cfg(feature = "control")]
+                log: std::sync::OnceLock::new(),
             },
             events: Events::default(),
             unjoined: unjoined::Unjoined::default(),
@@ -247,6 +249,12 @@ impl<T: Send + 'static> Engine<T> {
     #[cfg(feature = "control")]
     pub(crate) fn commands(&self) -> &crate::control::Commands {
         self.notes.commands()
+    }
+
+    /// Where the program's log is, for operators.
+    #[cfg(feature = "control")]
+    pub(crate) const fn log(&self) -> &std::sync::OnceLock<crate::Log> {
+        &self.notes.log
     }
 
     pub(crate) fn is_stopping(&self) -> bool {

@@ -5,7 +5,7 @@
 pub(super) use crate::control::Recorded;
 
 #[cfg(feature = "control")]
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 #[cfg(not(feature = "control"))]
 use cara_core::distribution::parameters::ParametersView;
@@ -14,6 +14,8 @@ use cara_core::error::Error;
 use cara_core::services::session::RequestOptions;
 
 use super::link::LinkCell;
+#[cfg(feature = "control")]
+use crate::Log;
 #[cfg(feature = "control")]
 use crate::control::{Audit, Commands, FollowedCall, ProgramCall};
 
@@ -43,6 +45,9 @@ pub(super) struct Notes {
     pub(super) audit: Option<Arc<Audit>>,
     #[cfg(feature = "control")]
     pub(super) commands: Arc<Commands>,
+    /// The program's log, which operators see.
+    #[cfg(feature = "control")]
+    pub(super) log: OnceLock<Log>,
 }
 
 #[cfg(feature = "control")]

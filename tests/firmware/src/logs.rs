@@ -1,9 +1,10 @@
 //! A board that logs a hundred lines a second over its link, to a manager that calls it meanwhile; and that says after a panic what
-//! it was, once it has joined again. `cara logs` shows it. For an image with the features `faults` and `logs`, and a `cara` with
+//! it was, once it has joined again. `cara logs` shows it, `cara record` records it, and a page has its last lines. For an image with the features `faults` and `logs`, and a `cara` with
 //! the feature `defmt`.
 
 use std::ffi::OsStr;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -31,11 +32,17 @@ pub(crate) fn run(bench: &Bench) -> Result<()> {
     let agv = manager.meet_offering(&Who::agv(17), "log")?;
     let folder = bench.keys.folder().join("images");
     let wrong = images(bench.image(), &folder)?;
-    let logs = |elf: &OsStr| {
+    let cara = |verb: &[&str], elf: &OsStr| {
         let mut command = bench.keys.command();
-        command.args(["logs", "agv-17", "--socket"]).arg(&socket).arg("--elf").arg(elf);
+        command.args(verb).arg("--socket").arg(&socket).arg("--elf").arg(elf);
         command
     };
+    let file = bench.keys.folder().join("log.mcap");
+    let recorded = file.to_str().context("the folder's name is no text")?;
+    let _recording = Log::follow(&mut cara(&["record", recorded, "--stream", "log"], folder.as_os_str()))?;
+    let web = Log::follow(&mut cara(&["web", "--listen", "127.0.0.1:0"], folder.as_os_str()))?;
+    let page = Log::of_page(&web)?;
+    let logs = |elf| cara(&["logs", "agv-17"], elf);
     let log = Log::follow(&mut logs(folder.as_os_str()))?;
     log.has("started because of")?;
     let without = call(&agv)?;
@@ -60,6 +67,20 @@ pub(crate) fn run(bench: &Bench) -> Result<()> {
     log.has_behind(before, "panic at")?;
     log.has_behind(before, "started because of")?;
     println!("after a panic the board told its place, and why it had started");
+    page.has(&format!("line {} of", LINES - 1))?;
+    page.has("panic at")?;
+    let replayed = || Ok::<_, anyhow::Error>(bench.keys.command().args(["replay", recorded]).output()?.stdout);
+    let end = Instant::now() + LONG;
+    let wanted = [format!("line {} of", LINES - 1), "panic at".to_owned()];
+    loop {
+        let shown = String::from_utf8_lossy(&replayed()?).into_owned();
+        if wanted.iter().all(|part| shown.contains(part)) {
+            break;
+        }
+        ensure!(Instant::now() < end, "the recording lacks one of {wanted:?}:\n{shown}");
+        std::thread::sleep(PAUSE);
+    }
+    println!("the recording and the page have both");
     Ok(())
 }
 
@@ -78,9 +99,10 @@ fn images(image: &Path, folder: &Path) -> Result<std::path::PathBuf> {
     Ok(wrong)
 }
 
-/// What `cara logs` shows, line by line.
+/// What `cara` shows, or a page is sent, line by line.
 struct Log {
-    cara: Child,
+    /// None of a page.
+    cara: Option<Child>,
     lines: Arc<Mutex<Vec<String>>>,
 }
 
@@ -88,14 +110,18 @@ impl Log {
     fn follow(command: &mut Command) -> Result<Self> {
         let mut cara = command.stdout(Stdio::piped()).spawn().context("cannot start cara")?;
         let output = cara.stdout.take().context("cara has no output")?;
-        let log = Self { cara, lines: Arc::default() };
-        let lines = log.lines.clone();
-        std::thread::spawn(move || {
-            for line in BufReader::new(output).lines().map_while(Result::ok) {
-                lines.lock().unwrap_or_else(PoisonError::into_inner).push(line);
-            }
-        });
-        Ok(log)
+        Ok(Self { cara: Some(cara), lines: collect(output) })
+    }
+
+    /// What `cara web` sends a page.
+    fn of_page(web: &Self) -> Result<Self> {
+        web.has("the page is at ")?;
+        let lines = web.lines();
+        let url = lines.iter().find_map(|line| line.split_once("http://")).context("it has no address")?.1;
+        let (address, key) = url.split_once("/#").context("it has no key")?;
+        let mut page = TcpStream::connect(address)?;
+        write!(page, "GET /api/stream HTTP/1.1\r\nhost: {address}\r\nauthorization: Bearer {key}\r\n\r\n")?;
+        Ok(Self { cara: None, lines: collect(page) })
     }
 
     fn lines(&self) -> Vec<String> {
@@ -116,10 +142,24 @@ impl Log {
     }
 }
 
+/// The lines that come there, as they come.
+fn collect(from: impl Read + Send + 'static) -> Arc<Mutex<Vec<String>>> {
+    let lines = Arc::<Mutex<Vec<String>>>::default();
+    let found = lines.clone();
+    std::thread::spawn(move || {
+        for line in BufReader::new(from).lines().map_while(Result::ok) {
+            found.lock().unwrap_or_else(PoisonError::into_inner).push(line);
+        }
+    });
+    lines
+}
+
 impl Drop for Log {
     fn drop(&mut self) {
-        let _ = self.cara.kill();
-        let _ = self.cara.wait();
+        if let Some(cara) = &mut self.cara {
+            let _ = cara.kill();
+            let _ = cara.wait();
+        }
     }
 }
 

@@ -151,6 +151,18 @@ pub(crate) fn line() -> Outcome {
     })
 }
 
+/// Shows and records the emulated board's log, by a `cara` that reads defmt.
+pub(crate) fn logs() -> Outcome {
+    emulated(|| {
+        let board = boards::find(TESTED)?;
+        install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+        let tests = tests(board, &board.build(&boards::LOGGED)?)?;
+        // Behind the builds of the `cara` without: the last one lies beside the tests.
+        binaries::debug_build(&["cara"]).args(["--features", "cara-cli/defmt"]).stream()?;
+        tests.args(["logs"]).code()
+    })
+}
+
 /// Hands the emulated board over between two Linux managers, then takes its manager away, which has a standby.
 pub(crate) fn hand_over() -> Outcome {
     emulated(|| {

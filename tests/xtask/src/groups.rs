@@ -341,6 +341,15 @@ pub(crate) const GROUPS: [Group; 41] = [
         run: |_| firmware::line(),
     },
     Group {
+        name: "logs",
+        what: "the emulated board's log over its link: decoded by cara logs, record and web, also behind a panic; builds a cara with defmt",
+        budget: 120,
+        quick: None,
+        by_default: false,
+        waits: true,
+        run: |_| firmware::logs(),
+    },
+    Group {
         name: "hand-over",
         what: "the emulated board handed over between two Linux managers, and beside a manager that is killed or frozen and its standby",
         budget: 120,

@@ -1,8 +1,10 @@
 //! `cara logs`: the logs of units, as they come over their links.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::fmt;
+use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 use cara_std::Shown;
@@ -21,28 +23,36 @@ const STREAM: &str = "log";
 /// What is kept of a line that has no end.
 const LONGEST: usize = 64 * 1024;
 
-/// Shows the logs of units, as they come: of boards that are built with the feature `logs`, and of units on Linux that stream theirs.
-/// First comes what each has kept, a board also of its life before. Ctrl-C ends it.
+/// Shows the logs of units, as they come: of boards that are built with the feature `logs`, of units on Linux that stream theirs,
+/// and of the manager itself. First comes what each has kept, a board also of its life before. Ctrl-C ends it.
 ///
 /// A log of defmt takes the firmware's ELF. Others are lines of text.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// The node: NAME, NAME/ID or #ID; all if absent.
+    /// The node: NAME, NAME/ID or #ID; `.` or its name for the manager; all if absent.
     node: Option<String>,
-    /// The ELF of the boards' firmware, whose log is defmt's, or a folder of ELFs, in which each node's is found by its build id;
-    /// needs a `cara` that is built with the feature `defmt`.
-    #[arg(long, value_name = "ELF|FOLDER")]
-    elf: Option<PathBuf>,
+    #[command(flatten)]
+    firmware: FirmwareArguments,
     /// End after this time.
     #[arg(long = "for", value_name = "TIME", value_parser = parse_time)]
     span: Option<Duration>,
 }
 
-pub(crate) fn run(Arguments { node, elf, span }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let decoding = Decoding::of(elf.as_deref())?;
+// Where the firmware of boards is. No text of help: it would be that of the verb.
+#[derive(clap::Args)]
+pub(crate) struct FirmwareArguments {
+    /// The ELF of the boards' firmware, whose log is defmt's, or a folder of ELFs, in which each node's is found by its build id;
+    /// needs a `cara` that is built with the feature `defmt`.
+    #[arg(long, value_name = "ELF|FOLDER")]
+    elf: Option<PathBuf>,
+}
+
+pub(crate) fn run(Arguments { node, firmware, span }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let mut logs = Logs::new(Decoding::of(&firmware, Decoding::Text)?.into());
     let mut operator = Operator::open(global, &node.as_deref().map_or(Need::Everybody, Need::Node))?;
     let is_one = node.is_some();
     let question = match node {
+        Some(node) if operator.is_itself(&node)? => of_one(".".to_owned()),
         Some(node) => {
             let node = nodes::connected(&mut operator, &node)?.selector;
             let published = nodes::functions(&mut operator, &node)?;
@@ -52,34 +62,32 @@ pub(crate) fn run(Arguments { node, elf, span }: Arguments, global: &Global) -> 
                 );
                 return Err(Ended::failed("NoLog", text));
             }
-            Question::Stream { node, name: Some(STREAM.to_owned()), interval_ms: 0 }
+            of_one(node)
         }
         None => Question::Streams { names: vec![STREAM.to_owned()], interval_ms: 0 },
     };
-    let mut logs = HashMap::<String, Log>::new();
     operator.watch(&question, span, |answer| {
-        let Answer::Value { node, unix_ms, values, error, .. } = answer else { return Ok(true) };
+        let Answer::Value { node, unix_ms, error, .. } = &answer else { return Ok(true) };
         if let Some(error) = error {
             output::warning(format_args!("{node}: {}: {}", error.error, Shown(&error.text)));
         }
-        let Some(Piece { at, build, bytes }) = Piece::of(&values) else { return Ok(true) };
-        if logs.get(&node).is_none_or(|log| log.build != build) {
-            let reader = match decoding.reader(build) {
-                Err(why) if is_one => return Err(Ended::failed("NoFirmware", format!("{node}: {why}"))),
-                Err(why) => {
-                    output::warning(format_args!("{node}: {why}"));
-                    None
-                }
-                Ok(reader) => Some(reader),
-            };
-            logs.insert(node.clone(), Log { build, next: None, reader });
-        }
-        for line in logs.get_mut(&node).map(|log| log.take(at, &bytes)).unwrap_or_default() {
-            show(&node, unix_ms, line, global)?;
+        match logs.take(&answer) {
+            Some(Found::Unread(Some(why))) if is_one => {
+                return Err(Ended::failed("NoFirmware", format!("{node}: {why}")));
+            }
+            Some(Found::Unread(Some(why))) => output::warning(format_args!("{node}: {why}")),
+            Some(Found::Lines(lines)) => {
+                lines.into_iter().try_for_each(|line| show(node, *unix_ms, line, global))?;
+            }
+            Some(Found::Unread(None)) | None => {}
         }
         Ok(true)
     })?;
     Ok(Exit::Done.into())
+}
+
+fn of_one(node: String) -> Question {
+    Question::Stream { node, name: Some(STREAM.to_owned()), interval_ms: 0 }
 }
 
 /// What a board's log has at one position.
@@ -113,9 +121,7 @@ fn show(node: &str, unix_ms: u64, line: Line, global: &Global) -> std::io::Resul
     let time = show_time(unix_ms);
     match line {
         Line::Text(text) => output::line(format_args!("{FAINT}{time}{FAINT:#}  {node:<20} {}", Shown(&text))),
-        Line::Lost(bytes) => {
-            output::line(format_args!("{FAINT}{time}{FAINT:#}  {node:<20} {BAD}{bytes} bytes are lost here{BAD:#}"))
-        }
+        lost @ Line::Lost(_) => output::line(format_args!("{FAINT}{time}{FAINT:#}  {node:<20} {BAD}{lost}{BAD:#}")),
     }
 }
 
@@ -133,6 +139,15 @@ enum Line {
     Lost(u32),
 }
 
+impl fmt::Display for Line {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Text(text) => f.write_str(text),
+            Self::Lost(bytes) => write!(f, "{bytes} bytes are lost here"),
+        }
+    }
+}
+
 /// The log of one board, put together from its pieces.
 struct Log {
     build: Option<u64>,
@@ -142,27 +157,59 @@ struct Log {
     reader: Option<Box<dyn Read>>,
 }
 
-/// The logs of units on Linux, line by line.
+/// The logs of all nodes, put together from their pieces. The default reads no board's.
 #[derive(Default)]
-pub(super) struct Texts(HashMap<String, Log>);
+pub(crate) struct Logs {
+    decoding: Arc<Decoding>,
+    /// By node.
+    logs: HashMap<String, Log>,
+}
 
-impl Texts {
-    /// The lines that end in a piece, as events. `None` if it is no piece, or a board's, which takes the firmware to be read.
-    pub(super) fn events(&mut self, answer: &Answer) -> Option<Vec<Answer>> {
-        let Answer::Value { node, stream, unix_ms, values, .. } = answer else { return None };
+/// What a piece of a log brings.
+enum Found {
+    Lines(Vec<Line>),
+    /// Its firmware is not there; why, with the first piece.
+    Unread(Option<String>),
+}
+
+impl Logs {
+    pub(super) fn new(decoding: Arc<Decoding>) -> Self {
+        Self { decoding, logs: HashMap::new() }
+    }
+
+    /// `None` if it is no piece of a log.
+    fn take(&mut self, answer: &Answer) -> Option<Found> {
+        let Answer::Value { node, stream, values, .. } = answer else { return None };
         if stream.split('(').next() != Some(STREAM) {
             return None;
         }
-        let Piece { at, build: None, bytes } = Piece::of(values)? else { return None };
-        let log = self.0.entry(node.clone()).or_insert_with(Log::of_text);
-        let event = |line| {
-            let text = match line {
-                Line::Text(text) => text,
-                Line::Lost(bytes) => format!("{bytes} bytes are lost here"),
-            };
-            Answer::Event { at_ms: 0, unix_ms: *unix_ms, event: STREAM.to_owned(), node: Some(node.clone()), text }
+        let Piece { at, build, bytes } = Piece::of(values)?;
+        let mut why_not = None;
+        if self.logs.get(node).is_none_or(|log| log.build != build) {
+            let reader = self.decoding.reader(build).map_err(|why| why_not = Some(why)).ok();
+            self.logs.insert(node.clone(), Log { build, next: None, reader });
+        }
+        let log = self.logs.get_mut(node).filter(|log| log.reader.is_some());
+        Some(log.map_or(Found::Unread(why_not), |log| Found::Lines(log.take(at, &bytes))))
+    }
+
+    /// An event for each line in the place of a piece of a log. A piece whose firmware is not there, and anything else, stays as it
+    /// is; before the first such piece an event says why.
+    pub(crate) fn events(&mut self, answer: Answer) -> Vec<Answer> {
+        let found = self.take(&answer);
+        let Answer::Value { node, unix_ms, .. } = &answer else { return vec![answer] };
+        let event = |event: &str, text| Answer::Event {
+            at_ms: 0,
+            unix_ms: *unix_ms,
+            event: event.to_owned(),
+            node: Some(node.clone()),
+            text,
         };
-        Some(log.take(at, &bytes).into_iter().map(event).collect())
+        match found {
+            Some(Found::Lines(lines)) => lines.into_iter().map(|line| event(STREAM, line.to_string())).collect(),
+            Some(Found::Unread(Some(why))) => vec![event("no_firmware", why), answer],
+            Some(Found::Unread(None)) | None => vec![answer],
+        }
     }
 }
 
@@ -175,10 +222,6 @@ trait Read {
 }
 
 impl Log {
-    fn of_text() -> Self {
-        Self { build: None, next: None, reader: Some(Box::<Lines>::default()) }
-    }
-
     fn take(&mut self, at: u32, piece: &[u8]) -> Vec<Line> {
         let (next, mut found) = (self.next.unwrap_or(at), Vec::new());
         let Some(reader) = &mut self.reader else { return found };
@@ -219,32 +262,44 @@ impl Read for Lines {
 }
 
 /// How logs are read.
-enum Decoding {
+#[derive(Default)]
+pub(super) enum Decoding {
+    /// All are text.
     Text,
+    /// Those of units on Linux are text, and a board's is not read.
+    #[default]
+    OfLinux,
     #[cfg(feature = "defmt")]
     Frames(firmware::Firmware),
 }
 
 impl Decoding {
+    /// With the firmware that is named; `otherwise` if none is.
     #[cfg(not(feature = "defmt"))]
-    fn of(elf: Option<&Path>) -> anyhow::Result<Self> {
+    pub(super) fn of(arguments: &FirmwareArguments, otherwise: Self) -> anyhow::Result<Self> {
         let refused = "this `cara` is built without the feature `defmt`: it reads no firmware";
-        elf.map_or(Ok(Self::Text), |_| Err(Ended::usage(refused)))
+        arguments.elf.as_ref().map_or(Ok(otherwise), |_| Err(Ended::usage(refused)))
     }
 
     #[cfg(feature = "defmt")]
-    fn of(elf: Option<&Path>) -> anyhow::Result<Self> {
-        let Some(path) = elf else { return Ok(Self::Text) };
+    pub(super) fn of(arguments: &FirmwareArguments, otherwise: Self) -> anyhow::Result<Self> {
+        let Some(path) = &arguments.elf else { return Ok(otherwise) };
         let found = firmware::Firmware::of(path);
         found.map(Self::Frames).map_err(|why| Ended::usage(format!("{}: {why}", path.display())))
     }
 
     /// Of a board whose firmware has this build id; a log without any is text.
-    #[cfg_attr(not(feature = "defmt"), allow(clippy::unnecessary_wraps, reason = "text needs no firmware"))]
     fn reader(&self, build: Option<u64>) -> Result<Box<dyn Read>, String> {
         match (self, build) {
             #[cfg(feature = "defmt")]
             (Self::Frames(firmware), Some(build)) => Ok(Box::new(frames::Frames::new(firmware.table(build)?))),
+            (Self::OfLinux, Some(build)) => Err(format!(
+                "its log stays bytes, as its firmware is not known, {}: name its ELF, or a folder that has it, with --elf",
+                match build {
+                    0 => "which tells no build id".to_owned(),
+                    build => format!("whose build id is {build:016x}"),
+                }
+            )),
             _ => Ok(Box::new(Lines::default())),
         }
     }
@@ -252,9 +307,9 @@ impl Decoding {
 
 #[cfg(feature = "defmt")]
 mod firmware {
-    use std::cell::RefCell;
     use std::collections::HashMap;
     use std::path::{Path, PathBuf};
+    use std::sync::{Mutex, PoisonError};
 
     use defmt_decoder::Table;
     use object::Object as _;
@@ -270,13 +325,13 @@ mod firmware {
             table: &'static Table,
         },
         /// With what was found there.
-        Folder(PathBuf, RefCell<HashMap<u64, &'static Table>>),
+        Folder(PathBuf, Mutex<HashMap<u64, &'static Table>>),
     }
 
     impl Firmware {
         pub(super) fn of(path: &Path) -> Result<Self, String> {
             if path.is_dir() {
-                return Ok(Self::Folder(path.to_owned(), RefCell::default()));
+                return Ok(Self::Folder(path.to_owned(), Mutex::default()));
             }
             let elf = std::fs::read(path).map_err(|error| error.to_string())?;
             Ok(Self::File { path: path.to_owned(), build: build_id(&elf), table: table(&elf)? })
@@ -298,11 +353,12 @@ mod firmware {
                     Err(format!("it tells no build id, by which its ELF could be found in {folder}: name the ELF"))
                 }
                 Self::Folder(folder, found) => {
-                    if let Some(table) = found.borrow().get(&build) {
+                    let mut found = found.lock().unwrap_or_else(PoisonError::into_inner);
+                    if let Some(table) = found.get(&build) {
                         return Ok(table);
                     }
                     let table = table(&elf_of(folder, build)?)?;
-                    found.borrow_mut().insert(build, table);
+                    found.insert(build, table);
                     Ok(table)
                 }
             }
@@ -401,16 +457,20 @@ mod tests {
         Line::Text(text.to_owned())
     }
 
+    fn log_of_text() -> Log {
+        Log { build: None, next: None, reader: Some(Box::<Lines>::default()) }
+    }
+
     #[test]
     fn pieces_make_lines_and_what_is_lost_is_counted() {
-        let mut log = Log::of_text();
+        let mut log = log_of_text();
         assert_eq!(log.take(7, b"one\ntw"), [text("one")]);
         assert_eq!(log.take(13, b"o\n"), [text("two")]);
         assert_eq!(log.take(13, b"o\n"), [], "sent again");
         assert_eq!(log.take(13, b"o\nthree\n"), [text("three")]);
         assert_eq!(log.take(121, b"rest\nfour\n"), [Line::Lost(100), text("rest"), text("four")]);
         assert_eq!(log.take(0, b"anew\n"), [text("anew")], "power was off");
-        let mut wrapping = Log::of_text();
+        let mut wrapping = log_of_text();
         assert_eq!(wrapping.take(u32::MAX, b"ab"), []);
         assert_eq!(wrapping.take(1, b"c\n"), [text("abc")]);
         assert_eq!(wrapping.take(4, b"d\n"), [Line::Lost(1), text("d")]);

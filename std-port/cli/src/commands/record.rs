@@ -1,8 +1,9 @@
 //! `cara record`: what a manager reports, into a file.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Builder, sleep};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -10,7 +11,7 @@ use blake2::{Blake2s256, Digest};
 use cara_std::control::protocol::{Answer, NodeInfo, OrderInfo, Question, UnitInfo};
 use serde_json::json;
 
-use super::logs::Texts;
+use super::logs::{Decoding, FirmwareArguments, Logs};
 use crate::nodes;
 use crate::operator::{Need, Operator, Way};
 use cara_recording::{Limits, Recorder, StartError};
@@ -27,12 +28,15 @@ use cara_tools::units::{parse_bytes, parse_time, show_bytes};
 pub(crate) struct Arguments {
     /// The file. A recording that is there becomes FILE.1.
     file: PathBuf,
-    /// Record the streams of this name, of all nodes; may be repeated. `log` is recorded line by line, as events.
+    /// Record the streams of this name, of all nodes; may be repeated. `log` is recorded line by line, as events, also the
+    /// manager's own; a board's with --elf.
     #[arg(long, value_name = "NAME")]
     stream: Vec<String>,
     /// Record at most so many values of a stream a second; as many as the node grants, up to 50, if absent.
     #[arg(long, value_name = "NUMBER", value_parser = super::stream::rate, requires = "stream")]
     rate: Option<f64>,
+    #[command(flatten)]
+    firmware: FirmwareArguments,
     /// How often counters and the state of links are recorded.
     #[arg(long, value_name = "TIME", default_value = "10s", value_parser = parse_time)]
     every: Duration,
@@ -67,7 +71,8 @@ fn size(text: &str) -> Result<u64, String> {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let asked = Asked::catch()?;
-    let Arguments { file, stream, rate, every, max_size, keep, span } = arguments;
+    let Arguments { file, stream, rate, firmware, every, max_size, keep, span } = arguments;
+    let decoding = Arc::new(Decoding::of(&firmware, Decoding::OfLinux)?);
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let unit = operator.unit()?;
     let recorder = Recorder::start(&file, Limits { size: max_size, keep: keep.into() }, about(&unit));
@@ -81,12 +86,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         let interval_ms = rate.map_or(0, |rate| (1000.0 / rate).ceil() as u64);
         questions.push(Question::Streams { interval_ms, names: stream });
     }
+    let changed = Changed::default();
     for question in questions {
-        let (way, recorder) = (way.clone(), recorder.clone());
-        Builder::new().name("follow".into()).spawn(move || follow(&way, &recorder, question))?;
+        let (way, recorder, changed, decoding) = (way.clone(), recorder.clone(), changed.clone(), decoding.clone());
+        let follow = move || follow(&way, &recorder, question, Logs::new(decoding), &changed);
+        Builder::new().name("follow".into()).spawn(follow)?;
     }
     let (from, to) = (way.clone(), recorder.clone());
-    Builder::new().name("look".into()).spawn(move || look(operator, &from, &to, every))?;
+    Builder::new().name("look".into()).spawn(move || look(operator, &from, &to, every, &changed))?;
     match global.json {
         true => output::object(&json!({ "recording": file }))?,
         false => output::line(format_args!(
@@ -150,19 +157,24 @@ fn about(unit: &UnitInfo) -> BTreeMap<String, String> {
     .collect()
 }
 
+/// Nodes whose functions may be others than those that are recorded.
+type Changed = Arc<Mutex<HashSet<String>>>;
+
 /// Records the answers to a question that has no end, also after the manager was away.
-fn follow(way: &Way, recorder: &Recorder, mut question: Question) {
+fn follow(way: &Way, recorder: &Recorder, mut question: Question, mut logs: Logs, changed: &Changed) {
     let is_streams = matches!(question, Question::Streams { .. });
-    let (mut is_warned, mut logs) = (false, Texts::default());
+    let mut is_warned = false;
     loop {
         let mut is_followed = false;
         let ended = way.open().and_then(|mut operator| {
             operator.watch(&question, None, |answer| {
                 is_followed = true;
-                match logs.events(&answer) {
-                    Some(lines) => lines.iter().for_each(|line| recorder.take(line)),
-                    None => recorder.take(&answer),
+                if let Answer::Event { event, node: Some(node), .. } = &answer
+                    && event == "list_changed"
+                {
+                    changed.lock().unwrap_or_else(PoisonError::into_inner).insert(node.clone());
                 }
+                logs.events(answer).iter().for_each(|answer| recorder.take(answer));
                 Ok(true)
             })
         });
@@ -197,7 +209,7 @@ fn follow(way: &Way, recorder: &Recorder, mut question: Question) {
 }
 
 /// Records what has changed of the unit, nodes and orders, again and again; counters and the state of links every so often.
-fn look(first: Operator, way: &Way, recorder: &Recorder, every: Duration) {
+fn look(first: Operator, way: &Way, recorder: &Recorder, every: Duration, changed: &Changed) {
     let (mut operator, mut file, mut sampled) = (Some(first), 0, None::<Instant>);
     // By what they are about, without what changes with time alone.
     let mut known = HashMap::<String, Answer>::new();
@@ -213,7 +225,7 @@ fn look(first: Operator, way: &Way, recorder: &Recorder, every: Duration) {
             if is_due {
                 questions.extend([Question::Unit, Question::Counters { node: None }]);
             }
-            let mut changed = Vec::new();
+            let mut changed = std::mem::take(&mut *changed.lock().unwrap_or_else(PoisonError::into_inner));
             for question in questions {
                 operator.ask(&question, |answer| {
                     changed.extend(record_changed(recorder, &mut known, answer, is_due));

@@ -7,15 +7,26 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, Question};
-use cara_web::{Arguments, Beat, Cancel, Connection, Unit};
+use cara_web::{Beat, Cancel, Connection, Unit};
 use serde_json::Value;
 
+use super::logs::{Decoding, FirmwareArguments, Logs};
 use crate::commands::scan::all_managers;
 use crate::operator::{Need, Operator};
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
 
-pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+#[derive(clap::Args)]
+#[group(skip)]
+pub(crate) struct Arguments {
+    #[command(flatten)]
+    page: cara_web::Arguments,
+    #[command(flatten)]
+    firmware: FirmwareArguments,
+}
+
+pub(crate) fn run(Arguments { page, firmware }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let decoding = Arc::new(Decoding::of(&firmware, Decoding::OfLinux)?);
     // A manager that is not there now may come, and the page says that it is absent. What is ambiguous is told now.
     let own = match &global.act_as {
         Some(_) => Some(Operator::open(global, &Need::Nothing)?),
@@ -24,7 +35,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
             None
         }
     };
-    cara_web::run(arguments, Arc::new(Chosen { global: global.clone(), own }), global)
+    cara_web::run(page, Arc::new(Chosen { global: global.clone(), own, decoding }), global)
 }
 
 /// The unit that the options choose.
@@ -32,6 +43,7 @@ struct Chosen {
     global: Global,
     /// That of this process.
     own: Option<Operator>,
+    decoding: Arc<Decoding>,
 }
 
 impl Unit for Chosen {
@@ -51,6 +63,11 @@ impl Unit for Chosen {
             ));
         }
         cara_doctor::examine(listen, &self.global)
+    }
+
+    fn logs(&self) -> cara_web::Logs {
+        let mut logs = Logs::new(self.decoding.clone());
+        Box::new(move |answer| logs.events(answer))
     }
 
     fn managers(&self, listen: Duration) -> anyhow::Result<Value> {

@@ -29,7 +29,7 @@ pub(super) struct Logging {
     /// The environment's `RUST_LOG` stands above the file's level.
     fixed: bool,
     lines: LineQueue,
-    /// The same lines for the unit's manager.
+    /// The same lines for the unit's manager, or for an m_unit's operators.
     stream: Option<Log>,
 }
 

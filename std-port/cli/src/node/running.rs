@@ -43,7 +43,7 @@ pub(super) fn run(
         }
     })?;
     if let Some(log) = logging.stream() {
-        node.my_function_list().add_log(log).map_err(|error| Ended::usage(format!("[log] stream: {error}")))?;
+        node.show_log(log).map_err(|error| Ended::usage(format!("[log] stream: {error}")))?;
     }
     if settings.tells_clock {
         node.my_function_list().add_clock().map_err(|error| Ended::usage(format!("clock: {error}")))?;

@@ -59,7 +59,7 @@ pub(super) struct Settings {
     pub(super) access: Option<PathBuf>,
     /// The file's level of the log.
     pub(super) file_log: Option<String>,
-    /// Its manager gets the log as a stream.
+    /// Its manager gets the log as a stream; that of an m_unit is shown to its operators.
     pub(super) streams_log: bool,
     pub(super) black_box: Budget,
     /// Streams of the nodes that are in an m_unit's black box.
@@ -167,7 +167,8 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         metrics: metrics(file, over, mistakes),
         access: access(file, over, mistakes),
         file_log: log(file, mistakes),
-        streams_log: streams_log(file, role, mistakes),
+        // An m_unit's goes no further than its control socket.
+        streams_log: file.log.stream.as_ref().map_or(role == Role::MUnit, |stream| *stream.get_ref()),
         black_box: limits::black_box(&file.black_box, mistakes),
         boxed_streams: boxed_streams(file, role, mistakes),
         services: functions::services(&source, &file.functions, capacities.functions, mistakes),
@@ -394,16 +395,6 @@ fn access(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<
         mistakes.push(Mistake::new(written.span(), format!("the access table is wrong: {error}"), help));
     }
     Some(written.get_ref().into())
-}
-
-fn streams_log(file: &File, role: Role, mistakes: &mut Vec<Mistake>) -> bool {
-    let Some(stream) = &file.log.stream else { return false };
-    if *stream.get_ref() && role == Role::MUnit {
-        let help =
-            "leave it out: it is for an s_unit, whose manager reads the log; that of an m_unit would go to all nodes";
-        mistakes.push(Mistake::new(stream.span(), "an m_unit streams no log", help));
-    }
-    *stream.get_ref()
 }
 
 fn boxed_streams(file: &File, role: Role, mistakes: &mut Vec<Mistake>) -> Vec<String> {

@@ -11,13 +11,14 @@ use cara_std::access::AccessError;
 use cara_std::control::execute;
 use cara_std::control::protocol::{Answer, Question};
 use cara_std::{
-    BuildError, Builder, CommunicationSystem, Constraints, Error, Identity, Mode, MyFunctionList, StartError, Unit,
-    UnitEvent,
+    BuildError, Builder, CommunicationSystem, Constraints, Error, Identity, Log, Mode, MyFunctionList, StartError,
+    Unit, UnitEvent,
 };
 
 use super::black_box::{BlackBox, Cause, Look};
 use super::http::Metrics;
 use super::settings::Settings;
+use crate::commands::logs::Logs;
 
 /// Between two values of a stream in the black box.
 const BOXED_MS: u64 = 1_000;
@@ -89,6 +90,15 @@ impl Node {
             Self::Manager(system) => system.stop(),
             Self::Vehicle(unit) => unit.stop(),
         }
+    }
+
+    /// To the s_unit's manager, or to the m_unit's operators.
+    pub(super) fn show_log(&self, log: &Log) -> Result<(), Error> {
+        match self {
+            Self::Manager(system) => system.show_log(log),
+            Self::Vehicle(unit) => unit.my_function_list().add_log(log)?,
+        }
+        Ok(())
     }
 
     pub(super) fn my_function_list(&self) -> MyFunctionList<'_, ()> {
@@ -244,8 +254,12 @@ impl Node {
         let (system, names) = (system.downgrade(), names.to_vec());
         let follow = move || {
             let Some(system) = system.upgrade() else { return };
+            let (own, mut logs) = (system.identity().to_string(), Logs::default());
             execute(&system, &Question::Streams { interval_ms: BOXED_MS, names }, &mut |answer| {
-                black_box.take(&answer);
+                // The box has its own log line by line.
+                if !matches!(&answer, Answer::Value { node, .. } if *node == own) {
+                    logs.events(answer).iter().for_each(|answer| black_box.take(answer));
+                }
                 ControlFlow::Continue(())
             });
         };

@@ -3,8 +3,9 @@
 use std::io::Write as _;
 
 use cara_std::Log;
+use serde_json::Value;
 
-use crate::support::{Running, Stage};
+use crate::support::{Running, Stage, until};
 
 fn stage() -> Stage {
     let mut stage = Stage::empty();
@@ -44,8 +45,77 @@ fn a_node_streams_its_log_where_its_file_says_so() {
     std::fs::write(&file, text).unwrap();
     let mut node = stage.command(&["node", file.to_str().unwrap()]).spawn().unwrap();
     let mut shown = Running::start(stage.command(&["logs", "--json"]));
-    let line = shown.expect("joined");
-    assert!(line.contains("\"node\":\"agv-1/11\"") && line.contains("INFO"), "{line}");
+    // Beside the manager's.
+    while !shown.expect("joined").contains("\"node\":\"agv-1/11\"") {}
     node.kill().unwrap();
     node.wait().unwrap();
+}
+
+#[test]
+fn a_manager_shows_its_own_log_beside_those_of_vehicles_and_by_its_name() {
+    let mut stage = Stage::with(&["agv-1"]);
+    for named in [&["logs"][..], &["logs", "."], &["logs", "manager"], &["logs", "manager/1"]] {
+        let mut shown = Running::start(stage.command(named));
+        let line = shown.expect("joined");
+        assert!(line.contains("manager/1") && line.contains("agv-1"), "{named:?}: {line}");
+    }
+    let mut shown = Running::start(stage.command(&["logs", "manager", "--json"]));
+    stage.stop_agvs();
+    let line: Value = serde_json::from_str(&shown.expect("left")).unwrap();
+    assert!(line["node"] == "manager/1" && line["lost"].is_null(), "{line}");
+}
+
+#[test]
+fn a_manager_s_file_may_keep_its_log_to_itself() {
+    let mut stage = Stage::empty();
+    let file = stage.control().join("manager.toml");
+    std::fs::write(&file, "name = \"manager\"\nid = 1\n[log]\nstream = false\n").unwrap();
+    stage.start_manager_with(&[file.to_str().unwrap()]);
+    let refused = stage.ends(2, &["logs", "manager", "--json"]).error();
+    assert_eq!(refused["name"], "NoLog", "{refused}");
+}
+
+/// All that was written is shown or counted, and neither who writes nor other operators wait for a reader that takes nothing.
+#[test]
+fn a_reader_that_is_late_loses_bytes_of_the_log_and_a_frozen_one_holds_up_nobody() {
+    let stage = Stage::empty();
+    let manager = stage.manager().build().unwrap();
+    let mut log = Log::default();
+    manager.show_log(&log);
+    manager.start().unwrap();
+    let start = |more: &[&str]| Running::start(stage.command(&[&["logs", "manager", "--json"], more].concat()));
+    writeln!(log, "begins").unwrap();
+    let (mut late, mut frozen) = (start(&[]), start(&[]));
+    late.expect("begins");
+    frozen.expect("begins");
+    frozen.freeze();
+    let (mut written, mut seen, mut lost) = (0, 0, 0);
+    // More than is kept, faster than anybody looks.
+    for number in 0..10_000 {
+        let line = format!("line {number} of the manager");
+        written += line.len() + 1;
+        writeln!(log, "{line}").unwrap();
+    }
+    writeln!(log, "ends").unwrap();
+    loop {
+        let line: Value = serde_json::from_str(&late.expect("")).unwrap();
+        lost += line["lost"].as_u64().unwrap_or(0) as usize;
+        match line["text"].as_str() {
+            Some("ends") => break,
+            text => seen += text.map_or(0, |text| text.len() + 1),
+        }
+    }
+    assert!(lost > 0 && seen > 0 && lost + seen == written, "{lost} lost and {seen} seen of {written}");
+    // The frozen one's socket is full by now, or has been cut off.
+    for round in 0..200 {
+        writeln!(log, "{}", "x".repeat(4_000)).unwrap();
+        if round % 50 == 0 {
+            stage.ends(0, &["scan"]);
+        }
+    }
+    writeln!(log, "still there").unwrap();
+    late.expect("still there");
+    frozen.thaw();
+    until("the frozen one goes on, or was cut off", || frozen.has_ended() || frozen.expect("").contains("lost"));
+    manager.stop();
 }

@@ -8,6 +8,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
+use cara_std::{Definition, Duration, Parameters};
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use serde_json::Value;
 
@@ -34,6 +35,13 @@ fn topics(file: &Path) -> BTreeSet<String> {
     messages.map(|message| message.channel.topic.clone()).collect()
 }
 
+/// The messages of a channel of such a file.
+fn messages(file: &Path, topic: &str) -> Vec<Value> {
+    let messages = mcap::io::MessageReader::new(File::open(file).unwrap()).map_while(Result::ok);
+    let its = messages.filter(|message| message.channel.topic == topic);
+    its.map(|message| serde_json::from_slice(&message.data).unwrap()).collect()
+}
+
 /// How many messages a recording says to be lost.
 fn losses(file: &Path) -> u64 {
     let messages = mcap::io::MessageReader::new(File::open(file).unwrap()).map_while(Result::ok);
@@ -58,7 +66,10 @@ fn record(stage: &mut Stage, file: &Path, killed: &Path) {
     let all: BTreeSet<_> = all.map(str::to_owned).into();
     let has_all = |file: &Path| {
         let shown = stage.cara(&["replay", file.to_str().unwrap()]).out;
-        topics(file) == all && ["joined            late-1/12", LOGGED].iter().all(|part| shown.contains(part))
+        topics(file) == all
+            && ["joined            late-1/12", LOGGED, "log               manager/1"]
+                .iter()
+                .all(|part| shown.contains(part))
     };
     until("all is written down", || has_all(file) && has_all(killed));
     to_kill.kill();
@@ -129,21 +140,79 @@ fn top_shows_a_recording_at_any_speed() {
 fn the_page_shows_a_recording_at_any_speed() {
     for speed in ["0.9", "1000"] {
         let (stage, _folder, _replaying, socket) = replaying(speed);
-        let mut web = Running::start(stage.command(&["web", "--socket", &socket, "--listen", "127.0.0.1:0"]));
-        let line = web.expect("the page is at ");
-        let (address, key) = line.rsplit_once("http://").unwrap().1.split_once("/#").unwrap();
-        let mut page = TcpStream::connect(address).unwrap();
-        page.set_read_timeout(Some(PATIENCE)).unwrap();
-        write!(page, "GET /api/stream HTTP/1.1\r\nhost: {address}\r\nauthorization: Bearer {key}\r\n\r\n").unwrap();
-        let (mut told, mut piece, start) = (Vec::new(), [0; 4096], Instant::now());
         // Its nodes, and a stream with its value.
         let wanted = ["\"agv-1/11@s_unit\":{", "\"late-1/12@s_unit\":{", "pose() -> (x: int)", "[[\"x\",[\"7\"]]"];
-        while !wanted.iter().all(|part| String::from_utf8_lossy(&told).contains(part)) {
-            let read = page.read(&mut piece).unwrap_or_default();
-            assert!(read > 0 && start.elapsed() < PATIENCE, "at speed {speed} only {}", String::from_utf8_lossy(&told));
-            told.extend_from_slice(&piece[..read]);
-        }
+        page_shows(&stage, &["--socket", &socket], &wanted);
     }
+}
+
+/// Waits until a page was told all of these.
+fn page_shows(stage: &Stage, more: &[&str], wanted: &[&str]) {
+    let mut web = Running::start(stage.command(&[&["web", "--listen", "127.0.0.1:0"], more].concat()));
+    let line = web.expect("the page is at ");
+    let (address, key) = line.rsplit_once("http://").unwrap().1.split_once("/#").unwrap();
+    let mut page = TcpStream::connect(address).unwrap();
+    page.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(page, "GET /api/stream HTTP/1.1\r\nhost: {address}\r\nauthorization: Bearer {key}\r\n\r\n").unwrap();
+    let (mut told, mut piece, start) = (Vec::new(), [0; 4096], Instant::now());
+    while !wanted.iter().all(|part| String::from_utf8_lossy(&told).contains(part)) {
+        let read = page.read(&mut piece).unwrap_or_default();
+        assert!(read > 0 && start.elapsed() < PATIENCE, "{more:?}: only {}", String::from_utf8_lossy(&told));
+        told.extend_from_slice(&piece[..read]);
+    }
+}
+
+/// A vehicle that logs as boards do.
+fn board(stage: &Stage) -> (cara_std::Unit, cara_std::Stream) {
+    let board = stage.vehicle("late-1", 12).build().unwrap();
+    let definition = Definition::stream("log(at: int, build: int, piece: bytes[256])").unwrap();
+    let log = board.my_function_list().add_stream(&definition, Duration::from_millis(50)).unwrap();
+    let mut piece = Parameters::new();
+    for (name, value) in [("at", 0), ("build", 0x0bad_cafe)] {
+        piece.add_int(name, 1).unwrap();
+        piece.set_value(name, value).unwrap();
+    }
+    piece.add_bytes("piece", 256).unwrap();
+    piece.set_value("piece", &b"\x01\x02\x03\x00"[..]).unwrap();
+    log.publish(&piece).unwrap();
+    board.publish_my_function_list().unwrap();
+    board.start().unwrap();
+    (board, log)
+}
+
+#[test]
+fn a_board_s_log_without_its_firmware_stays_bytes_and_the_missing_build_id_is_said() {
+    let (stage, agv, _pose) = stage();
+    let (board, _log) = board(&stage);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a.mcap");
+    let mut recording = Running::start(stage.command(&["record", file.to_str().unwrap(), "--stream", "log"]));
+    recording.expect("recording manager/1");
+    until("its bytes are recorded", || topics(&file).contains("/streams/late-1/12/log"));
+    let said = stage.ends(0, &["replay", file.to_str().unwrap()]);
+    said.says("no_firmware       late-1/12").says("whose build id is 000000000badcafe");
+    let bytes = messages(&file, "/streams/late-1/12/log");
+    assert_eq!(bytes[0]["values"]["piece"], "01020300", "{bytes:?}");
+    let build = "[\"build\",\"000000000badcafe\",true],[\"piece\",\"4 bytes, whose firmware is not known\",true]";
+    page_shows(&stage, &[], &[build, "no_firmware", "\"manager/1\":[[", LOGGED]);
+    agv.stop();
+    board.stop();
+}
+
+#[test]
+fn a_stream_that_is_replaced_while_its_vehicle_stays_is_in_the_recording() {
+    let (stage, agv, _pose) = stage();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a.mcap");
+    let mut recording = Running::start(stage.command(&["record", file.to_str().unwrap()]));
+    recording.expect("recording manager/1");
+    let has = |signature: &str| messages(&file, "/functions").iter().any(|told| told.to_string().contains(signature));
+    until("the old one is there", || has("battery() -> (percent: float)"));
+    agv.my_function_list().remove("battery").unwrap();
+    agv.my_function_list().add_stream(&Definition::stream("battery(volts: float)").unwrap(), Duration::ZERO).unwrap();
+    agv.publish_my_function_list().unwrap();
+    until("the new one is there", || has("battery() -> (volts: float)"));
+    agv.stop();
 }
 
 /// A limit of the system for the size of files stands for a disk that is full, and later has space again.

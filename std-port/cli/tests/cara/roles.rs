@@ -5,9 +5,11 @@ use std::io::ErrorKind;
 use std::os::unix::fs::{PermissionsExt, chown};
 use std::os::unix::process::CommandExt;
 
-use crate::support::{Ran, Stage, until};
+use crate::support::{Ran, Running, Stage, until};
 
 const USER: u32 = 4711;
+/// May only stop.
+const STOPPER: u32 = 4713;
 
 #[test]
 fn another_user_looks_and_stops_and_is_told_what_else_needs() {
@@ -20,7 +22,7 @@ fn another_user_looks_and_stops_and_is_told_what_else_needs() {
         return;
     }
     let file = stage.control().join("manager.toml");
-    let (fleet, operators) = (stage.fleet, format!("operators = {{ {USER} = \"see\" }}"));
+    let (fleet, operators) = (stage.fleet, format!("operators = {{ {USER} = \"see\", {STOPPER} = \"stop\" }}"));
     let control = format!("[control]\npath = {socket:?}\naudit = {audit:?}\n{operators}\n");
     fs::write(&file, format!("name = \"manager\"\nid = 1\nfleet = {fleet}\n{control}")).unwrap();
     stage.know("agv", 7);
@@ -43,6 +45,12 @@ fn another_user_looks_and_stops_and_is_told_what_else_needs() {
     call.says("needs the role `operate`, and you have `see`");
     let reset = asked(&["reset", "agv", "--json"]);
     assert_eq!((reset.code, &reset.error()["name"]), (1, &"NotAllowed".into()));
+    let mut log = stage.command(&["logs", "manager"]);
+    log.uid(USER).gid(USER);
+    Running::start(log).expect("agv/7");
+    let stopper = asked_by(STOPPER, &["logs", "manager"]).unwrap();
+    assert_eq!(stopper.code, 1, "{}", stopper.everything());
+    stopper.says("needs the role `see`, and you have `stop`");
     asked(&["stop", "agv"]).says("published no function that stops");
     let stranger = asked_by(USER + 1, &["stop", "agv"]).unwrap();
     assert_eq!(stranger.code, 3);

@@ -53,19 +53,17 @@ fn streamed(argument: &Argument) -> Value {
     }
 }
 
-/// The values of a stream, in the order of its signature. Of a piece of a log there is its text; one of defmt takes the firmware's
-/// file, which a page does not have.
+/// The values of a stream, in the order of its signature. Of a piece of a log, which takes a firmware that is not there, only how
+/// long it is.
 pub(crate) fn streamed_all(stream: &str, values: &[Argument]) -> Value {
     let is_log = stream.split('(').next() == Some("log");
-    let is_defmt = values.iter().any(|value| value.name == "build");
     let one = |value: &Argument| match &value.value {
-        ArgumentValue::Bytes(digits) if is_log && is_defmt => {
-            json!([value.name, format!("{} bytes of defmt", digits.len() / 2), true])
+        ArgumentValue::Bytes(digits) if is_log => {
+            json!([value.name, format!("{} bytes, whose firmware is not known", digits.len() / 2), true])
         }
-        ArgumentValue::Bytes(digits) if is_log => match hex::decode(digits) {
-            Ok(bytes) => json!([value.name, Shown(&String::from_utf8_lossy(&bytes)).to_string(), true]),
-            Err(_) => streamed(value),
-        },
+        ArgumentValue::Int(build) if is_log && value.name == "build" => {
+            json!([value.name, build.iter().map(|build| format!("{build:016x}")).collect::<String>(), true])
+        }
         _ => streamed(value),
     };
     values.iter().map(one).collect()
@@ -115,17 +113,14 @@ mod tests {
     }
 
     #[test]
-    fn a_piece_of_a_log_is_text_and_one_of_defmt_its_length() {
-        let log = |build: bool| {
-            let value = |name: &str, value| Argument { name: name.to_owned(), size: 1, value };
-            let build = build.then(|| value("build", ArgumentValue::Int(vec![7])));
-            let piece = value("piece", ArgumentValue::Bytes("6f6e65ff".to_owned()));
-            build.into_iter().chain([piece]).collect::<Vec<_>>()
-        };
-        assert_eq!(streamed_all("log() -> (piece: bytes[9])", &log(false)), json!([["piece", "one\u{fffd}", true]]));
-        let defmt = json!([["build", ["7"]], ["piece", "4 bytes of defmt", true]]);
-        assert_eq!(streamed_all("log() -> (build: int, piece: bytes[9])", &log(true)), defmt);
-        assert_eq!(streamed_all("scan() -> (piece: bytes[9])", &log(false)), json!([["piece", "6f6e65ff"]]));
+    fn a_piece_of_a_log_that_was_not_read_is_its_length_and_its_build_id() {
+        let value = |name: &str, value| Argument { name: name.to_owned(), size: 1, value };
+        let piece = value("piece", ArgumentValue::Bytes("6f6e65ff".to_owned()));
+        let log = [value("build", ArgumentValue::Int(vec![-7])), piece];
+        let shown =
+            json!([["build", "fffffffffffffff9", true], ["piece", "4 bytes, whose firmware is not known", true]]);
+        assert_eq!(streamed_all("log() -> (build: int, piece: bytes[9])", &log), shown);
+        assert_eq!(streamed_all("scan() -> (piece: bytes[9])", &log[1..]), json!([["piece", "6f6e65ff"]]));
     }
 
     #[test]

@@ -75,9 +75,16 @@ pub trait Unit: Send + Sync + 'static {
     /// What the doctor finds when it listens for so long.
     fn findings(&self, listen: Duration) -> anyhow::Result<Value>;
 
+    /// What makes an event `log` of each line of a log, in the place of the pieces that streams bring. Pieces of a board whose firmware is
+    /// not known stay, and all else.
+    fn logs(&self) -> Logs;
+
     /// Which m_unit has which s_unit, after a survey of so long: `rows` (`cells`: m_unit, fleet, s_unit, state; `kind`) and `remarks`.
     fn managers(&self, listen: Duration) -> anyhow::Result<Value>;
 }
+
+/// See [`Unit::logs`].
+pub type Logs = Box<dyn FnMut(Answer) -> Vec<Answer>>;
 
 /// Ends what is asked over a connection, from another thread.
 pub type Cancel = Box<dyn Fn() + Send + Sync>;

@@ -26,6 +26,9 @@ pub(crate) const BODY: usize = 1024 * 1024;
 pub(crate) const STREAMS: usize = 4096;
 /// Events that are kept for pages that come later.
 pub(crate) const EVENTS: usize = 200;
+/// Lines of a log that are shown of each node, and characters of a line; the rest of a longer one is left out.
+pub(crate) const LOG_LINES: usize = 30;
+pub(crate) const LOG_LINE: usize = 400;
 /// Cells of a map.
 pub(crate) const CELLS: usize = 4 * 1024 * 1024;
 

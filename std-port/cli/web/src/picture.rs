@@ -5,10 +5,11 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::fmt::Write;
 use std::time::Instant;
 
+use cara_std::Shown;
 use cara_std::control::Role;
 use serde_json::{Value, json};
 
-use crate::limits::{EVENTS, Limits, STREAMS};
+use crate::limits::{EVENTS, LOG_LINE, LOG_LINES, Limits, STREAMS};
 use crate::users::User;
 
 /// Kinds of things that are told.
@@ -28,6 +29,8 @@ pub(crate) enum Section {
     Streams,
     /// Their newest values, by the same number.
     Values,
+    /// The last lines of logs, each with its time, by `NAME/ID`.
+    Logs,
     /// Round trips, by `NAME/ID`.
     Pings,
     /// What the doctor found last.
@@ -38,7 +41,7 @@ pub(crate) enum Section {
     Managers,
 }
 
-const SECTIONS: [(Section, &str); 11] = [
+const SECTIONS: [(Section, &str); 12] = [
     (Section::Unit, "unit"),
     (Section::Nodes, "nodes"),
     (Section::Refused, "refused"),
@@ -46,6 +49,7 @@ const SECTIONS: [(Section, &str); 11] = [
     (Section::Counters, "counters"),
     (Section::Streams, "streams"),
     (Section::Values, "values"),
+    (Section::Logs, "logs"),
     (Section::Pings, "pings"),
     (Section::Doctor, "doctor"),
     (Section::Limits, "limits"),
@@ -70,6 +74,8 @@ pub(crate) struct Picture {
     /// By node and name: its number, and how many values have come.
     streams: HashMap<(String, String), (usize, u64)>,
     next_stream: usize,
+    /// The lines as JSON, by node.
+    logs: HashMap<String, VecDeque<String>>,
     link: Link,
 }
 
@@ -99,6 +105,7 @@ impl Picture {
             events_seen: 0,
             streams: HashMap::new(),
             next_stream: 0,
+            logs: HashMap::new(),
             link: Link::default(),
         }
     }
@@ -110,7 +117,10 @@ impl Picture {
 
     /// Puts a row into a table. One that is as it was is no change.
     pub(crate) fn put(&mut self, section: Section, key: &str, row: &Value) {
-        let text = row.to_string();
+        self.put_text(section, key, row.to_string());
+    }
+
+    fn put_text(&mut self, section: Section, key: &str, text: String) {
         let table = &mut self.tables[section as usize];
         if table.rows.get(key).is_none_or(|(_, old)| *old != text) {
             self.change += 1;
@@ -155,12 +165,26 @@ impl Picture {
         self.put(Section::Values, &number, &json!([count, at, values]));
     }
 
-    /// Forgets streams of nodes that are not known any more.
+    /// A line of a node's log.
+    pub(crate) fn log(&mut self, node: &str, unix_ms: u64, text: &str) {
+        let text: String = Shown(text).to_string().chars().take(LOG_LINE).collect();
+        let lines = self.logs.entry(node.to_owned()).or_default();
+        if lines.len() == LOG_LINES {
+            lines.pop_front();
+        }
+        lines.push_back(json!([unix_ms, text]).to_string());
+        let row = format!("[{}]", lines.iter().map(String::as_str).collect::<Vec<_>>().join(","));
+        self.put_text(Section::Logs, node, row);
+    }
+
+    /// Forgets streams and logs of nodes that are not known any more.
     pub(crate) fn only_streams_of(&mut self, is_known: impl Fn(&str) -> bool) {
         self.streams.retain(|(node, _), _| is_known(node));
         let left: HashSet<String> = self.streams.values().map(|(number, _)| number.to_string()).collect();
         self.keep(Section::Streams, |key| left.contains(key));
         self.keep(Section::Values, |key| left.contains(key));
+        self.logs.retain(|node, _| is_known(node));
+        self.keep(Section::Logs, &is_known);
     }
 
     /// Something happened. How many events are kept now.

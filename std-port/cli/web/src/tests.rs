@@ -50,6 +50,10 @@ impl Unit for Fake {
         Ok(json!({ "findings": [{ "id": "full" }], "listened_ms": 5 }))
     }
 
+    fn logs(&self) -> crate::Logs {
+        Box::new(|answer| vec![answer])
+    }
+
     fn managers(&self, _: Duration) -> anyhow::Result<Value> {
         anyhow::ensure!(!self.is_gone.load(Ordering::Acquire), "no survey");
         Ok(

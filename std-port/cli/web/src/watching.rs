@@ -92,7 +92,8 @@ fn look(shared: &Shared, way: &mut dyn Connection) -> anyhow::Result<()> {
         joined.retain(|key, _| known.contains(key.as_str()));
         picture.put(Section::Unit, "", &unit);
         let names: HashSet<&str> = nodes.iter().filter_map(|(key, _)| Some(key.rsplit_once('@')?.0)).collect();
-        picture.only_streams_of(|node| names.contains(node));
+        let own = format!("{}/{}", unit["name"].as_str().unwrap_or_default(), unit["id"]);
+        picture.only_streams_of(|node| names.contains(node) || node == own);
         picture.set(Section::Nodes, &nodes);
         picture.set(Section::Refused, &refused);
         picture.set(Section::Orders, &of_orders(orders, now));
@@ -195,24 +196,38 @@ fn of_counters(answers: Vec<Answer>) -> Vec<(String, Value)> {
 
 fn events(shared: &Shared, way: &mut dyn Connection) -> anyhow::Result<()> {
     way.ask(&Question::Watch, &mut |answer| {
-        if let Answer::Event { unix_ms, event, node, text, .. } = answer {
-            let kept =
-                shared.picture().event(&json!({ "unix_ms": unix_ms, "event": event, "node": node, "text": text }));
-            shared.limits.events.uses(kept);
-        }
+        take(shared, answer);
         ControlFlow::Continue(())
     })
 }
 
 fn streams(shared: &Shared, way: &mut dyn Connection) -> anyhow::Result<()> {
+    let mut logs = shared.unit.logs();
     way.ask(&Question::Streams { interval_ms: STREAM_INTERVAL_MS, names: Vec::new() }, &mut |answer| {
-        if let Answer::Value { node, stream, age_us: Some(age), values, error: None, .. } = answer {
+        logs(answer).into_iter().for_each(|answer| take(shared, answer));
+        ControlFlow::Continue(())
+    })
+}
+
+/// Something happened, was logged, or is the value of a stream.
+fn take(shared: &Shared, answer: Answer) {
+    match answer {
+        // A recording has lines as events.
+        Answer::Event { unix_ms, event, node: Some(node), text, .. } if event == "log" => {
+            shared.picture().log(&node, unix_ms, &text);
+        }
+        Answer::Event { unix_ms, event, node, text, .. } => {
+            let kept =
+                shared.picture().event(&json!({ "unix_ms": unix_ms, "event": event, "node": node, "text": text }));
+            shared.limits.events.uses(kept);
+        }
+        Answer::Value { node, stream, age_us: Some(age), values, error: None, .. } => {
             // Pairs, in the order of the signature: an object has none, and a place is the first two numbers of a pose.
             let values = form::streamed_all(&stream, &values);
             shared.picture().value(&node, &stream, &values, age / 1000, &shared.limits);
         }
-        ControlFlow::Continue(())
-    })
+        _ => {}
+    }
 }
 
 /// The round trips of connected nodes that are due, the longest unasked ones first. `pinged` has when each was asked.

@@ -100,6 +100,8 @@ pub(crate) const WAREHOUSE: Image =
     Image { feature: Some("warehouse"), ..Image::plain("warehouse", "warehouse").secured() };
 /// The AGV of an emulated board with a service that makes it fail.
 pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
+/// The same, whose log comes over its link.
+pub(crate) const LOGGED: Image = Image { name: "agv-faults-logs", feature: Some("faults,logs"), ..AGV };
 /// The AGV of an emulated board with random numbers that are the same in each life, and with a service that takes lists.
 pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random,lists"), ..AGV };
 /// The AGV of the emulated board that can be handed over to a second manager.

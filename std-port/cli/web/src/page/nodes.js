@@ -55,6 +55,7 @@ export function draw() {
   drawChosen();
   drawOrders();
   drawEvents();
+  drawLog("own-log", state.unit[""] && `${state.unit[""].name}/${state.unit[""].id}`);
   drawDoctor();
   drawManagers();
   drawLimits();
@@ -95,6 +96,7 @@ function drawChosen() {
     const value = state.values[number];
     return [stream.name, value ? `${node.connected ? "" : "was "}${show(value[2])}  ·  ${span(now() - value[1])} old` : "no value yet"];
   }).sort(([a], [b]) => natural(a, b)));
+  drawLog("node-log", one.name);
   facts($("counters"), Object.entries(state.counters[one.name] ?? {}).map(([name, count]) => [words(name), count.toLocaleString("en")]));
   forms.refresh(one);
 }
@@ -142,6 +144,16 @@ function drawEvents() {
   told = state.events[0];
   $("events").replaceChildren(...state.events.slice(0, 100).map((event) => make("li", {},
     make("time", { dateTime: new Date(event.unix_ms).toISOString() }, clock(event.unix_ms)), make("strong", {}, words(event.event)), " ", event.node ? `${event.node} ` : "", event.text)));
+}
+
+// Lines of a node's log, the newest first.
+const drawnLogs = {};
+function drawLog(id, name) {
+  const lines = state.logs[name] ?? null;
+  if (drawnLogs[id] === lines) return;
+  drawnLogs[id] = lines;
+  $(id).parentElement.hidden = lines === null;
+  $(id).replaceChildren(...(lines ?? []).map(([ms, line]) => make("li", {}, make("time", { dateTime: new Date(ms).toISOString() }, clock(ms)), line)).reverse());
 }
 
 let found = null;

@@ -1,7 +1,7 @@
 // What the page knows, and how old that is. Data that is old never looks like data that is not.
 
 export const state = {
-  unit: {}, nodes: {}, refused: {}, orders: {}, counters: {}, streams: {}, values: {}, pings: {}, doctor: {}, limits: {}, managers: {},
+  unit: {}, nodes: {}, refused: {}, orders: {}, counters: {}, streams: {}, values: {}, logs: {}, pings: {}, doctor: {}, limits: {}, managers: {},
   events: [], link: null, chosen: null,
   // When the last message came, by the page's clock, and the server's clock then.
   heard: null, server: 0,
