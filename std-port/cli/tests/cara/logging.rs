@@ -71,7 +71,7 @@ fn a_manager_s_file_may_keep_its_log_to_itself() {
     let file = stage.control().join("manager.toml");
     std::fs::write(&file, "name = \"manager\"\nid = 1\n[log]\nstream = false\n").unwrap();
     stage.start_manager_with(&[file.to_str().unwrap()]);
-    let refused = stage.ends(2, &["logs", "manager", "--json"]).error();
+    let refused = stage.ends(2, &["logs", "manager", "--json", "--for", "20s"]).error();
     assert_eq!(refused["name"], "NoLog", "{refused}");
 }
 

@@ -48,7 +48,7 @@ fn another_user_looks_and_stops_and_is_told_what_else_needs() {
     let mut log = stage.command(&["logs", "manager"]);
     log.uid(USER).gid(USER);
     Running::start(log).expect("agv/7");
-    let stopper = asked_by(STOPPER, &["logs", "manager"]).unwrap();
+    let stopper = asked_by(STOPPER, &["logs", "manager", "--for", "20s"]).unwrap();
     assert_eq!(stopper.code, 1, "{}", stopper.everything());
     stopper.says("needs the role `see`, and you have `stop`");
     asked(&["stop", "agv"]).says("published no function that stops");
