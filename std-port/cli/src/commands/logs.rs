@@ -318,7 +318,7 @@ mod firmware {
     const MAGIC: &[u8] = b"\x7fELF";
 
     /// Where the ELFs are.
-    pub(super) enum Firmware {
+    pub(in crate::commands) enum Firmware {
         File {
             path: PathBuf,
             build: Option<u64>,
