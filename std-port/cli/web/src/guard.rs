@@ -162,8 +162,9 @@ impl Guard {
     }
 }
 
+/// A value that is no text counts as an empty one, and not as absent: what is absent may pass.
 fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
-    headers.get(name)?.to_str().ok()
+    headers.get(name).map(|value| value.to_str().unwrap_or_default())
 }
 
 /// The check of every request, and the headers of every answer.
@@ -329,6 +330,15 @@ mod tests {
         for wrong in [None, Some(""), Some(TOKEN), Some("Bearer "), Some(shorter), Some(&longer), Some(&other)] {
             assert_eq!(get(wrong), Err(Refusal::Token), "{wrong:?}");
         }
+    }
+
+    #[test]
+    fn an_origin_that_is_no_text_is_not_one_that_is_absent() {
+        let token = bearer();
+        let mut all = headers(&[("host", "localhost"), ("authorization", &token)]);
+        assert_eq!(guard().check(&Method::GET, &all, true), Ok(()));
+        all.insert(header::ORIGIN, HeaderValue::from_bytes(b"http://\xff").unwrap());
+        assert_eq!(guard().check(&Method::GET, &all, true), Err(Refusal::Origin));
     }
 
     #[test]
