@@ -80,7 +80,7 @@ pub(crate) fn fits(legs: &[(Edge, Node)], edge: &Edge, node: &Node) -> bool {
 }
 
 /// What the gateway sends: the stretch without its names, the names of edges and nodes, and the map of all nodes.
-pub(crate) fn of_order(number: i64, legs: &[(Edge, Node)]) -> (Stretch<'static>, [String; 2], &str) {
+pub fn of_order(number: i64, legs: &[(Edge, Node)]) -> (Stretch<'static>, [String; 2], &str) {
     let mut stretch = Stretch {
         number,
         count: legs.len() as i64,

@@ -54,7 +54,7 @@ pub(crate) fn read_claims(path: &Path) -> Result<Option<KeptClaims>, KeyError> {
     parse(&text).map(Some).map_err(|error| file::form(path, error))
 }
 
-fn parse(text: &str) -> Result<KeptClaims, FormError> {
+pub(super) fn parse(text: &str) -> Result<KeptClaims, FormError> {
     let text = text.replace(&format!("\n{LATER}"), "\n");
     let mut lines = Lines::of(&text);
     lines.head(HEAD, "a file with claims begins with `cara-claims`")?;
@@ -102,6 +102,14 @@ fn digits(bytes: &[u8]) -> String {
 
 /// Writes it, whole, and with its folder on the disk before this returns.
 pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyError> {
+    if let Some(folder) = path.parent() {
+        file::make_folder(folder)?;
+    }
+    file::write_private(path, text(kept).as_bytes())
+}
+
+/// The text of its file.
+pub(super) fn text(kept: &KeptClaims) -> String {
     let mut text = String::new();
     // Writing to text does not fail.
     let _ = writeln!(text, "{HEAD} {FORM}\nown {} {}", kept.own.term, kept.own.claimant);
@@ -120,10 +128,7 @@ pub(crate) fn write_claims(path: &Path, kept: &KeptClaims) -> Result<(), KeyErro
         }
     }
     push_sum(&mut text);
-    if let Some(folder) = path.parent() {
-        file::make_folder(folder)?;
-    }
-    file::write_private(path, text.as_bytes())
+    text
 }
 
 #[cfg(test)]

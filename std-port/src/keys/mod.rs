@@ -62,3 +62,17 @@ pub fn draw<const BYTES: usize>() -> Result<zeroize::Zeroizing<[u8; BYTES]>, Key
 pub fn shown(fingerprint: [u8; cara_secure::keys::FINGERPRINT_BYTES]) -> String {
     fingerprint.iter().map(|byte| format!("{byte:02x}")).collect()
 }
+
+/// What a file of claims says, whatever its checksum, and the text that is written of that; for `tests/fuzz`.
+#[doc(hidden)]
+pub fn claims_again(text: &str) -> Result<[String; 2], KeyError> {
+    let form = |error| file::form(std::path::Path::new("claims"), error);
+    claims::parse(text).map(|kept| [format!("{kept:?}"), claims::text(&kept)]).map_err(form)
+}
+
+/// The same of a list of members.
+#[doc(hidden)]
+pub fn members_again(text: &str) -> Result<[String; 2], KeyError> {
+    let form = |error| file::form(std::path::Path::new("members"), error);
+    Members::parse(text).map(|members| [format!("{members:?}"), members.text()]).map_err(form)
+}

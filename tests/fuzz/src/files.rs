@@ -1,4 +1,5 @@
-//! Texts that people and programs write: access tables, key files, questions on the control socket, and values in JSON.
+//! Texts that people and programs write: access tables, key files, files of claims, lists of a fleet's members, lines of the control
+//! socket, and values in JSON.
 
 use std::fs::File;
 use std::io::{Seek as _, Write as _};
@@ -9,7 +10,9 @@ use cara_core::services::access::{Principal, Verb};
 use cara_std::access::AccessTable;
 use cara_std::control::json;
 use cara_std::control::protocol::{Answer, Question};
-use cara_std::keys::KeyRing;
+use cara_std::keys::{self, KeyError, KeyRing};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::Value as Json;
 use tempfile::NamedTempFile;
 
@@ -66,6 +69,34 @@ const KEYS: &[&str] = &[
     "0",
     "ff",
 ];
+/// Pieces of a file of claims, and of a list of members.
+const KEPT: &[&str] = &[
+    "cara-claims 2\n",
+    "cara-claims 1\n",
+    "own 3 4\n",
+    "own 18446744073709551615 ",
+    "obeyed 3 4 ",
+    "000102030405060708090a0b0c0d0e0f ",
+    "010203040506 ",
+    "home ",
+    "present ",
+    "#!",
+    "cara-fleet 2\n",
+    "cara-fleet 1\n",
+    "fleet 7\n",
+    "generations 1 2\n",
+    "generations 1\n",
+    "node 1 ",
+    "manager ",
+    "revoked 2 ",
+    "m_unit 1 depot\n",
+    "s_unit 17 agv\n",
+    "m_unit 1 ",
+    "sum 00000000\n",
+    "# for people\n",
+    "\n",
+    " ",
+];
 const QUESTIONS: &[&str] = &[
     "{\"ask\":",
     "\"call\"",
@@ -102,6 +133,19 @@ const QUESTIONS: &[&str] = &[
     "\"a\":",
     "\"role\":\"stop\"",
     "\"\\ud800\"",
+    "{\"answer\":",
+    "\"called\",\"node\":\"agv\",\"id\":7,\"results\":[",
+    "],\"took_us\":1",
+    "\"failed\"",
+    "\"done\"",
+    "\"event\",\"at_ms\":1,\"event\":\"joined\",\"text\":\"\"",
+    "\"command\",\"unix_ms\":1,\"by\":",
+    "\"value\",\"node\":\"agv/7\",\"stream\":\"s()\",\"unix_ms\":1,\"values\":[",
+    "\"function\",\"name\":\"go\",\"signature\":\"go()\",\"priority\":\"high\",\"lease_us\":1000000",
+    ",\"stop\":true",
+    ",\"error\":",
+    "{\"cause\":\"peer\",\"error\":\"Busy\",\"text\":\"\"",
+    "\"node\",\"name\":\"agv\",\"id\":7,\"role\":\"s_unit\",\"connected\":true,\"functions\":1",
 ];
 /// What values in JSON are read as.
 const VARIABLES: [&str; 5] =
@@ -109,10 +153,12 @@ const VARIABLES: [&str; 5] =
 
 pub(crate) fn run(data: &[u8]) {
     let mut script = Script::new(data);
-    match script.below(4) {
+    match script.below(6) {
         0 => access(&text(script, ACCESS)),
-        1 => keys(&text(script, KEYS)),
-        2 => question(&text(script, QUESTIONS)),
+        1 => ring(&text(script, KEYS)),
+        2 => again(&text(script, KEPT), keys::claims_again),
+        3 => again(&text(script, KEPT), keys::members_again),
+        4 => line(&text(script, QUESTIONS)),
         _ => {
             let variable = VARIABLES[usize::from(script.below(VARIABLES.len() as u8))];
             values(variable, &text(script, QUESTIONS));
@@ -121,7 +167,7 @@ pub(crate) fn run(data: &[u8]) {
 }
 
 /// Pieces where they are meant, and other characters as they are.
-fn text(mut script: Script<'_>, pieces: &[&str]) -> String {
+pub(crate) fn text(mut script: Script<'_>, pieces: &[&str]) -> String {
     let mut text = String::new();
     while !script.is_over() {
         let byte = script.byte();
@@ -151,7 +197,7 @@ thread_local! {
     static FILE: NamedTempFile = NamedTempFile::new().expect("there is room");
 }
 
-fn keys(text: &str) {
+fn ring(text: &str) {
     FILE.with(|named| {
         let mut file: &File = named.as_file();
         file.set_len(0).and_then(|()| file.rewind()).expect("it is ours");
@@ -163,13 +209,30 @@ fn keys(text: &str) {
     });
 }
 
-fn question(text: &str) {
-    if let Ok(question) = serde_json::from_str::<Question>(text) {
-        let again = serde_json::to_string(&question).expect("it is JSON");
-        let read = serde_json::from_str::<Question>(&again).expect("what is written can be read");
-        assert_eq!(serde_json::to_string(&read).expect("it is JSON"), again);
+/// What is read of a file is written as a file that reads the same.
+fn again(text: &str, read: fn(&str) -> Result<[String; 2], KeyError>) {
+    match read(text) {
+        Ok([said, written]) => match read(&written) {
+            Ok(again) => assert_eq!(again, [said, written], "{text}"),
+            Err(error) => panic!("what is written cannot be read: {error}: {written}"),
+        },
+        Err(error) => assert!(!error.to_string().is_empty()),
     }
-    let _ = serde_json::from_str::<Answer>(text);
+}
+
+/// A line of the control socket.
+fn line(text: &str) {
+    line_of::<Question>(text);
+    line_of::<Answer>(text);
+}
+
+fn line_of<T: Serialize + DeserializeOwned>(text: &str) {
+    if let Ok(read) = serde_json::from_str::<T>(text) {
+        let line = serde_json::to_string(&read).expect("it is JSON");
+        assert!(!line.contains('\n'), "it is more than a line");
+        let again = serde_json::from_str::<T>(&line).unwrap_or_else(|error| panic!("{line}: {error}"));
+        assert_eq!(serde_json::to_string(&again).expect("it is JSON"), line);
+    }
 }
 
 fn values(variable: &str, text: &str) {

@@ -110,6 +110,7 @@ impl Play {
 
     /// Bytes reach the unit.
     pub(crate) fn arrive(&mut self, index: usize, bytes: &[u8]) {
+        crate::saw("stream", "", bytes);
         if let Some(link) = self.unit.links[index].as_mut().filter(|link| link.inbox.len() < 1 << 15) {
             link.inbox.extend_from_slice(bytes);
         }

@@ -12,6 +12,7 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::host::frame::Frame;
 use cara_core::host::secure::Plain;
 
+use crate::saw;
 use crate::script::Script;
 use crate::unit::FLEET;
 
@@ -34,6 +35,7 @@ pub(crate) fn run(data: &[u8]) {
         2 | 3 => {
             let signature = SIGNATURES[usize::from(script.below(SIGNATURES.len() as u8))];
             if let Ok(definition) = Definition::parse(signature) {
+                saw("block", signature, script.rest());
                 values(definition.signature().arguments(), script.rest());
             }
         }
@@ -67,6 +69,7 @@ fn text(bytes: &[u8]) {
 
 /// A signature in bytes.
 fn signature(bytes: &[u8]) -> Option<Definition> {
+    saw("signature", "", bytes);
     let signature = Signature::decode(bytes).ok()?;
     let definition = signature.to_definition();
     assert_eq!(definition.as_bytes(), signature.as_bytes());
@@ -102,6 +105,7 @@ fn write(specs: VariableSpecs<'_>, parameters: &Parameters<8_192>) -> Vec<u8> {
 fn hello(mode: Mode, bytes: &[u8]) {
     // The first bytes would hardly be found.
     let bytes = &[&mode.magic()[..], &[2, 2, 1, 0], bytes].concat();
+    saw("hello", "", bytes);
     let Ok(hello) = Hello::decode(bytes, mode) else { return };
     let mut out = [0; 600];
     let length = hello.encode(mode, &mut out).expect("it is short");
@@ -112,6 +116,7 @@ fn datagram(bytes: &[u8]) {
     let Some((&kind, rest)) = bytes.split_first() else { return };
     let head = [&Mode::Plain.magic()[..], &[2, 1 + kind % 3, 2, 0], &FLEET.0.to_le_bytes()].concat();
     let bytes = [&head[..], rest].concat();
+    saw("datagram", "", &bytes);
     let mut out = [0; 1_000];
     match Datagram::decode(&bytes, FLEET, &Plain) {
         Ok(Datagram::WhoHas(mut search)) => {
@@ -129,6 +134,7 @@ fn datagram(bytes: &[u8]) {
 }
 
 fn message(bytes: &[u8]) {
+    ["message", "session_body", "attributes"].into_iter().for_each(|kind| saw(kind, "", bytes));
     let _ = (Frame::parse(bytes), SessionBody::decode(bytes), FailureDetails::of(bytes));
     if let Ok(attributes) = Attributes::decode(bytes) {
         assert_eq!(Attributes::decode(&attributes.encode()), Ok(attributes));

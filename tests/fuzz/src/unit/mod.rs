@@ -605,6 +605,7 @@ impl Unit {
 
     /// A datagram has come.
     pub(crate) fn datagram(&mut self, from: SocketAddrV4, bytes: &mut [u8]) {
+        crate::saw("datagram", "", bytes);
         let mode = self.mode();
         if let Some((LinkId(link), nonce, body)) = for_session(bytes, mode, FLEET)
             && self.links.get(usize::from(link)).is_some_and(Option::is_some)
