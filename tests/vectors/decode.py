@@ -278,6 +278,23 @@ def check_discovery(vectors):
     return wrong
 
 
+def check_lines():
+    """Reads what is on standard input, a vector without a name a line; prints a line for each that the core has read otherwise."""
+    count, wrong = 0, 0
+    for line in sys.stdin:
+        vector = json.loads(line)
+        try:
+            value = canonical(decode(vector["kind"], vector["context"], bytes.fromhex(vector["hex"]))).decode()
+        except Exception as error:  # pylint: disable=broad-except
+            value = repr(error)
+        count += 1
+        if value != canonical(vector["value"]).decode():
+            wrong += 1
+            print("%s %s: %s instead of %s" % (vector["kind"], vector["hex"], value, canonical(vector["value"]).decode()))
+    print("%d read, %d otherwise" % (count, wrong))
+    return 1 if wrong or not count else 0
+
+
 def main():
     begin = time.monotonic()
     document = json.loads((HERE / "vectors.json").read_text(encoding="utf-8"))
@@ -305,4 +322,4 @@ def main():
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(check_lines() if sys.argv[1:] == ["--lines"] else main())

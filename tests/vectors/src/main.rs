@@ -5,6 +5,8 @@
 //! `docs/wire.md`, reads the same file.
 
 mod answers;
+#[cfg(test)]
+mod corpora;
 mod decoded;
 mod introductions;
 mod membership;
