@@ -139,11 +139,14 @@ pub(super) fn all<T: Send + 'static>(
 ) -> Result<(), End> {
     let mut reported: HashMap<(Identity, String), Report<T>> = HashMap::new();
     let mut looked: Option<Instant> = None;
-    let mut own = OwnLog::of(system).ok().filter(|_| is_wanted(names, LOG));
+    let mut own = None;
     while !system.is_stopped() {
         if looked.is_none_or(|looked| looked.elapsed() >= JOINED) {
             looked = Some(Instant::now());
             subscribe(system, interval, names, &mut reported);
+            if own.is_none() && is_wanted(names, LOG) {
+                own = OwnLog::of(system).ok();
+            }
         }
         own.iter_mut().try_for_each(|own| own.report(sink))?;
         for Report { peer, definition, subscription } in reported.values_mut() {

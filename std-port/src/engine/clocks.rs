@@ -186,8 +186,13 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn measure_clock(&self, link: &Arc<LinkCell>) {
+        let Some(peer) = link.peer.get() else { return };
+        // The node has another link, or none, by now.
+        if !peer.link().is_some_and(|current| Arc::ptr_eq(&current, link)) {
+            return;
+        }
         let mut state = link.lock();
-        let (Some(mut watch), Some(peer)) = (state.clock.take(), link.peer.get()) else { return };
+        let Some(mut watch) = state.clock.take() else { return };
         if let Some(asked) = watch.asked.take() {
             let (mut answer, now) = (Parameters::new(), self.now());
             match self.take_ended(link, &mut state, asked.id, &mut answer) {
@@ -257,6 +262,7 @@ fn tells_clock(state: &LinkState) -> bool {
         is_it
             && results.next().is_none()
             && function.signature.arguments().next().is_none()
+            && function.signature.progress().next().is_none()
             && !moves
             && stream.is_none()
     })

@@ -217,8 +217,8 @@ impl Logs {
 trait Read {
     fn read(&mut self, bytes: &[u8], found: &mut Vec<Line>);
 
-    /// What comes next does not follow what came.
-    fn cut(&mut self);
+    /// What comes next does not follow what came; returns how many bytes had no end yet, and are lost.
+    fn cut(&mut self) -> u32;
 }
 
 impl Log {
@@ -231,9 +231,9 @@ impl Log {
             // After it was away, a board sends its last piece again.
             Some(fresh) => reader.read(fresh, &mut found),
             None => {
-                reader.cut();
+                let begun = reader.cut();
                 // One that begins anew, after its power was off, is behind, and has lost nothing that is known of.
-                found.extend((ahead <= u32::MAX / 2).then_some(Line::Lost(ahead)));
+                found.extend((ahead <= u32::MAX / 2).then(|| Line::Lost(ahead.saturating_add(begun))));
                 reader.read(piece, &mut found);
             }
         }
@@ -256,8 +256,8 @@ impl Read for Lines {
         }
     }
 
-    fn cut(&mut self) {
-        self.0.clear();
+    fn cut(&mut self) -> u32 {
+        std::mem::take(&mut self.0).len() as u32
     }
 }
 
@@ -438,13 +438,16 @@ mod frames {
                     Ok(Err(DecodeError::UnexpectedEof)) => return,
                     // The rest of a frame whose begin is lost, or another firmware's.
                     Ok(Err(DecodeError::Malformed)) if self.table.encoding().can_recover() => {}
-                    Ok(Err(DecodeError::Malformed)) | Err(_) => return self.cut(),
+                    Ok(Err(DecodeError::Malformed)) | Err(_) => {
+                        self.cut();
+                        return;
+                    }
                 }
             }
         }
 
-        fn cut(&mut self) {
-            *self = Self::new(self.table);
+        fn cut(&mut self) -> u32 {
+            std::mem::replace(self, Self::new(self.table)).waiting as u32
         }
     }
 }

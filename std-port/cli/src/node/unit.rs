@@ -257,7 +257,8 @@ impl Node {
             let (own, mut logs) = (system.identity().to_string(), Logs::default());
             execute(&system, &Question::Streams { interval_ms: BOXED_MS, names }, &mut |answer| {
                 // The box has its own log line by line.
-                if !matches!(&answer, Answer::Value { node, .. } if *node == own) {
+                if !matches!(&answer, Answer::Value { node, stream, .. } if *node == own && stream.starts_with("log("))
+                {
                     logs.events(answer).iter().for_each(|answer| black_box.take(answer));
                 }
                 ControlFlow::Continue(())
