@@ -361,9 +361,9 @@ impl Master {
         }
         let why = || "why".to_owned();
         let answer = match script.byte() {
-            ..0xD0 => Ok(()),
-            ..0xE0 => Err(Failure::Refused(why())),
-            ..0xF0 => Err(Failure::Stopped(why())),
+            0..0xD0 => Ok(()),
+            0xD0..0xE0 => Err(Failure::Refused(why())),
+            0xE0..0xF0 => Err(Failure::Stopped(why())),
             _ => Err(Failure::Lost(why())),
         };
         self.machine.answered(&command, answer, self.now);
