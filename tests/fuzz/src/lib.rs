@@ -5,7 +5,6 @@
 mod discovery;
 mod files;
 mod handshake;
-mod page;
 mod peer;
 mod play;
 mod said;
@@ -38,7 +37,6 @@ pub const TARGETS: &[Target] = &[
     Target { name: "unit", run: whole::run, longest: 200 },
     Target { name: "values", run: values::run, longest: 512 },
     Target { name: "files", run: files::run, longest: 400 },
-    Target { name: "page", run: page::run, longest: 300 },
     Target { name: "vda5050", run: vda5050::run, longest: 300 },
     Target { name: "serial", run: serial::run, longest: 400 },
 ];

@@ -333,6 +333,15 @@ mod tests {
     }
 
     #[test]
+    fn an_origin_that_is_no_text_is_not_one_that_is_absent() {
+        let token = bearer();
+        let mut all = headers(&[("host", "localhost"), ("authorization", &token)]);
+        assert_eq!(guard().check(&Method::GET, &all, true), Ok(()));
+        all.insert(header::ORIGIN, HeaderValue::from_bytes(b"http://\xff").unwrap());
+        assert_eq!(guard().check(&Method::GET, &all, true), Err(Refusal::Origin));
+    }
+
+    #[test]
     fn a_change_comes_from_the_page_itself() {
         let own = [
             ("host", "localhost:1"),
@@ -403,6 +412,7 @@ mod tests {
             "fleet.example",
             "ftp://fleet.example",
             "https://",
+            "https://:80",
             "https:///x",
             "https://a@b",
             "https://a:x",

@@ -7,8 +7,6 @@
 
 mod asking;
 mod door;
-#[doc(hidden)]
-pub mod entrance;
 mod form;
 mod guard;
 mod limits;
