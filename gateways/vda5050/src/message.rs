@@ -1,7 +1,7 @@
 //! The messages of VDA 5050 2.0 and 2.1 (clauses 6.4 to 6.15), as their schemas and the document have them, and those of 3.0.
 //!
 //! One set of structs serves all versions: 2.1 only adds members to 2.0, and what 3.0 calls otherwise is translated when a message is
-//! [`read`] or [written](write). Where a schema and its document differ, the document counts: 2.0's schemas have `allowedDeviationXy`
+//! [`read`] or [written](write()). Where a schema and its document differ, the document counts: 2.0's schemas have `allowedDeviationXy`
 //! and `actionName`, which are read and never written.
 // The members are the standard's, with its names and its meanings.
 #![allow(missing_docs)]

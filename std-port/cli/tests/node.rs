@@ -601,7 +601,9 @@ fn the_socket_is_there_while_the_node_runs() {
 #[test]
 fn sighup_takes_over_constraints_and_log_of_a_file_without_mistakes() {
     let mut node = Node::start(&format!("constraints.minimum_interval = 0\nlog.level = \"warn\"\n{SERVED}"));
-    let (_unit, manager) = node.vehicle("agv", 7);
+    let (unit, manager) = node.vehicle("agv", 7);
+    unit.my_function_list().add_clock().unwrap();
+    unit.publish_my_function_list().unwrap();
     let mut report = Parameters::new();
     report.add_string("text", 64).unwrap();
     let twice = || manager.request("report", &report).and_then(|_| manager.request("report", &report));
@@ -704,6 +706,7 @@ fn metrics_are_the_counters() {
     for _ in 0..5 {
         manager.block_request("report", &mut report).unwrap();
     }
+    until("its clock is measured", || scrape(address).contains("cara_clock_offset_seconds{"));
     let socket = node.control_socket();
     let before = counters(&socket);
     let answer = scrape(address);
