@@ -76,7 +76,7 @@ impl Snapshot {
             role: cell.identity.role().as_str(),
             connected: cell.is_connected(),
             readings: engine.accounts.of_peer(cell),
-            clock: cell.clock_offset(),
+            clock: cell.clock_offset(engine.now()),
         });
         Self { unit: unit.to_string(), uptime: engine.uptime(), peers: peers.collect(), readings: engine.readings() }
     }

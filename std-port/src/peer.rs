@@ -214,7 +214,7 @@ impl<T: Send + 'static> Peer<T> {
     /// How far the node's clock is from this manager's, while it is connected and where it [tells](crate::MyFunctionList::add_clock)
     /// that; `None` also at an s_unit, which does not ask. It is measured when the node has joined, and each minute.
     pub fn clock_offset(&self) -> Option<ClockOffset> {
-        self.cell.clock_offset()
+        self.cell.clock_offset(self.engine.now())
     }
 
     /// Hands this vehicle over to another manager while nothing of it moves: it leaves this one, and is back within about ten seconds

@@ -64,12 +64,12 @@ pub struct ClockOffset {
 pub(super) struct Measured {
     offset_us: i64,
     error: Duration,
-    at: std::time::Instant,
+    at: Instant,
 }
 
 impl Measured {
-    pub(super) fn offset(&self) -> ClockOffset {
-        ClockOffset { offset_us: self.offset_us, error: self.error, age: self.at.elapsed().into() }
+    pub(super) fn offset(&self, now: Instant) -> ClockOffset {
+        ClockOffset { offset_us: self.offset_us, error: self.error, age: now.since(self.at) }
     }
 }
 
@@ -135,7 +135,7 @@ impl ClockWatch {
         }
         self.best = error;
         let middle = asked.unix_us.saturating_add_unsigned(error.as_micros());
-        Some(Measured { offset_us: theirs.saturating_sub(middle), error, at: std::time::Instant::now() })
+        Some(Measured { offset_us: theirs.saturating_sub(middle), error, at: came })
     }
 
     fn ends(&mut self, now: Instant, few: u8) {
@@ -162,7 +162,17 @@ impl<T: Send + 'static> Engine<T> {
     /// A node's list has changed: a manager asks for its clock if it offers that.
     pub(super) fn look_for_clock(&self, link: &LinkCell) {
         let mut state = link.lock();
-        if state.clock.is_none() && tells_clock(&state) && self.hub.lock().identity().0.role() == Role::MUnit {
+        if !tells_clock(&state) {
+            // A call that is open ends by itself, and the watch with it.
+            if let Some(watch) = &mut state.clock {
+                watch.due = Instant::START;
+                drop(state);
+                self.clocks.set(link, Instant::START);
+                self.driver.wake_looker();
+            }
+            return;
+        }
+        if state.clock.is_none() && self.hub.lock().identity().0.role() == Role::MUnit {
             state.clock = Some(Box::default());
             drop(state);
             self.clocks.set(link, Instant::START);
@@ -223,6 +233,11 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn ask_clock(&self, link: &Arc<LinkCell>, state: &mut LinkState, watch: &mut ClockWatch) {
+        if !state.session.has_call_room() {
+            // Calls of the node wait unread, as a call of this unit would have them refused.
+            watch.due = self.now() + FULL;
+            return;
+        }
         let options =
             RequestOptions { timeout: Some(PATIENCE), priority: Some(Priority::Low), ..RequestOptions::new() };
         // A link that is kept is read by no thread until its caller is back.

@@ -11,7 +11,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::requests::CallId;
-use cara_core::time::Duration;
+use cara_core::time::{Duration, Instant};
 
 use super::clocks::{ClockOffset, Measured};
 use super::link::LinkCell;
@@ -134,9 +134,9 @@ impl PeerCell {
     }
 
     /// How far its clock is from this unit's, while it is connected and where it tells that.
-    pub(crate) fn clock_offset(&self) -> Option<ClockOffset> {
+    pub(crate) fn clock_offset(&self, now: Instant) -> Option<ClockOffset> {
         self.link()?;
-        lock(&self.clock).as_deref().map(Measured::offset)
+        lock(&self.clock).as_deref().map(|measured| measured.offset(now))
     }
 
     pub(super) fn set_clock(&self, measured: Option<Measured>) {

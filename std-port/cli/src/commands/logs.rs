@@ -1,6 +1,6 @@
 //! `cara logs`: the logs of units, as they come over their links.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -22,6 +22,8 @@ use cara_tools::units::{parse_time, show_time};
 const STREAM: &str = "log";
 /// What is kept of a line that has no end.
 const LONGEST: usize = 64 * 1024;
+/// Firmware that is looked for in vain, before no more is looked for.
+const MOST_WITHOUT: usize = 1024;
 
 /// Shows the logs of units, as they come: of boards that are built with the feature `logs`, of units on Linux that stream theirs,
 /// and of the manager itself. First comes what each has kept, a board also of its life before. Ctrl-C ends it.
@@ -163,6 +165,8 @@ pub(crate) struct Logs {
     decoding: Arc<Decoding>,
     /// By node.
     logs: HashMap<String, Log>,
+    /// Whose firmware was not found.
+    without: HashSet<(String, Option<u64>)>,
 }
 
 /// What a piece of a log brings.
@@ -174,7 +178,7 @@ enum Found {
 
 impl Logs {
     pub(super) fn new(decoding: Arc<Decoding>) -> Self {
-        Self { decoding, logs: HashMap::new() }
+        Self { decoding, ..Self::default() }
     }
 
     /// `None` if it is no piece of a log.
@@ -186,7 +190,16 @@ impl Logs {
         let Piece { at, build, bytes } = Piece::of(values)?;
         let mut why_not = None;
         if self.logs.get(node).is_none_or(|log| log.build != build) {
-            let reader = self.decoding.reader(build).map_err(|why| why_not = Some(why)).ok();
+            let whose = (node.clone(), build);
+            // A board that changes its build id with each piece is not looked for each time.
+            let reader = if self.without.contains(&whose) || self.without.len() >= MOST_WITHOUT {
+                None
+            } else {
+                self.decoding.reader(build).map_err(|why| why_not = Some(why)).ok()
+            };
+            if why_not.is_some() {
+                self.without.insert(whose);
+            }
             self.logs.insert(node.clone(), Log { build, next: None, reader });
         }
         let log = self.logs.get_mut(node).filter(|log| log.reader.is_some());

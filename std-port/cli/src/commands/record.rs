@@ -89,7 +89,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let changed = Changed::default();
     for question in questions {
         let (way, recorder, changed, decoding) = (way.clone(), recorder.clone(), changed.clone(), decoding.clone());
-        let follow = move || follow(&way, &recorder, question, Logs::new(decoding), &changed);
+        let follow = move || follow(&way, &recorder, question, &decoding, &changed);
         Builder::new().name("follow".into()).spawn(follow)?;
     }
     let (from, to) = (way.clone(), recorder.clone());
@@ -161,11 +161,12 @@ fn about(unit: &UnitInfo) -> BTreeMap<String, String> {
 type Changed = Arc<Mutex<HashSet<String>>>;
 
 /// Records the answers to a question that has no end, also after the manager was away.
-fn follow(way: &Way, recorder: &Recorder, mut question: Question, mut logs: Logs, changed: &Changed) {
+fn follow(way: &Way, recorder: &Recorder, mut question: Question, decoding: &Arc<Decoding>, changed: &Changed) {
     let is_streams = matches!(question, Question::Streams { .. });
     let mut is_warned = false;
     loop {
-        let mut is_followed = false;
+        // The manager may be another life of the one before, whose log begins anew.
+        let (mut is_followed, mut logs) = (false, Logs::new(decoding.clone()));
         let ended = way.open().and_then(|mut operator| {
             operator.watch(&question, None, |answer| {
                 is_followed = true;
