@@ -1,7 +1,7 @@
 //! The client: finds the socket of a running unit, asks, and reads the answers.
 
 use std::fmt;
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::net::Shutdown;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
@@ -21,6 +21,8 @@ const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
 /// A unit that has answered nothing for so long is looked at, and after growing pauses again.
 const FIRST_LOOK: Duration = Duration::from_secs(2);
 const LONGEST_LOOK: Duration = Duration::from_secs(30);
+/// A unit that takes none of a question's bytes for so long hangs.
+const ASKING: Duration = Duration::from_secs(5);
 /// Between two looks at a queue of connections that is full.
 const DIAL_PAUSE: Duration = Duration::from_millis(20);
 
@@ -237,12 +239,10 @@ fn look(path: &Path) -> Option<RunningUnit> {
 /// # Ok::<(), cara_std::control::ControlError>(())
 /// ```
 pub struct Client {
-    lines: Lines<UnixStream>,
+    lines: Lines<Connection>,
     unit: RunningUnit,
     /// Answers to the last question may still come.
     open: bool,
-    /// When the last sign of life was sent, for a question that needs them.
-    beaten: Option<Instant>,
     /// Heartbeats are those of [`Closer::beat`] alone.
     leaves_beats: bool,
 }
@@ -274,11 +274,12 @@ impl Client {
             return Err(ControlError::NotAllowed { path: path.to_owned(), reason });
         }
         stream.set_read_timeout(Some(HELLO_TIMEOUT))?;
-        let mut lines = Lines::new(stream);
+        stream.set_write_timeout(Some(ASKING))?;
+        let mut lines = Lines::new(Connection { stream, path: path.to_owned(), is_asked: false, beaten: None });
         let (unit, fleet, state) = hello(&mut lines).map_err(|error| refused(path, error))?;
-        lines.source().set_read_timeout(None)?;
+        lines.source().stream.set_read_timeout(None)?;
         let unit = RunningUnit { unit, fleet, path: path.to_owned(), state };
-        Ok(Self { lines, unit, open: false, beaten: None, leaves_beats: false })
+        Ok(Self { lines, unit, open: false, leaves_beats: false })
     }
 
     /// Connects to the only unit that runs, or to the one that is meant by `NAME/ID` or `NAME`.
@@ -313,7 +314,7 @@ impl Client {
 
     /// A handle with which another thread closes the connection while answers are waited for. What was held is released.
     pub fn closer(&self) -> io::Result<Closer> {
-        self.lines.source().try_clone().map(Closer)
+        self.lines.source().stream.try_clone().map(Closer)
     }
 
     /// Sends no heartbeat by itself from here on: the program passes on those of the client it asks for, with
@@ -336,47 +337,86 @@ impl Client {
         }
         let mut line = serde_json::to_vec(question).map_err(io::Error::from)?;
         line.push(b'\n');
-        self.lines.source().write_all(&line)?;
+        let beaten = (question.needs_beats() && !self.leaves_beats).then(Instant::now);
+        let connection = self.lines.source_mut();
+        (connection.is_asked, connection.beaten) = (true, beaten);
+        if let Err(error) = connection.stream.write_all(&line) {
+            // Part of the question may be there: nothing can follow it.
+            let _ = connection.stream.shutdown(Shutdown::Both);
+            return Err(self.broken(error.into()));
+        }
         self.open = true;
-        self.beaten = (question.needs_beats() && !self.leaves_beats).then(Instant::now);
         Ok(Answers { client: self })
     }
 
-    /// Sends heartbeats, if they are due, until an answer arrives. An error where the unit hangs: its answer never comes.
-    fn await_answer(&mut self) -> Result<(), ControlError> {
-        let mut look = Look::new();
-        while !self.lines.has_more() {
-            let mut left = look.due.saturating_duration_since(Instant::now());
-            if let Some(beaten) = self.beaten {
-                left = left.min(BEAT.saturating_sub(beaten.elapsed()));
-            }
-            // What is wrong with the connection is told when it is read.
-            if wait_readable(self.lines.source().as_fd(), left.into()).unwrap_or(true) {
-                return Ok(());
-            }
-            if self.beaten.is_some_and(|beaten| beaten.elapsed() >= BEAT) {
-                let _ = self.lines.source().write_all(b"\n");
-                self.beaten = Some(Instant::now());
-            }
-            if look.due <= Instant::now() && look.finds_silence(self.lines.source(), &self.unit.path) {
-                self.open = false;
-                let RunningUnit { unit, path, .. } = self.unit.clone();
-                return Err(ControlError::Silent { unit, path });
-            }
-        }
-        Ok(())
-    }
-
     fn next_answer(&mut self) -> Result<Option<Answer>, ControlError> {
-        self.await_answer()?;
         let answer = read(&mut self.lines);
         self.open = matches!(answer, Ok(ref answer) if !matches!(answer, Answer::Done | Answer::Failed(_)));
-        match answer? {
+        match answer.map_err(|error| self.broken(error))? {
             Answer::Done => Ok(None),
             Answer::Failed(failure) => Err(ControlError::Failed(failure)),
             answer => Ok(Some(answer)),
         }
     }
+
+    /// What it means that the unit took or gave no more bytes.
+    fn broken(&self, error: ControlError) -> ControlError {
+        match error {
+            ControlError::Broken(error) if is_silence(&error) => {
+                let RunningUnit { unit, path, .. } = self.unit.clone();
+                ControlError::Silent { unit, path }
+            }
+            error => error,
+        }
+    }
+}
+
+/// The stream to a unit. Once that has been asked, each read waits for bytes for as long as the unit lives: it may hang within
+/// a line of its answer.
+struct Connection {
+    stream: UnixStream,
+    path: PathBuf,
+    is_asked: bool,
+    /// When the last sign of life was sent, for a question that needs them.
+    beaten: Option<Instant>,
+}
+
+impl Read for Connection {
+    fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        if self.is_asked {
+            self.await_bytes()?;
+        }
+        self.stream.read(bytes)
+    }
+}
+
+impl Connection {
+    /// Sends heartbeats, if they are due, until bytes arrive. [`io::ErrorKind::TimedOut`] if the unit hangs.
+    fn await_bytes(&mut self) -> io::Result<()> {
+        let mut look = Look::new();
+        loop {
+            let mut left = look.due.saturating_duration_since(Instant::now());
+            if let Some(beaten) = self.beaten {
+                left = left.min(BEAT.saturating_sub(beaten.elapsed()));
+            }
+            // The read reports what is wrong with the connection.
+            if wait_readable(self.stream.as_fd(), left.into()).unwrap_or(true) {
+                return Ok(());
+            }
+            if self.beaten.is_some_and(|beaten| beaten.elapsed() >= BEAT) {
+                beat(&self.stream);
+                self.beaten = Some(Instant::now());
+            }
+            if look.due <= Instant::now() && look.finds_silence(&self.stream, &self.path) {
+                return Err(io::ErrorKind::TimedOut.into());
+            }
+        }
+    }
+}
+
+/// Waits for nothing: a unit that does not read loses the heartbeat.
+fn beat(stream: &UnixStream) {
+    let _ = rustix::net::send(stream, b"\n", SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
 }
 
 /// Looks now and then, on a connection of its own, whether a unit that has not answered for a while still introduces itself.
@@ -438,7 +478,7 @@ impl Closer {
     /// Sends the heartbeat of a client whose call this connection holds. It waits for nothing: a unit that does not read loses
     /// it, as the connection's end.
     pub fn beat(&self) {
-        let _ = rustix::net::send(&self.0, b"\n", SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+        beat(&self.0);
     }
 }
 
@@ -482,15 +522,17 @@ fn refused(path: &Path, error: ControlError) -> ControlError {
         ControlError::Failed(failure) if failure.error == "NotAllowed" => {
             ControlError::NotAllowed { path: path.to_owned(), reason: failure.text }
         }
-        ControlError::Broken(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
-            ControlError::Silent { unit, path: path.to_owned() }
-        }
+        ControlError::Broken(error) if is_silence(&error) => ControlError::Silent { unit, path: path.to_owned() },
         error => error,
     }
 }
 
+fn is_silence(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
+}
+
 /// The unit's `NAME/ID` and fleet, and whether it can be asked.
-fn hello(lines: &mut Lines<UnixStream>) -> Result<(String, u32, UnitState), ControlError> {
+fn hello(lines: &mut Lines<Connection>) -> Result<(String, u32, UnitState), ControlError> {
     match read(lines)? {
         Answer::Hello { control_version: CONTROL_VERSION, unit, fleet, full: is_full } => {
             Ok((unit, fleet, if is_full { UnitState::Full(full().text) } else { UnitState::Answers }))
@@ -501,7 +543,7 @@ fn hello(lines: &mut Lines<UnixStream>) -> Result<(String, u32, UnitState), Cont
     }
 }
 
-fn read(lines: &mut Lines<UnixStream>) -> Result<Answer, ControlError> {
+fn read(lines: &mut Lines<Connection>) -> Result<Answer, ControlError> {
     match lines.next()? {
         Some(Line::Text(text)) => Ok(serde_json::from_slice(text).map_err(io::Error::from)?),
         Some(Line::TooLong) => Err(io::Error::new(io::ErrorKind::InvalidData, "an answer was too long").into()),

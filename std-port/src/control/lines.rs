@@ -31,6 +31,10 @@ impl<R: Read> Lines<R> {
         self.reader.get_ref()
     }
 
+    pub(super) fn source_mut(&mut self) -> &mut R {
+        self.reader.get_mut()
+    }
+
     /// Whether something has been read that is in no line yet.
     pub(super) fn has_more(&self) -> bool {
         !self.reader.buffer().is_empty()

@@ -2,9 +2,10 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
+use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use cara_std::control::protocol::{Answer, ArgumentValue, LONGEST_LINE, Question};
+use cara_std::control::protocol::{Answer, ArgumentValue, CONTROL_VERSION, LONGEST_LINE, Question};
 use cara_std::control::{Client, Control, ControlError, RunningUnit, UnitState, running_in};
 
 use crate::support::{Depot, PATIENCE, ask, call, manager, until};
@@ -282,6 +283,44 @@ fn a_unit_that_takes_no_connection_is_said_to_stand_still() {
     match Client::find_in(directory.path(), Some("m_1")) {
         Err(error @ ControlError::Silent { .. }) => assert!(error.to_string().contains("restart it"), "{error}"),
         other => panic!("{:?}", other.err()),
+    }
+}
+
+/// One that introduces itself, takes a question, answers with each beginning of `answer` on a connection of its own, and then
+/// stands still: it accepts nothing more and closes nothing.
+#[test]
+fn a_question_ends_whatever_part_of_the_answer_came_before_the_unit_hung() {
+    let answer = b"{\"answer\":\"done\"}\n";
+    let directory = crate::support::directory();
+    let path = directory.path().join("m_1-7-3.sock");
+    let listener = UnixListener::bind(&path).unwrap();
+    let hello =
+        format!("{{\"answer\":\"hello\",\"control_version\":{CONTROL_VERSION},\"unit\":\"m_1/7\",\"fleet\":3}}\n");
+    // Before the first question: who asks looks at the unit again on a connection of its own.
+    let connected: Vec<_> = (0..answer.len())
+        .map(|_| {
+            let path = path.clone();
+            let client = std::thread::spawn(move || Client::connect(&path).unwrap());
+            let mut stream = listener.accept().unwrap().0;
+            stream.write_all(hello.as_bytes()).unwrap();
+            (client.join().unwrap(), stream)
+        })
+        .collect();
+    let (ended, outcomes) = channel();
+    let mut streams = Vec::new();
+    for (length, (mut client, mut stream)) in connected.into_iter().enumerate() {
+        let ended = ended.clone();
+        std::thread::spawn(move || {
+            let outcome = client.ask(&Question::Search).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+            let _ = ended.send((length, outcome));
+        });
+        BufReader::new(&stream).read_line(&mut String::new()).unwrap();
+        stream.write_all(&answer[..length]).unwrap();
+        streams.push(stream);
+    }
+    for _ in &streams {
+        let (length, outcome) = outcomes.recv_timeout(PATIENCE).expect("each question ends");
+        assert!(matches!(outcome, Err(ControlError::Silent { .. })), "after {length} bytes: {outcome:?}");
     }
 }
 

@@ -214,7 +214,21 @@ async fn managers(browser: &Browser, stage: &Stage) -> Result<()> {
     let name = r"<img src=x onerror=alert(1)>\\u{202e}/9";
     browser.wait("a manager that hangs is not known", &has(name, "not known", "not asked: ")).await?;
     browser.wait("nothing becomes markup", "!document.querySelector('#managers img, #managers-remarks img')").await?;
-    browser.says("#managers-remarks", "S_units that have joined are silent").await
+    browser.says("#managers-remarks", "S_units that have joined are silent").await?;
+    // That there is an earlier answer hides neither that they are asked again, nor that this failed.
+    browser.click("#managers-look").await?;
+    let about = "document.querySelector('#managers-about').innerText";
+    let both = |text: &str| format!("{about}.includes('{text}') && / looked .* ago/.test({about})");
+    browser.wait("managers are asked again", &both("listens for")).await?;
+    browser.wait("they have answered", "!document.querySelector('#managers-look').disabled").await?;
+    let cut = "window.reaches = fetch; \
+               window.fetch = (path, how) => path === 'api/managers' ? Promise.reject(new Error('cut')) : reaches(path, how)";
+    browser.run(cut).await?;
+    browser.click("#managers-look").await?;
+    browser.wait("a failure is told beside what was found before", &both("not reached: cut")).await?;
+    browser.run("window.fetch = window.reaches").await?;
+    browser.click("#managers-look").await?;
+    browser.wait("an answer ends it", &format!("{about}.startsWith('looked ')")).await
 }
 
 /// Opens the form of a function of the chosen node. How it is found from then on.

@@ -1,12 +1,17 @@
 //! `cara stop` and `cara reset`: the functions with that attribute, of one node or of all.
 
-use std::io::ErrorKind;
+use std::collections::BTreeSet;
+use std::fmt;
+use std::io::{self, ErrorKind};
+use std::mem;
 use std::process::ExitCode;
+use std::sync::mpsc::{Sender, channel};
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Failure, Question};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::nodes;
 use crate::operator::{Need, Operator};
@@ -62,9 +67,10 @@ impl Of {
 
 pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCode> {
     of.check("stop")?;
+    let mut rounds = Rounds::begin(of, global);
     let (mut until, mut answered) = (None, None);
-    loop {
-        let ended = run(&of, Operator::open_to_stop, |node| Question::Stop { node }, global);
+    let ended = loop {
+        let ended = rounds.next(Operator::open_to_stop, |node| Question::Stop { node });
         if until.is_none()
             && let Err(error) = &ended
             && let Some(span) = is_asked_again_for(error)
@@ -72,17 +78,22 @@ pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCod
             until = Some(Instant::now() + span);
             if !global.json {
                 let span = span.as_secs();
-                output::warning(format_args!("{error:#}. Asking again for {span} s, should a standby take over"));
+                let text = format!("{error:#}. Asking again for {span} s, should a standby take over");
+                rounds.write(move || {
+                    output::warning(text);
+                    Ok(())
+                });
             }
         }
         if let (Ok(Exit::Failed), Some(end)) = (&ended, &mut until) {
             *end = *answered.get_or_insert_with(|| (Instant::now() + JOINING).min(*end));
         }
         if matches!(ended, Ok(Exit::Done)) || until.is_none_or(|until| until < Instant::now()) {
-            return ended.map(Into::into);
+            break ended;
         }
-        std::thread::sleep(PAUSE);
-    }
+        thread::sleep(PAUSE);
+    };
+    rounds.end(ended)
 }
 
 /// How long a standby may take over from the manager that is missed, if one is.
@@ -96,42 +107,107 @@ fn is_asked_again_for(error: &anyhow::Error) -> Option<Duration> {
 
 pub(crate) fn reset(Reset { of }: Reset, global: &Global) -> anyhow::Result<ExitCode> {
     of.check("reset")?;
-    run(&of, Operator::open, |node| Question::Reset { node }, global).map(Into::into)
+    let mut rounds = Rounds::begin(of, global);
+    let ended = rounds.next(Operator::open, |node| Question::Reset { node });
+    rounds.end(ended)
 }
 
-fn run(
-    of: &Of,
-    open: fn(&Global, &Need<'_>) -> anyhow::Result<Operator>,
-    question: impl FnOnce(Option<String>) -> Question,
-    global: &Global,
-) -> anyhow::Result<Exit> {
-    let need = of.node.as_deref().map_or(Need::Everybody, Need::Node);
-    let mut operator = open(global, &need)?;
-    let node = match &of.node {
-        Some(node) => Some(nodes::known(&mut operator, node)?.selector),
-        None => None,
-    };
-    let mut sum = Sum::default();
-    let mut unshown = None;
-    let asked = operator.ask(&question(node), |answer| {
-        let Answer::Called { node, id, error, took_us, .. } = answer else { return Ok(()) };
-        let node = format!("{node}/{id}");
-        // An output that takes nothing ends no stop, and hides nothing of it.
-        unshown = unshown.take().or(show(&node, error.as_ref(), took_us, global).err());
-        sum.add(node, error.is_none().then_some(took_us));
-        Ok(())
-    });
-    if asked.is_ok() && sum.nodes == 0 {
-        return Err(Ended::failed("NoNodes", format!("no s_unit is known{}: nothing was called", operator.waited())));
+/// What is written, in turn.
+type Writing = Box<dyn FnOnce() -> io::Result<()> + Send>;
+
+/// The question, until all have acknowledged it. Each round asks all of them again: a vehicle that has acknowledged may have started
+/// anew since. A thread of its own writes what comes of it: an output that takes nothing holds up no round, and ends no stop.
+struct Rounds<'g> {
+    of: Of,
+    global: &'g Global,
+    sum: Sum,
+    /// Those whose acknowledgement has been written.
+    shown: BTreeSet<String>,
+    lines: Sender<Writing>,
+    /// Ends with the first error of the output.
+    writer: io::Result<JoinHandle<io::Result<()>>>,
+}
+
+impl<'g> Rounds<'g> {
+    fn begin(of: Of, global: &'g Global) -> Self {
+        let (lines, writings) = channel::<Writing>();
+        let write = move || {
+            let mut ended = Ok(());
+            for writing in writings {
+                let written = writing();
+                ended = ended.and(written);
+            }
+            ended
+        };
+        let writer = thread::Builder::new().spawn(write);
+        Self { of, global, sum: Sum::default(), shown: BTreeSet::new(), lines, writer }
     }
-    // A reader that has gone is no error: the exit code says the same.
-    unshown = unshown.or(sum.show(global).err()).filter(|error| error.kind() != ErrorKind::BrokenPipe);
-    let unshown = unshown.map(|error| format!("standard output: {error}; {sum}"));
-    match (asked, unshown) {
-        (Ok(()), None) => Ok(if sum.missing.is_empty() { Exit::Done } else { Exit::Failed }),
-        (Ok(()), Some(text)) => Err(Ended::failed("Output", text)),
-        (Err(error), None) if sum.nodes == 0 => Err(error),
-        (Err(error), text) => Err(error.context(text.unwrap_or_else(|| sum.to_string()))),
+
+    fn next(
+        &mut self,
+        open: fn(&Global, &Need<'_>) -> anyhow::Result<Operator>,
+        question: impl FnOnce(Option<String>) -> Question,
+    ) -> anyhow::Result<Exit> {
+        let need = self.of.node.as_deref().map_or(Need::Everybody, Need::Node);
+        let mut operator = open(self.global, &need)?;
+        let node = match &self.of.node {
+            Some(node) => Some(nodes::known(&mut operator, node)?.selector),
+            None => None,
+        };
+        let asked = self.ask(&mut operator, &question(node));
+        let sum = &self.sum;
+        if sum.nodes == 0 {
+            asked?;
+            let text = format!("no s_unit is known{}: nothing was called", operator.waited());
+            return Err(Ended::failed("NoNodes", text));
+        }
+        let (json, text, object) = (self.global.json, sum.to_string(), sum.to_json());
+        self.write(move || if json { output::object(&object) } else { output::line(text) });
+        match asked {
+            Err(error) if self.of.all || !sum.missing.is_empty() => Err(error.context(sum.to_string())),
+            _ => Ok(if sum.missing.is_empty() { Exit::Done } else { Exit::Failed }),
+        }
+    }
+
+    fn ask(&mut self, operator: &mut Operator, question: &Question) -> anyhow::Result<()> {
+        let Self { sum, shown, lines, global, .. } = self;
+        let earlier = mem::take(sum);
+        let (json, mut acknowledged) = (global.json, BTreeSet::new());
+        let asked = operator.ask(question, |answer| {
+            let Answer::Called { node, id, error, took_us, .. } = answer else { return Ok(()) };
+            let node = format!("{node}/{id}");
+            sum.add(&node, error.is_none(), took_us);
+            if error.is_none() {
+                acknowledged.insert(node.clone());
+            }
+            if error.is_some() || shown.insert(node.clone()) {
+                let _ = lines.send(Box::new(move || show(&node, error.as_ref(), took_us, json)));
+            }
+            Ok(())
+        });
+        sum.carry(earlier, &acknowledged);
+        asked
+    }
+
+    fn write(&self, writing: impl FnOnce() -> io::Result<()> + Send + 'static) {
+        // `end` says why there is no writer.
+        let _ = self.lines.send(Box::new(writing));
+    }
+
+    /// Waits for the output.
+    fn end(self, ended: anyhow::Result<Exit>) -> anyhow::Result<ExitCode> {
+        let Self { sum, lines, writer, .. } = self;
+        drop(lines);
+        let written =
+            writer.and_then(|writer| writer.join().unwrap_or_else(|_| Err(io::Error::other("its thread has ended"))));
+        // A reader that has gone is no error: the exit code says the same.
+        let unshown = written.err().filter(|error| error.kind() != ErrorKind::BrokenPipe);
+        let unshown = unshown.map(|error| format!("standard output: {error}; {sum}"));
+        match (ended, unshown) {
+            (ended, None) => ended.map(Into::into),
+            (Ok(_), Some(text)) => Err(Ended::failed("Output", text)),
+            (Err(error), Some(text)) => Err(error.context(text)),
+        }
     }
 }
 
@@ -139,55 +215,84 @@ fn run(
 #[derive(Default)]
 struct Sum {
     nodes: usize,
-    /// Those that have not acknowledged.
-    missing: Vec<String>,
+    /// How many of them.
+    acknowledged: usize,
+    missing: BTreeSet<String>,
     last_us: Option<u64>,
 }
 
 impl Sum {
-    fn add(&mut self, node: String, acknowledged_us: Option<u64>) {
+    fn add(&mut self, node: &str, has_acknowledged: bool, took_us: u64) {
         self.nodes += 1;
-        match acknowledged_us {
-            Some(took_us) => self.last_us = self.last_us.max(Some(took_us)),
-            None => self.missing.push(node),
+        if has_acknowledged {
+            self.acknowledged += 1;
+            self.last_us = self.last_us.max(Some(took_us));
+        } else {
+            self.missing.insert(node.to_owned());
         }
     }
 
-    fn acknowledged(&self) -> usize {
-        self.nodes - self.missing.len()
+    /// Who was missing in an earlier round is missing until it has acknowledged: whoever took over may not know it yet.
+    fn carry(&mut self, earlier: Self, acknowledged: &BTreeSet<String>) {
+        for node in earlier.missing {
+            if !acknowledged.contains(&node) && self.missing.insert(node) {
+                self.nodes += 1;
+            }
+        }
     }
 
-    fn show(&self, global: &Global) -> std::io::Result<()> {
-        let Self { nodes, missing, last_us } = self;
-        match global.json {
-            false => output::line(self),
-            true => output::object(&json!({
-                "nodes": nodes, "acknowledged": self.acknowledged(), "last_us": last_us, "missing": missing,
-            })),
-        }
+    fn to_json(&self) -> Value {
+        let Self { nodes, acknowledged, missing, last_us } = self;
+        json!({ "nodes": nodes, "acknowledged": acknowledged, "last_us": last_us, "missing": missing })
     }
 }
 
-impl std::fmt::Display for Sum {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} of {} acknowledged", self.acknowledged(), self.nodes)?;
+impl fmt::Display for Sum {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} of {} acknowledged", self.acknowledged, self.nodes)?;
         if let Some(last) = self.last_us {
             write!(f, ", the last after {}", show_micros(last as f64))?;
         }
         if !self.missing.is_empty() {
-            write!(f, "; not acknowledged: {}", Shown(&self.missing.join(", ")))?;
+            write!(
+                f,
+                "; not acknowledged: {}",
+                Shown(&self.missing.iter().map(String::as_str).collect::<Vec<_>>().join(", "))
+            )?;
         }
         Ok(())
     }
 }
 
-fn show(node: &str, error: Option<&Failure>, took_us: u64, global: &Global) -> std::io::Result<()> {
+fn show(node: &str, error: Option<&Failure>, took_us: u64, json: bool) -> io::Result<()> {
     match error {
-        _ if global.json => output::object(&json!({ "node": node, "error": error, "took_us": took_us })),
+        _ if json => output::object(&json!({ "node": node, "error": error, "took_us": took_us })),
         None => output::line(format_args!("{node}  acknowledged after {}", show_micros(took_us as f64))),
         Some(Failure { error, text, .. }) => {
             let what = if error == "NotConnected" { "not reached" } else { error };
             output::line(format_args!("{BAD}{node}: {what}:{BAD:#} {}", Shown(text)))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_was_missing_stays_so_until_it_has_acknowledged() {
+        let round = |earlier, answers: &[(&str, bool)]| {
+            let mut sum = Sum::default();
+            answers.iter().for_each(|(node, has)| sum.add(node, *has, 7));
+            let acknowledged = answers.iter().filter(|(_, has)| *has).map(|(node, _)| (*node).to_owned()).collect();
+            sum.carry(earlier, &acknowledged);
+            sum
+        };
+        let first = round(Sum::default(), &[("agv/7", true), ("lift/8", false)]);
+        let second = round(first, &[("agv/7", true)]);
+        assert_eq!(second.to_string(), "1 of 2 acknowledged, the last after 7 us; not acknowledged: lift/8");
+        let third = round(second, &[("agv/7", false), ("lift/8", true)]);
+        assert_eq!(third.to_string(), "1 of 2 acknowledged, the last after 7 us; not acknowledged: agv/7");
+        assert!(round(third, &[("agv/7", true), ("lift/8", true)]).missing.is_empty());
     }
 }

@@ -170,7 +170,8 @@ fn log_event(event: UnitEvent, address: Option<SocketAddr>) {
             tracing::warn!(node = %peer, skipped, "it has no room for some of this node's functions");
         }
         UnitEvent::LeaseExpired { peer, function } => tracing::warn!(node = %peer, function, "lease expired"),
-        UnitEvent::StandsBy { by } => tracing::warn!(by = by.map(tracing::field::display), "stands by"),
+        UnitEvent::StandsBy { by: None } => tracing::info!("stands by"),
+        UnitEvent::StandsBy { by: Some(by) } => tracing::warn!(%by, "stands by"),
         event => tracing::debug!(?event, "event"),
     }
 }

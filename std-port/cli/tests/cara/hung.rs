@@ -1,16 +1,19 @@
 //! A disk, a terminal or a pipe that takes nothing more holds up neither the end of what an operator holds nor a stop.
 
 use std::fs::File;
-use std::io::{ErrorKind, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::channel;
 
 use cara_std::{Definition, LeaseWatch, ParametersView, Served, ServiceError, ServiceOptions, Unit};
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 
-use crate::support::{Running, Stage, until};
+use crate::support::{PATIENCE, Running, Stage, until};
 
 const LEASE: std::time::Duration = std::time::Duration::from_millis(1_200);
 
@@ -108,4 +111,46 @@ fn a_log_that_nobody_reads_holds_nothing_up() {
     stage.adopt_manager(&mut command);
     Vehicle::start(&stage).is_let_go_and_stopped(&stage);
     drop(unread);
+}
+
+/// A manager by hand, which ends when the first of two vehicles has acknowledged, and is there again. Its operator's terminal
+/// takes nothing before the second round has been answered.
+#[test]
+fn a_later_round_of_a_stop_calls_all_again_and_waits_for_no_output() {
+    let stage = Stage::empty();
+    let path = stage.control().join("m_1-1-3.sock");
+    let listener = UnixListener::bind(&path).unwrap();
+    let (mut output, unread) = std::io::pipe().unwrap();
+    let unread = File::from(OwnedFd::from(unread));
+    fill(&unread);
+    let mut command = stage.command(&["stop", "--all", "--socket", path.to_str().unwrap()]);
+    let mut stopping = command.stdout(unread.try_clone().unwrap()).stderr(unread).spawn().unwrap();
+    drop(command);
+    let called = |node: &str, id: u32| {
+        format!(
+            "{{\"answer\":\"called\",\"node\":\"{node}\",\"id\":{id},\"results\":[],\"call\":null,\"error\":null,\"took_us\":400,\
+             \"functions\":[\"halt\"]}}\n"
+        )
+    };
+    let first = called("agv", 7);
+    let second = called("agv", 7) + &called("lift", 8) + "{\"answer\":\"done\"}\n";
+    let (asked, questions) = channel();
+    std::thread::spawn(move || {
+        for answers in [first, second] {
+            let mut stream = listener.accept().unwrap().0;
+            stream.write_all(b"{\"answer\":\"hello\",\"control_version\":2,\"unit\":\"m_1/1\",\"fleet\":3}\n").unwrap();
+            let mut question = String::new();
+            BufReader::new(&stream).read_line(&mut question).unwrap();
+            stream.write_all(answers.as_bytes()).unwrap();
+            let _ = asked.send(question);
+        }
+    });
+    let next = || questions.recv_timeout(PATIENCE).expect("it is asked though nothing is read");
+    let first = next();
+    assert_eq!(next(), first, "agv/7 may have started anew");
+    let mut text = String::new();
+    output.read_to_string(&mut text).unwrap();
+    assert_eq!(stopping.wait().unwrap().code(), Some(0), "{text}");
+    assert_eq!(text.matches("agv/7  acknowledged after").count(), 1, "{text}");
+    assert!(text.contains("lift/8  acknowledged after") && text.contains("2 of 2 acknowledged"), "{text}");
 }

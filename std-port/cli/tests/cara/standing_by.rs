@@ -73,6 +73,7 @@ fn whichever_commands_is_asked() {
     until("it commands", || host.is_led_above(0));
     let mut second = host.start(1);
     until("the other one waits", || host.says(1, "stands by"));
+    assert!(!host.says(1, "WARN"), "that is in order");
     host.stage.ends(0, &["ping", "agv-1", "--count", "1", "--timeout", "20s"]);
     let term = host.vehicle.claim().term;
     first.freeze();

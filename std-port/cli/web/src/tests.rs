@@ -296,7 +296,7 @@ fn other_sites_and_strangers_are_refused_and_counted() {
     assert!(stage.asked.try_recv().is_err(), "none of it came to the unit");
     let right = stop(&[]);
     assert!(starts(&right, 200) && right.contains("\"error\":\"NoStop\""), "a stop that fails says so: {right}");
-    assert!(matches!(stage.asked.recv_timeout(PATIENCE), Ok(Question::Stop { node: None })));
+    assert!(matches!(stage.asked.recv_timeout(PATIENCE), Ok(Question::Stop { node: None, .. })));
     stage.follow(|message| {
         let Some(limits) = message["limits"]["rows"][""].as_array() else { return false };
         let refused = |what: &str| {
@@ -333,7 +333,7 @@ fn the_manager_is_told_who_asks_and_every_user_may_stop() {
         let is_told = || assert_eq!(asked(), Question::As { name: name.to_owned(), role });
         post("/api/stop", &json!({ "node": null }));
         is_told();
-        assert!(matches!(asked(), Question::Stop { node: None }));
+        assert!(matches!(asked(), Question::Stop { node: None, .. }));
         post("/api/reset", &json!({ "node": "agv/1" }));
         is_told();
         assert!(matches!(asked(), Question::Reset { .. }));

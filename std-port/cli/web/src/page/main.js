@@ -7,7 +7,7 @@ import * as charts from "./charts.js";
 import * as map from "./map.js";
 import * as nodes from "./nodes.js";
 import * as stop from "./stop.js";
-import { may, ROLES, state, take, trouble } from "./state.js";
+import { may, now, ROLES, state, take, trouble } from "./state.js";
 
 // Between two attempts to reach the server again.
 const RETRY = 1000;
@@ -20,6 +20,9 @@ const SILENT = 5000;
 const HIDDEN = 10000;
 // Between two attempts whether a stop would pass. They keep a connection open that has shown the token.
 const PREPARE = 10000;
+
+// The buttons of surveys of the network, and where it is told of them.
+const SURVEYS = [["doctor", "doctor-about"], ["managers-look", "managers-about"]];
 
 const wait = (ms) => new Promise((go) => setTimeout(go, ms));
 let connection = new AbortController();
@@ -110,7 +113,7 @@ function drawLink() {
   flag($("link"), "good", !wrong && state.heard !== null);
   $("me").hidden = !state.me?.name;
   if (state.me?.name) text($("me"), `${state.me.name} ${ROLES[state.me.role] ?? state.me.role}`);
-  for (const button of ["doctor", "managers-look"]) $(button).disabled = surveys.has(button) || !may("see");
+  for (const [button, about] of SURVEYS) $(button).disabled = state.surveys[about]?.runs || !may("see");
   const unit = state.unit[""];
   if (unit) {
     text($("unit"), `${unit.name}/${unit.id}`);
@@ -155,12 +158,9 @@ function keyboard(event) {
   }
 }
 
-// Surveys of the network that this page has asked for, by their buttons.
-const surveys = new Set();
-async function survey(button, about, path, seconds) {
-  surveys.add(button);
-  $(button).disabled = true;
-  text($(about), `listens for ${seconds} s …`);
+async function survey(about, path, seconds) {
+  if (state.surveys[about]?.runs) return;
+  state.surveys[about] = { text: `listens for ${seconds} s …`, runs: true };
   let failure = null;
   try {
     for await (const line of api.ask(path, {})) {
@@ -169,8 +169,7 @@ async function survey(button, about, path, seconds) {
   } catch (error) {
     failure = `not reached: ${error.message}`;
   }
-  if (failure) text($(about), failure);
-  surveys.delete(button);
+  state.surveys[about] = failure && { text: failure, runs: false, at: now() };
 }
 
 api.token();
@@ -186,8 +185,8 @@ $("confirm-no").onclick = () => $("confirm").close();
 $("confirm-yes").onclick = () => { $("confirm").close(); stopAll("reset"); };
 $("help-open").onclick = () => $("help").showModal();
 $("help-close").onclick = () => $("help").close();
-$("doctor").onclick = () => survey("doctor", "doctor-about", "api/doctor", 6);
-$("managers-look").onclick = () => survey("managers-look", "managers-about", "api/managers", 2);
+$("doctor").onclick = () => survey("doctor-about", "api/doctor", 6);
+$("managers-look").onclick = () => survey("managers-about", "api/managers", 2);
 $("alarms-all").onclick = () => alarms.acknowledge();
 $("filter").oninput = () => nodes.draw();
 // A token is not to be passed by: without it nothing is shown.

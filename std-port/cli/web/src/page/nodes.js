@@ -158,10 +158,18 @@ function drawLog(id, name) {
 
 let found = null;
 const looked = (at) => `looked ${span(now() - at)} ago, at ${clock(Date.now() - (now() - at))}`;
+// A survey that runs or has failed, until a later one, of any page, has found something; and how old that is which is shown.
+function drawSurvey(about, found) {
+  const own = state.surveys[about];
+  const shown = own && (own.runs || !found || found.at < own.at) ? own : null;
+  text($(about), [shown?.text, found && looked(found.at)].filter(Boolean).join("; "));
+  flag($(about), "bad", shown && !shown.runs);
+}
+
 function drawDoctor() {
   const doctor = state.doctor[""];
   const refused = Object.entries(state.refused);
-  if (doctor) text($("doctor-about"), looked(doctor.at));
+  drawSurvey("doctor-about", doctor);
   const key = JSON.stringify([doctor, refused]);
   if (key === found) return;
   found = key;
@@ -177,9 +185,8 @@ const finding = (severity, what, seen, advice) => make("li", {},
 let asked = null;
 function drawManagers() {
   const managers = state.managers[""];
-  if (!managers) return;
-  text($("managers-about"), looked(managers.at));
-  if (managers === asked) return;
+  drawSurvey("managers-about", managers);
+  if (!managers || managers === asked) return;
   asked = managers;
   $("managers").replaceChildren(...managers.rows.map(({ cells, kind }) => make("tr", { className: kind }, ...cells.map((cell, index) => make("td", { className: index === 1 ? "number" : "" }, cell)))));
   $("managers-remarks").replaceChildren(...managers.remarks.map((remark) => make("li", { className: "faint" }, remark)));

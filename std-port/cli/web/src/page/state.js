@@ -3,6 +3,8 @@
 export const state = {
   unit: {}, nodes: {}, refused: {}, orders: {}, counters: {}, streams: {}, values: {}, logs: {}, pings: {}, doctor: {}, limits: {}, managers: {},
   events: [], link: null, chosen: null,
+  // Surveys of the network that this page has asked for, by the place that tells of them: what to say, and since when that is so.
+  surveys: {},
   // When the last message came, by the page's clock, and the server's clock then.
   heard: null, server: 0,
   // Whose token this page has: a name, or none, and a role.
