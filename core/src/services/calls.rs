@@ -152,6 +152,48 @@ pub(crate) struct Calls<S: Storage> {
     held: u16,
     /// When the next request may come by the minimum interval.
     due: Instant,
+    /// Refused as [`Error::Busy`]: their refusals wait for capacity.
+    pub(crate) refused: Refused,
+}
+
+/// Ids of requests that lie within 64 of each other, and which of them wait for a reply.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Refused {
+    first: u32,
+    ids: u64,
+    waiting: u64,
+}
+
+impl Refused {
+    /// `false` for an id that is too far from the others.
+    pub(crate) fn insert(&mut self, id: u32, wants_reply: bool) -> bool {
+        if self.ids == 0 {
+            self.first = id;
+        }
+        // A call that waited may be refused behind one that came later.
+        if let Some(back @ 1..) = self.first.checked_sub(id) {
+            if self.ids.leading_zeros() < back {
+                return false;
+            }
+            (self.first, self.ids, self.waiting) = (id, self.ids << back, self.waiting << back);
+        }
+        let bit = 1_u64.checked_shl(id - self.first).unwrap_or(0);
+        self.ids |= bit;
+        self.waiting |= if wants_reply { bit } else { 0 };
+        bit != 0
+    }
+
+    /// The first id, and whether it waits for a reply.
+    pub(crate) fn first(&self) -> Option<(u32, bool)> {
+        (self.ids != 0).then_some((self.first, self.waiting & 1 != 0))
+    }
+
+    pub(crate) fn remove_first(&mut self) {
+        let ahead = (self.ids & !1).trailing_zeros();
+        self.ids = (self.ids & !1).checked_shr(ahead).unwrap_or(0);
+        self.waiting = self.waiting.checked_shr(ahead).unwrap_or(0);
+        self.first = self.first.wrapping_add(ahead);
+    }
 }
 
 struct Queue<S: Storage> {
@@ -191,6 +233,7 @@ impl<S: Storage> Calls<S> {
             emergencies: ([0; _], Span::default()),
             held: 0,
             due: Instant::START,
+            refused: Refused::default(),
         }
     }
 

@@ -304,12 +304,24 @@ impl<P: Port> Session<P> {
             Error::Full(_) => Error::Busy,
             error => error,
         };
-        if self.wire.send_error(cx, id, priority, wants_reply, error).is_err() {
+        let is_sent = self.wire.send_error(cx, id, priority, wants_reply, error).is_ok();
+        // A burst of requests is refused faster than a poor network takes the refusals.
+        let is_kept = is_sent || error == Error::Busy && self.calls.refused.insert(id, wants_reply);
+        if !is_kept {
             self.wire.link.counters.count(LinkCounter::RepliesDropped);
         }
         if error == Error::StaleFunction {
             self.wire.publishing.notify_again(slot);
             self.pump(cx);
+        }
+    }
+
+    /// Sends the refusals that waited for capacity.
+    pub(super) fn send_refused(&mut self, cx: &mut Context<'_, P>) {
+        while let Some((id, wants_reply)) = self.calls.refused.first()
+            && self.wire.send_error(cx, id, Priority::Normal, wants_reply, Error::Busy).is_ok()
+        {
+            self.calls.refused.remove_first();
         }
     }
 }

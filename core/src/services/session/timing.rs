@@ -145,6 +145,7 @@ impl<P: Port> Session<P> {
         self.granting.send_ends(&mut self.wire, cx);
         send_limits(&mut self.wire, cx);
         self.granting.obedience.send_claim(&mut self.wire, cx);
+        self.send_refused(cx);
         send_list(&mut self.wire, cx);
         if STREAMS {
             self.streaming.pump(&mut self.wire, cx);

@@ -196,7 +196,7 @@ fn a_long_call_finds_one_buffer_more_to_wait_in() {
     }
 }
 
-/// Refusals may use only a few bytes, none of which are reserved for emergencies.
+/// Refusals may use only a few bytes, none of which are reserved for emergencies, and wait for capacity up to a number.
 #[test]
 fn refusals_without_a_buffer_are_bounded_and_leave_room_for_an_emergency() {
     let mut pair = Pair::live();
@@ -206,16 +206,53 @@ fn refusals_without_a_buffer_are_bounded_and_leave_room_for_an_emergency() {
     pair.publish();
     let others = pair.agv.take_buffers();
     pair.agv.net.capacity = 0;
-    for _ in 0..40 {
+    for _ in 0..100 {
         pair.manager.notify("work", &none()).unwrap();
     }
     pair.run(Duration::from_millis(1));
     let dropped = pair.agv.counter(LinkCounter::RepliesDropped);
-    assert!(dropped > 0 && dropped < 39, "{dropped}");
+    assert!(dropped > 0 && dropped < 99 - 64, "{dropped}");
     let stop = pair.agv.request_with("stop", &none(), &emergency(), true).unwrap();
     pair.agv.net.capacity = 1 << 20;
     pair.run(Duration::from_millis(5));
     pair.agv.give_buffers(others);
     assert!(pair.agv.outcome(stop).unwrap().is_ok());
-    assert_eq!(pair.manager.count(|event| matches!(event, Event::Failed(_, Error::Busy))) as u64, 39 - dropped);
+    assert_eq!(pair.manager.count(|event| matches!(event, Event::Failed(_, Error::Busy))) as u64, 99 - dropped);
+}
+
+#[test]
+fn ids_of_refusals_are_taken_out_in_their_order_whatever_order_they_came_in() {
+    use crate::services::calls::Refused;
+    let ids = |came: &[u32]| {
+        let mut refused = Refused::default();
+        let kept: std::vec::Vec<bool> = came.iter().map(|id| refused.insert(*id, id % 2 == 0)).collect();
+        let mut out = std::vec![];
+        while let Some((id, wants_reply)) = refused.first() {
+            assert_eq!(wants_reply, id % 2 == 0);
+            out.push(id);
+            refused.remove_first();
+        }
+        (kept, out)
+    };
+    assert_eq!(ids(&[5, 3, 68]), (std::vec![true, true, false], std::vec![3, 5]));
+    assert_eq!(ids(&[70, 7, 6, 8]), (std::vec![true, true, false, true], std::vec![7, 8, 70]));
+    assert_eq!(ids(&[u32::MAX, u32::MAX - 63, 0]), (std::vec![true, true, false], std::vec![u32::MAX - 63, u32::MAX]));
+    assert_eq!(ids(&[0, 0, 63, 64]), (std::vec![true, true, true, false], std::vec![0, 63]));
+}
+
+#[test]
+fn a_refusal_that_waited_for_capacity_ends_a_call_that_waits() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("work()");
+    pair.publish();
+    let others = pair.agv.take_buffers();
+    pair.agv.net.capacity = 0;
+    let calls: std::vec::Vec<_> = (0..60).map(|_| pair.manager.call("work", &none()).unwrap()).collect();
+    pair.run(Duration::from_millis(1));
+    pair.agv.net.capacity = 1 << 20;
+    pair.run(Duration::from_millis(5));
+    pair.agv.give_buffers(others);
+    let is_busy = |id| matches!(pair.manager.outcome(id), Some(Err(Error::Busy)));
+    assert_eq!(calls.iter().filter(|&&id| is_busy(id)).count(), 59);
+    assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
 }
