@@ -1,12 +1,13 @@
 //! A recording of what goes over MQTT: a message waits in the recorder's bounded queue, and a thread of its own writes it. A disk that
 //! is full, hangs or cannot be opened costs the recording alone.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use cara_recording::{Limits, Recorder};
+use cara_recording::{Limits, Recorder, StartError};
 
 use crate::config::Config;
 
@@ -14,6 +15,8 @@ use crate::config::Config;
 const CHUNK: Duration = Duration::from_secs(1);
 /// Between two warnings about losses.
 const WARN: Duration = Duration::from_secs(10);
+/// Before a file that cannot be opened is tried again.
+const RETRY: Duration = Duration::from_secs(10);
 /// A disk that takes nothing is waited for so long at the end, once or twice.
 const LAST: Duration = Duration::from_secs(2);
 /// Topic of the messages that tell whether the broker is there: they are not recorded.
@@ -32,7 +35,8 @@ struct Shared {
 }
 
 impl Recording {
-    /// Opens the file in a thread of its own, as its disk may hang. Fails if there is no such thread.
+    /// Opens the file in a thread of its own, as its disk may hang, and tries again while it cannot be opened. Fails if there is no
+    /// such thread.
     pub fn start(config: &Config) -> Result<Self> {
         let Some(settings) = config.recording.clone() else { return Ok(Self::default()) };
         let turned = Mutex::new((Instant::now(), 0, None));
@@ -44,11 +48,14 @@ impl Recording {
             ("vda5050", config.vda5050.version.clone()),
             ("recorded_by", format!("cara-vda5050 {}", env!("CARGO_PKG_VERSION"))),
         ];
-        let about = about.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
-        let own = shared.clone();
-        let open = move || match Recorder::start(&settings.file, limits, about) {
-            Ok(recorder) => drop(own.recorder.set(recorder)),
-            Err(error) => eprintln!("nothing is recorded: {error}"),
+        let about: BTreeMap<_, _> = about.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
+        let own = Arc::downgrade(&shared);
+        let open = move || {
+            let open = || Recorder::start(&settings.file, limits, about.clone());
+            let recorder = open_at_last(open, RETRY, || own.strong_count() > 0);
+            if let (Some(own), Some(recorder)) = (own.upgrade(), recorder) {
+                let _ = own.recorder.set(recorder);
+            }
         };
         std::thread::Builder::new().name("recording".into()).spawn(open)?;
         Ok(Self(Some(shared)))
@@ -88,5 +95,58 @@ impl Recording {
     fn opened(&self) -> Option<(&Shared, &Recorder)> {
         let shared = self.0.as_deref()?;
         Some((shared, shared.recorder.get()?))
+    }
+}
+
+/// Tries until the file is open or nobody waits for it. Each reason is logged once.
+fn open_at_last(
+    open: impl Fn() -> Result<Recorder, StartError>,
+    pause: Duration,
+    is_awaited: impl Fn() -> bool,
+) -> Option<Recorder> {
+    let mut why = String::new();
+    while is_awaited() {
+        match open() {
+            Ok(recorder) => {
+                if !why.is_empty() {
+                    eprintln!("recording from now on");
+                }
+                return Some(recorder);
+            }
+            Err(error) if error.to_string() == why => {}
+            Err(error) => {
+                why = error.to_string();
+                eprintln!("nothing is recorded, next try in {} s: {why}", pause.as_secs());
+            }
+        }
+        std::thread::sleep(pause);
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[test]
+    fn a_file_that_cannot_be_opened_is_tried_again_while_somebody_waits() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.mcap");
+        std::fs::write(&file, "no recording").unwrap();
+        let tries = Cell::new(0);
+        let open = || {
+            tries.set(tries.get() + 1);
+            if tries.get() == 3 {
+                std::fs::remove_file(&file).unwrap();
+            }
+            Recorder::start(&file, Limits { size: 1 << 20, keep: 1 }, BTreeMap::new())
+        };
+        assert!(open_at_last(open, Duration::ZERO, || tries.get() < 2).is_none());
+        assert_eq!(tries.get(), 2);
+        assert!(open_at_last(open, Duration::ZERO, || true).is_some());
+        assert_eq!(tries.get(), 3);
+        assert!(file.exists());
     }
 }

@@ -21,6 +21,8 @@ const RETRY: Duration = Duration::from_millis(100);
 const MOST_CHANNELS: usize = 10_000;
 /// Bytes after which a chunk ends although its second has not passed.
 const CHUNK: u64 = 1 << 20;
+/// A file is short if it has less than this part of its greatest size, and less than a chunk.
+const SHORT: u64 = 16;
 
 /// Why a recording does not begin.
 #[derive(Debug, thiserror::Error)]
@@ -80,7 +82,7 @@ impl Files {
         let mut files = Self { path: path.to_owned(), limits, about, state, open: None };
         let failed = |error| StartError::Failed { path: path.to_owned(), error };
         if files.is_there()? {
-            shift(path, limits.keep).map_err(failed)?;
+            shift(path, limits).map_err(failed)?;
         }
         let file = create(path).map_err(failed)?;
         files.begin(file).map_err(|error| failed(io::Error::other(error)))?;
@@ -141,7 +143,7 @@ impl Files {
             return Err(mcap::McapError::AttemptedWriteAfterFailure);
         }
         loop {
-            match shift(&self.path, self.limits.keep).and_then(|()| create(&self.path)) {
+            match shift(&self.path, self.limits).and_then(|()| create(&self.path)) {
                 Ok(file) => return self.begin(file),
                 Err(error) => self.state.is_held_up(error, RETRY)?,
             }
@@ -196,14 +198,23 @@ pub(super) fn create(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// FILE becomes FILE.1, which becomes FILE.2, up to FILE.`keep`, which goes.
-fn shift(path: &Path, keep: usize) -> io::Result<()> {
+/// FILE becomes FILE.1, which becomes FILE.2, up to FILE.`keep`. If all are there, the oldest short one is removed, so that a program
+/// that crashes in a loop does not push out what was recorded before; without a short one the oldest is.
+fn shift(path: &Path, Limits { size, keep }: Limits) -> io::Result<()> {
     let numbered = |number: usize| match number {
         0 => path.to_owned(),
         number => path.with_added_extension(number.to_string()),
     };
     let keep = keep.max(1);
-    let free = (0..keep).find(|number| !numbered(*number).exists()).unwrap_or(keep);
+    let is_short = |number: &usize| {
+        fs::metadata(numbered(*number)).is_ok_and(|found| found.is_file() && found.len() < (size / SHORT).min(CHUNK))
+    };
+    let missing = (0..=keep).find(|number| !numbered(*number).exists());
+    let free = match missing.or_else(|| (0..=keep).rev().find(is_short)) {
+        // `create` replaces no file.
+        Some(0) if missing.is_none() => return fs::remove_file(path),
+        free => free.unwrap_or(keep),
+    };
     (0..free).rev().try_for_each(|number| fs::rename(numbered(number), numbered(number + 1)))
 }
 

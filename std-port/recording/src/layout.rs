@@ -13,6 +13,8 @@ const COMMANDS: &str = "/commands";
 pub(super) const FUNCTIONS: &str = "/functions";
 /// Begins the channels of MQTT, before its own topic.
 pub(super) const MQTT: &str = "/mqtt/";
+/// Characters of a payload of MQTT that its event shows.
+const MOST_SHOWN: usize = 200;
 
 /// A message, and the channel that it belongs to.
 pub(super) struct Message {
@@ -79,8 +81,12 @@ pub(super) fn about_itself(body: Value, at: u64) -> Message {
     of("/recording", at, body)
 }
 
-/// The event that a message of a recording holds; of a command, one that tells it.
-pub fn event_of(topic: &str, body: &[u8]) -> Option<Answer> {
+/// The event that a message of a recording holds; of a command or a message of MQTT, one that tells it.
+pub fn event_of(message: &super::Message) -> Option<Answer> {
+    let (topic, body) = (message.topic.as_str(), message.body.as_slice());
+    if topic.starts_with(MQTT) {
+        return mqtt(message.came, &serde_json::from_slice(body).ok()?);
+    }
     if ![EVENTS, COMMANDS].contains(&topic) {
         return None;
     }
@@ -98,6 +104,17 @@ pub fn event_of(topic: &str, body: &[u8]) -> Option<Answer> {
         }
         _ => None,
     }
+}
+
+/// A message of MQTT: its direction, its topic and how its payload begins.
+fn mqtt(came: u64, body: &Value) -> Option<Answer> {
+    let (direction, topic) = (body["direction"].as_str()?, body["topic"].as_str()?);
+    let retained = if body["retained"] == true { ", retained" } else { "" };
+    let payload = body["payload"].as_str().or_else(|| body["payload_hex"].as_str()).unwrap_or_default();
+    let begin = payload.char_indices().nth(MOST_SHOWN).map_or(payload, |(end, _)| payload.split_at(end).0);
+    let more = if begin.len() < payload.len() { "…" } else { "" };
+    let text = format!("{direction} {topic}{retained}: {begin}{more}");
+    Some(Answer::Event { at_ms: 0, unix_ms: came / 1_000_000, event: "mqtt".to_owned(), node: None, text })
 }
 
 fn of(topic: &'static str, published: u64, body: Value) -> Message {

@@ -41,7 +41,7 @@ fn whole(recorder: Recorder) -> u64 {
 /// The texts of a file's events, and how it ends.
 fn texts(file: &[u8]) -> (Vec<String>, End) {
     let mut reading = Reading::of(file);
-    let events = reading.by_ref().filter_map(|message| match event_of(&message.topic, &message.body)? {
+    let events = reading.by_ref().filter_map(|message| match event_of(&message)? {
         Answer::Event { text, .. } => Some(text),
         _ => None,
     });
@@ -139,6 +139,40 @@ fn a_recording_that_is_there_is_kept_and_nothing_else_is_touched() {
 }
 
 #[test]
+fn a_crash_loop_pushes_no_long_recording_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let numbered = |number: u32| folder.path().join(format!("a.mcap.{number}"));
+    let limits = Limits { size: 1 << 20, keep: 3 };
+    let long = "x".repeat(100_000);
+    let record = |text: &str| {
+        let recorder = start(&path, limits);
+        recorder.take(&event(text));
+        whole(recorder);
+    };
+    let found = |path: &Path| texts(&fs::read(path).unwrap()).0.remove(0);
+    record(&long);
+    record(&long);
+    (0..10).for_each(|number| record(&number.to_string()));
+    // Both long ones, and the newest of the short ones.
+    assert_eq!([found(&path), found(&numbered(1))], ["9", "8"]);
+    assert!(found(&numbered(2)) == long && found(&numbered(3)) == long);
+    record(&long);
+    record(&long);
+    assert_eq!([&path, &numbered(1), &numbered(2), &numbered(3)].map(|path| found(path).len()), [100_000; 4]);
+    // Without a short one among those before it, the one that is there makes place.
+    record("short");
+    record("shorter");
+    assert_eq!((found(&path).as_str(), found(&numbered(1)).len()), ("shorter", 100_000));
+    // And without any short one the oldest goes.
+    let second = fs::read(numbered(2)).unwrap();
+    record(&long);
+    record(&long);
+    assert_eq!(fs::read(numbered(3)).unwrap(), second);
+    assert!(!numbered(4).exists());
+}
+
+#[test]
 fn what_ends_anywhere_is_read_up_to_there_and_no_damage_panics() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.mcap");
@@ -214,6 +248,31 @@ fn messages_of_mqtt_go_both_ways_and_each_topic_is_a_channel() {
         serde_json::json!({ "direction": "received", "topic": "uagv/order", "retained": true, "payload": "{\"orderId\":\"o1\"}" })
     );
     assert_eq!((&body(1)["direction"], &body(1)["payload_hex"]), (&"sent".into(), &"ff00".into()));
+}
+
+#[test]
+fn messages_of_mqtt_are_events_of_a_replay() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    recorder.take_mqtt(false, "uagv/order", true, b"{\"orderId\":\"o1\"}");
+    recorder.take_mqtt(true, "uagv/state", false, "ü".repeat(300).as_bytes());
+    recorder.take_mqtt(true, "uagv/state", false, &[0xff, 0]);
+    whole(recorder);
+    let all: Vec<_> = Reading::open(&path).unwrap().collect();
+    let shown = |index: usize| match event_of(&all[index]) {
+        Some(Answer::Event { unix_ms, event, text, .. }) => {
+            assert_eq!((unix_ms, event.as_str()), (all[index].came / 1_000_000, "mqtt"));
+            text
+        }
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(shown(0), "received uagv/order, retained: {\"orderId\":\"o1\"}");
+    assert_eq!(shown(1), format!("sent uagv/state: {}…", "ü".repeat(200)));
+    assert_eq!(shown(2), "sent uagv/state: ff00");
+    // A file of another program.
+    let foreign = super::reading::Message { topic: "/mqtt/x".into(), came: 0, body: b"[1]".to_vec() };
+    assert!(event_of(&foreign).is_none());
 }
 
 #[test]

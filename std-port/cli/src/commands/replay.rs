@@ -9,7 +9,7 @@ use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output;
 
-/// Prints the events of recordings by `cara record` as `cara watch` printed them.
+/// Prints the events of recordings by `cara record` as `cara watch` printed them, and messages of MQTT that a gateway recorded.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The recordings, the oldest first: FILE.1 before FILE.
@@ -37,7 +37,7 @@ pub(crate) fn run(Arguments { file, speed, serve }: Arguments, global: &Global) 
         let failed = |text: String| Ended::failed("Failed", format!("{}: {text}", path.display()));
         let mut reading = Reading::open(path).map_err(|error| failed(error.to_string()))?;
         for message in &mut reading {
-            let event = event_of(&message.topic, &message.body);
+            let event = event_of(&message);
             if event.is_none() && stage.is_none() {
                 continue;
             }

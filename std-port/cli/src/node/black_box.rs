@@ -300,7 +300,7 @@ mod tests {
     }
 
     fn texts(file: &Path) -> Vec<String> {
-        let events = Reading::open(file).unwrap().filter_map(|message| event_of(&message.topic, &message.body));
+        let events = Reading::open(file).unwrap().filter_map(|message| event_of(&message));
         let text = |event| if let Answer::Event { text, .. } = event { text } else { String::new() };
         events.map(text).collect()
     }
