@@ -601,9 +601,7 @@ fn the_socket_is_there_while_the_node_runs() {
 #[test]
 fn sighup_takes_over_constraints_and_log_of_a_file_without_mistakes() {
     let mut node = Node::start(&format!("constraints.minimum_interval = 0\nlog.level = \"warn\"\n{SERVED}"));
-    let (unit, manager) = node.vehicle("agv", 7);
-    unit.my_function_list().add_clock().unwrap();
-    unit.publish_my_function_list().unwrap();
+    let (_unit, manager) = node.vehicle("agv", 7);
     let mut report = Parameters::new();
     report.add_string("text", 64).unwrap();
     let twice = || manager.request("report", &report).and_then(|_| manager.request("report", &report));
@@ -700,7 +698,9 @@ fn metrics_are_the_counters() {
     let node = Node::start(&format!("[metrics]\nlisten = \"127.0.0.1:0\"\n{SERVED}"));
     let url = node.up.split("metrics http://").nth(1).unwrap();
     let address = url.strip_suffix("/metrics").unwrap().parse().unwrap();
-    let (_unit, manager) = node.vehicle("agv", 7);
+    let (unit, manager) = node.vehicle("agv", 7);
+    unit.my_function_list().add_clock().unwrap();
+    unit.publish_my_function_list().unwrap();
     let mut report = Parameters::new();
     report.add_string("text", 64).unwrap();
     for _ in 0..5 {
