@@ -212,7 +212,8 @@ impl<T: Send + 'static> Peer<T> {
     }
 
     /// How far the node's clock is from this manager's, while it is connected and where it [tells](crate::MyFunctionList::add_clock)
-    /// that; `None` also at an s_unit, which does not ask. It is measured when the node has joined, and each minute.
+    /// that; `None` also at an s_unit, which does not ask. It is measured when the node has joined, and each minute;
+    /// what is older than 4 minutes is not told.
     pub fn clock_offset(&self) -> Option<ClockOffset> {
         self.cell.clock_offset(self.engine.now())
     }

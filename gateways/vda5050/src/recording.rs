@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -30,6 +31,8 @@ struct Shared {
     file: PathBuf,
     /// Once its file is open.
     recorder: OnceLock<Recorder>,
+    /// Messages before that.
+    missed: AtomicU64,
     /// When its chunk ended last; how many messages were lost at the last warning, and when that was.
     turned: Mutex<(Instant, u64, Option<Instant>)>,
 }
@@ -40,7 +43,12 @@ impl Recording {
     pub fn start(config: &Config) -> Result<Self> {
         let Some(settings) = config.recording.clone() else { return Ok(Self::default()) };
         let turned = Mutex::new((Instant::now(), 0, None));
-        let shared = Arc::new(Shared { file: settings.file.clone(), recorder: OnceLock::new(), turned });
+        let shared = Arc::new(Shared {
+            file: settings.file.clone(),
+            recorder: OnceLock::new(),
+            missed: AtomicU64::new(0),
+            turned,
+        });
         let limits = Limits { size: settings.max_size, keep: settings.keep.into() };
         let about = [
             ("unit", format!("{}/{}", config.manager.name, config.manager.id)),
@@ -63,9 +71,10 @@ impl Recording {
 
     /// Records a message. Never waits: what finds no place is counted.
     pub fn take(&self, is_sent: bool, topic: &str, is_retained: bool, payload: &[u8]) {
-        let recorder = self.0.as_ref().and_then(|shared| shared.recorder.get());
-        if let Some(recorder) = recorder.filter(|_| !topic.ends_with(PROBE)) {
-            recorder.take_mqtt(is_sent, topic, is_retained, payload);
+        let Some(shared) = self.0.as_ref().filter(|_| !topic.ends_with(PROBE)) else { return };
+        match shared.recorder.get() {
+            Some(recorder) => recorder.take_mqtt(is_sent, topic, is_retained, payload),
+            None => drop(shared.missed.fetch_add(1, Ordering::Relaxed)),
         }
     }
 
@@ -87,9 +96,11 @@ impl Recording {
 
     /// Ends the file.
     pub fn end(&self) {
-        let Some((shared, recorder)) = self.opened() else { return };
-        let outcome = recorder.clone().end(LAST);
-        eprintln!("{}: {} messages recorded, {} lost", shared.file.display(), outcome.messages, outcome.lost);
+        let Some(shared) = self.0.as_deref() else { return };
+        let outcome = shared.recorder.get().map(|recorder| recorder.clone().end(LAST));
+        let (messages, lost) = outcome.map_or((0, 0), |outcome| (outcome.messages, outcome.lost));
+        let lost = lost + shared.missed.load(Ordering::Relaxed);
+        eprintln!("{}: {messages} messages recorded, {lost} lost", shared.file.display());
     }
 
     fn opened(&self) -> Option<(&Shared, &Recorder)> {

@@ -199,7 +199,7 @@ pub(super) fn create(path: &Path) -> io::Result<File> {
 }
 
 /// FILE becomes FILE.1, which becomes FILE.2, up to FILE.`keep`. If all are there, the oldest short one is removed, so that a program
-/// that crashes in a loop does not push out what was recorded before; without a short one the oldest is.
+/// that crashes in a loop pushes out one long one at most; without a short one the oldest is.
 fn shift(path: &Path, Limits { size, keep }: Limits) -> io::Result<()> {
     let numbered = |number: usize| match number {
         0 => path.to_owned(),
@@ -210,11 +210,8 @@ fn shift(path: &Path, Limits { size, keep }: Limits) -> io::Result<()> {
         fs::metadata(numbered(*number)).is_ok_and(|found| found.is_file() && found.len() < (size / SHORT).min(CHUNK))
     };
     let missing = (0..=keep).find(|number| !numbered(*number).exists());
-    let free = match missing.or_else(|| (0..=keep).rev().find(is_short)) {
-        // `create` replaces no file.
-        Some(0) if missing.is_none() => return fs::remove_file(path),
-        free => free.unwrap_or(keep),
-    };
+    // Not FILE itself: it may be what a program that has crashed for the first time had just begun.
+    let free = missing.or_else(|| (1..=keep).rev().find(is_short)).unwrap_or(keep);
     (0..free).rev().try_for_each(|number| fs::rename(numbered(number), numbered(number + 1)))
 }
 

@@ -39,6 +39,8 @@ pub(crate) const UNIX_US: &str = "unix_us";
 const FEW: u8 = 4;
 /// Between the ends of two of these measurements.
 const PERIOD: Duration = Duration::from_secs(60);
+/// What was measured is told for so long.
+const MOST_AGE: Duration = Duration::from_secs(240);
 /// How long an answer is waited for, and a slot for calls is in use.
 const PATIENCE: Duration = Duration::from_millis(500);
 /// Before the second try where the first call has failed, as it may in a busy moment. It is a period before the third.
@@ -68,8 +70,10 @@ pub(super) struct Measured {
 }
 
 impl Measured {
-    pub(super) fn offset(&self, now: Instant) -> ClockOffset {
-        ClockOffset { offset_us: self.offset_us, error: self.error, age: now.since(self.at) }
+    /// `None` if it is too old.
+    pub(super) fn offset(&self, now: Instant) -> Option<ClockOffset> {
+        let age = now.since(self.at);
+        (age < MOST_AGE).then_some(ClockOffset { offset_us: self.offset_us, error: self.error, age })
     }
 }
 
@@ -164,8 +168,7 @@ impl<T: Send + 'static> Engine<T> {
         let mut state = link.lock();
         if !tells_clock(&state) {
             // A call that is open ends by itself, and the watch with it.
-            if let Some(watch) = &mut state.clock {
-                watch.due = Instant::START;
+            if state.clock.is_some() {
                 drop(state);
                 self.clocks.set(link, Instant::START);
                 self.driver.wake_looker();
@@ -211,18 +214,18 @@ impl<T: Send + 'static> Engine<T> {
                     // It has this variable by its signature.
                     let theirs = answer.variable(UNIX_US).unwrap_or(asked.unix_us);
                     if let Some(measured) = watch.answered(now, &asked, theirs) {
-                        peer.set_clock(Some(measured));
+                        peer.set_clock(link, Some(measured));
                     }
                     watch.ends(now, if has_interval(&state) { 1 } else { FEW });
                 }
-                Some(Err(error)) => fail(peer, &mut watch, now, error.error),
+                Some(Err(error)) => fail(peer, link, &mut watch, now, error.error),
             }
         }
+        if watch.asked.is_none() && !tells_clock(&state) {
+            peer.set_clock(link, None);
+            return self.settle(link, state);
+        }
         if watch.asked.is_none() && watch.due <= self.now() {
-            if !tells_clock(&state) {
-                peer.set_clock(None);
-                return self.settle(link, state);
-            }
             self.ask_clock(link, &mut state, &mut watch);
         }
         if watch.asked.is_none() {
@@ -252,16 +255,16 @@ impl<T: Send + 'static> Engine<T> {
             }
             Err(error) => match (worth_waiting(&error.error, FULL), link.peer.get()) {
                 (Some(wait), _) => watch.due = at + wait,
-                (None, Some(peer)) => fail(peer, watch, at, error.error),
+                (None, Some(peer)) => fail(peer, link, watch, at, error.error),
                 (None, None) => {}
             },
         }
     }
 }
 
-fn fail(peer: &PeerCell, watch: &mut ClockWatch, now: Instant, error: Error) {
+fn fail(peer: &PeerCell, link: &LinkCell, watch: &mut ClockWatch, now: Instant, error: Error) {
     if watch.fails(now) {
-        peer.set_clock(None);
+        peer.set_clock(link, None);
         tracing::warn!(node = %peer.identity, %error, "does not tell its clock, and is not asked for it until it joins again");
     }
 }

@@ -133,14 +133,18 @@ impl PeerCell {
         })
     }
 
-    /// How far its clock is from this unit's, while it is connected and where it tells that.
+    /// How far its clock is from this unit's, while it is connected and where it has told that lately.
     pub(crate) fn clock_offset(&self, now: Instant) -> Option<ClockOffset> {
         self.link()?;
-        lock(&self.clock).as_deref().map(|measured| measured.offset(now))
+        lock(&self.clock).as_deref().and_then(|measured| measured.offset(now))
     }
 
-    pub(super) fn set_clock(&self, measured: Option<Measured>) {
-        *lock(&self.clock) = measured.map(Box::new);
+    /// Of what was measured on this link. Nothing of a link before the present one counts.
+    pub(super) fn set_clock(&self, link: &LinkCell, measured: Option<Measured>) {
+        let current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
+        if current.as_ref().is_some_and(|current| current.serial == link.serial) {
+            *lock(&self.clock) = measured.map(Box::new);
+        }
     }
 
     /// Whether it has ever joined.

@@ -192,7 +192,8 @@ impl Logs {
         if self.logs.get(node).is_none_or(|log| log.build != build) {
             let whose = (node.clone(), build);
             // A board that changes its build id with each piece is not looked for each time.
-            let reader = if self.without.contains(&whose) || self.without.len() >= MOST_WITHOUT {
+            let is_many = build.is_some() && self.without.len() >= MOST_WITHOUT;
+            let reader = if is_many || self.without.contains(&whose) {
                 None
             } else {
                 self.decoding.reader(build).map_err(|why| why_not = Some(why)).ok()
@@ -244,9 +245,10 @@ impl Log {
             // After it was away, a board sends its last piece again.
             Some(fresh) => reader.read(fresh, &mut found),
             None => {
-                let begun = reader.cut();
-                // One that begins anew, after its power was off, is behind, and has lost nothing that is known of.
-                found.extend((ahead <= u32::MAX / 2).then(|| Line::Lost(ahead.saturating_add(begun))));
+                // One that begins anew, after its power was off, is behind: of it only the begun line is known to be lost.
+                let missing = if ahead <= u32::MAX / 2 { ahead } else { 0 };
+                let lost = missing.saturating_add(reader.cut());
+                found.extend((lost > 0).then_some(Line::Lost(lost)));
                 reader.read(piece, &mut found);
             }
         }
@@ -436,7 +438,7 @@ mod frames {
     impl Read for Frames {
         fn read(&mut self, bytes: &[u8], found: &mut Vec<Line>) {
             if self.waiting > LONGEST {
-                self.cut();
+                found.push(Line::Lost(self.cut()));
             }
             self.decoder.received(bytes);
             self.waiting += bytes.len();
@@ -452,7 +454,7 @@ mod frames {
                     // The rest of a frame whose begin is lost, or another firmware's.
                     Ok(Err(DecodeError::Malformed)) if self.table.encoding().can_recover() => {}
                     Ok(Err(DecodeError::Malformed)) | Err(_) => {
-                        self.cut();
+                        found.push(Line::Lost(self.cut()));
                         return;
                     }
                 }
@@ -486,6 +488,8 @@ mod tests {
         assert_eq!(log.take(13, b"o\nthree\n"), [text("three")]);
         assert_eq!(log.take(121, b"rest\nfour\n"), [Line::Lost(100), text("rest"), text("four")]);
         assert_eq!(log.take(0, b"anew\n"), [text("anew")], "power was off");
+        assert_eq!(log.take(5, b"begun"), []);
+        assert_eq!(log.take(0, b"an\n"), [Line::Lost(5), text("an")], "in the middle of a line");
         let mut wrapping = log_of_text();
         assert_eq!(wrapping.take(u32::MAX, b"ab"), []);
         assert_eq!(wrapping.take(1, b"c\n"), [text("abc")]);

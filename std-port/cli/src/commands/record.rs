@@ -163,10 +163,9 @@ type Changed = Arc<Mutex<HashSet<String>>>;
 /// Records the answers to a question that has no end, also after the manager was away.
 fn follow(way: &Way, recorder: &Recorder, mut question: Question, decoding: &Arc<Decoding>, changed: &Changed) {
     let is_streams = matches!(question, Question::Streams { .. });
-    let mut is_warned = false;
+    let (mut is_warned, mut logs) = (false, Logs::new(decoding.clone()));
     loop {
-        // The manager may be another life of the one before, whose log begins anew.
-        let (mut is_followed, mut logs) = (false, Logs::new(decoding.clone()));
+        let mut is_followed = false;
         let ended = way.open().and_then(|mut operator| {
             operator.watch(&question, None, |answer| {
                 is_followed = true;

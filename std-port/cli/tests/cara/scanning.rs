@@ -11,7 +11,7 @@ use cara_std::{Fleet, Identity, Interfaces, ParametersView, Served, ServiceError
 
 use serde_json::{Value, json};
 
-use crate::support::{Ran, Stage, agv, until};
+use crate::support::{Ran, Running, Stage, agv, until};
 
 #[test]
 fn a_scan_shows_who_is_there() {
@@ -71,9 +71,11 @@ fn a_clock_that_is_wrong_is_shown_and_recorded() {
     stage.cara(&["doctor", "late-1"]).says("clock-wrong").says("s behind, compared with that of manager/1");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a.mcap");
-    stage.ends(0, &["record", file.to_str().unwrap(), "--for", "1s"]);
-    let recorded = std::fs::read(&file).unwrap();
-    assert!(recorded.windows(14).any(|bytes| bytes == b"\"offset_us\":-1"), "the recording has no offset");
+    let _recorder = Running::start(stage.command(&["record", file.to_str().unwrap()]));
+    until("it is recorded", || {
+        let recorded = std::fs::read(&file).unwrap_or_default();
+        recorded.windows(14).any(|bytes| bytes == b"\"offset_us\":-1")
+    });
     agv.stop();
 }
 

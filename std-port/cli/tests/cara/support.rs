@@ -271,6 +271,11 @@ impl Running {
         found.unwrap_or_else(|| panic!("it ended without a line with `{text}`"))
     }
 
+    /// The next line; `None` at its end.
+    pub(crate) fn line(&mut self) -> Option<String> {
+        self.lines.as_mut().expect("it is read").next()?.ok()
+    }
+
     pub(crate) fn type_in(&mut self, text: &str) {
         self.typed.as_mut().expect("it is open").write_all(text.as_bytes()).unwrap();
     }
