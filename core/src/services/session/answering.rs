@@ -316,7 +316,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Sends the refusals that waited for capacity.
+    /// Sends the refusals that waited for capacity, behind what ends or renews motion.
     pub(super) fn send_refused(&mut self, cx: &mut Context<'_, P>) {
         while let Some((id, wants_reply)) = self.calls.refused.first()
             && self.wire.send_error(cx, id, Priority::Normal, wants_reply, Error::Busy).is_ok()

@@ -545,6 +545,7 @@ impl<P: Port> Session<P> {
             self.calling.send_releases(&mut self.wire, cx);
         }
         self.pump(cx);
+        self.send_refused(cx);
         if STREAMS {
             self.streaming.send_samples(&mut self.wire, cx);
         }

@@ -102,6 +102,7 @@ impl<P: Port> Session<P> {
         if self.wire.due.has_come(Part::KeepAlive, cx.now) {
             self.send_keep_alive(cx);
         }
+        self.send_refused(cx);
         let moves = self.moves();
         self.renewal.poll(&mut self.wire, cx, moves);
         if self.wire.due.has_come(Part::Claims, cx.now) {
@@ -145,7 +146,6 @@ impl<P: Port> Session<P> {
         self.granting.send_ends(&mut self.wire, cx);
         send_limits(&mut self.wire, cx);
         self.granting.obedience.send_claim(&mut self.wire, cx);
-        self.send_refused(cx);
         send_list(&mut self.wire, cx);
         if STREAMS {
             self.streaming.pump(&mut self.wire, cx);

@@ -156,7 +156,7 @@ impl<'g> Rounds<'g> {
         };
         let asked = self.ask(&mut operator, &question(node));
         let sum = &self.sum;
-        if sum.nodes == 0 {
+        if sum.nodes() == 0 {
             asked?;
             let text = format!("no s_unit is known{}: nothing was called", operator.waited());
             return Err(Ended::failed("NoNodes", text));
@@ -172,20 +172,20 @@ impl<'g> Rounds<'g> {
     fn ask(&mut self, operator: &mut Operator, question: &Question) -> anyhow::Result<()> {
         let Self { sum, shown, lines, global, .. } = self;
         let earlier = mem::take(sum);
-        let (json, mut acknowledged) = (global.json, BTreeSet::new());
+        let json = global.json;
         let asked = operator.ask(question, |answer| {
             let Answer::Called { node, id, error, took_us, .. } = answer else { return Ok(()) };
             let node = format!("{node}/{id}");
             sum.add(&node, error.is_none(), took_us);
-            if error.is_none() {
-                acknowledged.insert(node.clone());
+            if error.is_some() {
+                shown.remove(&node);
             }
             if error.is_some() || shown.insert(node.clone()) {
                 let _ = lines.send(Box::new(move || show(&node, error.as_ref(), took_us, json)));
             }
             Ok(())
         });
-        sum.carry(earlier, &acknowledged);
+        sum.carry(earlier);
         asked
     }
 
@@ -214,42 +214,40 @@ impl<'g> Rounds<'g> {
 /// What came of all nodes.
 #[derive(Default)]
 struct Sum {
-    nodes: usize,
-    /// How many of them.
-    acknowledged: usize,
+    acknowledged: BTreeSet<String>,
     missing: BTreeSet<String>,
     last_us: Option<u64>,
 }
 
 impl Sum {
     fn add(&mut self, node: &str, has_acknowledged: bool, took_us: u64) {
-        self.nodes += 1;
         if has_acknowledged {
-            self.acknowledged += 1;
+            self.acknowledged.insert(node.to_owned());
             self.last_us = self.last_us.max(Some(took_us));
         } else {
             self.missing.insert(node.to_owned());
         }
     }
 
-    /// Who was missing in an earlier round is missing until it has acknowledged: whoever took over may not know it yet.
-    fn carry(&mut self, earlier: Self, acknowledged: &BTreeSet<String>) {
-        for node in earlier.missing {
-            if !acknowledged.contains(&node) && self.missing.insert(node) {
-                self.nodes += 1;
-            }
-        }
+    /// Who was asked in an earlier round is missing until it has acknowledged in this one: whoever took over may not know it yet.
+    fn carry(&mut self, earlier: Self) {
+        let asked = earlier.acknowledged.into_iter().chain(earlier.missing);
+        self.missing.extend(asked.filter(|node| !self.acknowledged.contains(node)));
+    }
+
+    fn nodes(&self) -> usize {
+        self.acknowledged.len() + self.missing.len()
     }
 
     fn to_json(&self) -> Value {
-        let Self { nodes, acknowledged, missing, last_us } = self;
-        json!({ "nodes": nodes, "acknowledged": acknowledged, "last_us": last_us, "missing": missing })
+        let Self { acknowledged, missing, last_us } = self;
+        json!({ "nodes": self.nodes(), "acknowledged": acknowledged.len(), "last_us": last_us, "missing": missing })
     }
 }
 
 impl fmt::Display for Sum {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} of {} acknowledged", self.acknowledged, self.nodes)?;
+        write!(f, "{} of {} acknowledged", self.acknowledged.len(), self.nodes())?;
         if let Some(last) = self.last_us {
             write!(f, ", the last after {}", show_micros(last as f64))?;
         }
@@ -284,8 +282,7 @@ mod tests {
         let round = |earlier, answers: &[(&str, bool)]| {
             let mut sum = Sum::default();
             answers.iter().for_each(|(node, has)| sum.add(node, *has, 7));
-            let acknowledged = answers.iter().filter(|(_, has)| *has).map(|(node, _)| (*node).to_owned()).collect();
-            sum.carry(earlier, &acknowledged);
+            sum.carry(earlier);
             sum
         };
         let first = round(Sum::default(), &[("agv/7", true), ("lift/8", false)]);
@@ -293,6 +290,9 @@ mod tests {
         assert_eq!(second.to_string(), "1 of 2 acknowledged, the last after 7 us; not acknowledged: lift/8");
         let third = round(second, &[("agv/7", false), ("lift/8", true)]);
         assert_eq!(third.to_string(), "1 of 2 acknowledged, the last after 7 us; not acknowledged: agv/7");
-        assert!(round(third, &[("agv/7", true), ("lift/8", true)]).missing.is_empty());
+        let fourth = round(third, &[("agv/7", true), ("lift/8", true)]);
+        assert!(fourth.missing.is_empty());
+        let fifth = round(fourth, &[("lift/8", true)]);
+        assert_eq!(fifth.to_string(), "1 of 2 acknowledged, the last after 7 us; not acknowledged: agv/7");
     }
 }
