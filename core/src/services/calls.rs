@@ -177,7 +177,7 @@ impl Refused {
             }
             (self.first, self.ids, self.waiting) = (id, self.ids << back, self.waiting << back);
         }
-        let bit = 1_u64.checked_shl(id - self.first).unwrap_or(0);
+        let bit = 1_u64.checked_shl(id.wrapping_sub(self.first)).unwrap_or(0);
         self.ids |= bit;
         self.waiting |= if wants_reply { bit } else { 0 };
         bit != 0

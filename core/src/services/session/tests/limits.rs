@@ -5,12 +5,14 @@ use std::vec;
 use super::super::Event;
 use super::pair::Pair;
 use super::setup::Setup;
+use super::side::context;
 use super::{none, text, x};
 use crate::config::{Constraints, Priority};
 use crate::distribution::function_list::Generation;
 use crate::distribution::message::RequestHeader;
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
+use crate::services::Context;
 use crate::services::session::RequestOptions;
 use crate::storage::LEFT_BY_WAITING;
 use crate::time::Duration;
@@ -242,17 +244,25 @@ fn ids_of_refusals_are_taken_out_in_their_order_whatever_order_they_came_in() {
 
 #[test]
 fn a_refusal_that_waited_for_capacity_ends_a_call_that_waits() {
-    let mut pair = Pair::live();
-    pair.agv.offer_held("work()");
-    pair.publish();
-    let others = pair.agv.take_buffers();
-    pair.agv.net.capacity = 0;
-    let calls: std::vec::Vec<_> = (0..60).map(|_| pair.manager.call("work", &none()).unwrap()).collect();
-    pair.run(Duration::from_millis(1));
-    pair.agv.net.capacity = 1 << 20;
-    pair.run(Duration::from_millis(5));
-    pair.agv.give_buffers(others);
-    let is_busy = |id| matches!(pair.manager.outcome(id), Some(Err(Error::Busy)));
-    assert_eq!(calls.iter().filter(|&&id| is_busy(id)).count(), 59);
-    assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
+    for is_drained_by_another in [false, true] {
+        let mut pair = Pair::live();
+        pair.agv.offer_held("work()");
+        pair.publish();
+        let others = pair.agv.take_buffers();
+        pair.agv.net.capacity = 0;
+        let calls: std::vec::Vec<_> = (0..60).map(|_| pair.manager.call("work", &none()).unwrap()).collect();
+        pair.run(Duration::from_millis(1));
+        pair.agv.net.capacity = 1 << 20;
+        pair.agv.give_buffers(others);
+        if is_drained_by_another {
+            // The port sees a stream that is not blocked any more, and does not report that it is writable.
+            let agv = &mut pair.agv;
+            agv.session.ping(context!(agv)).unwrap();
+            assert!(!agv.session.wants_to_write());
+        }
+        pair.settle();
+        let is_busy = |id| matches!(pair.manager.outcome(id), Some(Err(Error::Busy)));
+        assert_eq!(calls.iter().filter(|&&id| is_busy(id)).count(), 59);
+        assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
+    }
 }
