@@ -552,9 +552,8 @@ impl<P: Port> Session<P> {
     }
 
     /// Sends a ping and measures the round trip: [`Event::Answered`] follows, then [`round_trip`](Self::round_trip) is new.
-    /// Replaces a ping that is still unanswered.
-    ///
-    /// [`Error::NotConnected`] if the link is not live, [`Error::Full`] if the stream has no capacity.
+    /// Replaces a ping that is still unanswered. [`Error::NotConnected`] if the link is not live, [`Error::Full`] if the stream has no
+    /// capacity.
     pub fn ping(&mut self, cx: &mut Context<'_, P>) -> Result<(), Error> {
         self.pings.ping(&mut self.wire, cx)
     }
