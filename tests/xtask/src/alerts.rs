@@ -63,7 +63,7 @@ fn scrape(panels: &[String]) -> Result<()> {
         Process::start(name, Path::new("env"), words.chain(arguments.iter().copied()))
     };
     let made = Run::new("env").args([&keys]).args([&cara]);
-    made.args(["keys", "new-fleet", "--fleet", &fleet, "AGV_manager/1@m_unit", "agv-1/11"]).text()?;
+    made.args(["keys", "new-fleet", "--fleet", &fleet, "AGV_manager/1@m_unit", "agv-1/11", "clock-1/12"]).text()?;
     let arguments =
         ["--loopback", "--fleet", &fleet, "node", "--name", "AGV_manager", "--id", "1", "--metrics", "127.0.0.1:0"];
     let manager = start("manager", &cara, &arguments)?;
@@ -72,6 +72,12 @@ fn scrape(panels: &[String]) -> Result<()> {
         up.split_once("metrics http://").and_then(|(_, rest)| rest.split('/').next()).context("no address")?;
     let mut vehicle = start("agv-1", &programs.join("agv"), &["--attended", "--loopback", "--fleet", &fleet])?;
     vehicle.expect("joined", STEP)?;
+    let clock = place.join("clock-1.toml");
+    let text =
+        "name = \"clock-1\"\nid = 12\nrole = \"s_unit\"\nclock = true\n[manager]\nname = \"AGV_manager\"\nid = 1\n";
+    fs::write(&clock, text)?;
+    let arguments = ["--loopback", "--fleet", &fleet, "node", &clock.display().to_string()];
+    let _clock = start("clock-1", &cara, &arguments)?;
     let settings = json!({
         "global": { "scrape_interval": "1s", "evaluation_interval": "1s" },
         "rule_files": [workspace::root().join(RULES)],

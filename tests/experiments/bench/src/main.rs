@@ -19,6 +19,7 @@ mod pair;
 mod peers;
 mod plots;
 mod progress;
+mod recording;
 mod results;
 mod share;
 mod soak;
@@ -72,6 +73,8 @@ enum Command {
         /// Where the figure goes.
         folder: Option<PathBuf>,
     },
+    /// What a recording costs the round trip of a call; prints it.
+    Recording,
     /// Counts what each end of a round trip asks of the kernel; an error where that has grown.
     Counts,
     /// The process that answers; started by the others.
@@ -114,6 +117,7 @@ fn main() -> Result<()> {
             folder.map_or(Ok(()), |folder| plots::draw_soak(&processes, &folder))?;
             soak::judge(&processes)
         }
+        Command::Recording => recording::measure(),
         Command::Counts => counts::check(),
         Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),
         Command::Call(end) => child::call(&end),

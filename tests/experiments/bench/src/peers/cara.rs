@@ -139,6 +139,17 @@ impl Cara {
         }
     }
 
+    /// A manager that calls the passive one, once it has found that.
+    pub(crate) fn manager(
+        &self,
+        place: &Place,
+        address: &str,
+        id: u32,
+    ) -> Result<(CommunicationSystem, Box<dyn Caller>)> {
+        let system = self.system(place, address, &main_name(id), id)?;
+        Ok((system.clone(), Echo::of_system(system)?))
+    }
+
     fn has_keys(&self) -> bool {
         matches!(self, Self::Secured | Self::Spinning { secured: true })
     }
@@ -215,7 +226,7 @@ impl Peer for Cara {
                 };
                 Echo::of_system(shared.insert(main).clone())
             }
-            _ if number == FIRST_CALLER => Echo::of_system(self.system(place, address, &main_name(id), id)?),
+            _ if number == FIRST_CALLER => Ok(self.manager(place, address, id)?.1),
             _ => {
                 let threads = Some(shared_threads()?);
                 Echo::of_unit(self.unit(place, address, &caller_name(id), FIRST_UNIT + id, threads)?)
