@@ -106,6 +106,17 @@ pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut imp
     }
 }
 
+/// The values of a block that [`write()`] has made, with their names, in place. Ends at bytes that are no such value.
+pub fn values<'a>(specs: VariableSpecs<'a>, block: &'a [u8]) -> impl Iterator<Item = (&'a str, Value<'a>)> {
+    let mut rest = block;
+    specs.raw().enumerate().map_while(move |(index, spec)| {
+        let bytes;
+        (bytes, rest) = if spec.kind.is_nested() { nested::extent(spec, rest) } else { split(spec, rest) }?;
+        let value = Value { index: index as u8, kind: spec.kind, size: spec.size, inner: spec.inner, bytes };
+        Some((core::str::from_utf8(spec.name).ok()?, value))
+    })
+}
+
 /// The longest block of `specs` in bytes; `None` if that exceeds the address space.
 pub fn longest(specs: VariableSpecs<'_>) -> Option<usize> {
     specs.raw().try_fold(0_usize, |sum, spec| {

@@ -241,8 +241,10 @@ impl<'a> Signature<'a> {
         bytes.map_or(u32::MAX, saturate)
     }
 
-    /// A signature from bytes that were checked when they were stored.
-    pub(crate) const fn of_checked(bytes: &'a [u8]) -> Self {
+    /// A signature from bytes that were checked when they were stored. Only for those of [`as_bytes`](Self::as_bytes): what reads
+    /// others may recurse as deep as they say.
+    #[doc(hidden)]
+    pub const fn of_checked(bytes: &'a [u8]) -> Self {
         Self { bytes }
     }
 

@@ -22,6 +22,8 @@ use crate::{CommunicationSystem, Finding, HandOverError, Identity, Manager, Name
 
 /// Events that wait to be written before some are lost.
 const EVENTS: usize = 1024;
+/// Of commands and calls, of which those of [`LOOK`] are read at once.
+const COMMANDS: usize = 16 * 1024;
 /// How long a refusal is shown. A node that still tries is refused again within [`LONGEST_SEARCH`](cara_core::config::LONGEST_SEARCH).
 const REFUSED: Duration = Duration::from_secs(300);
 /// Bytes of metrics in one answer.
@@ -114,7 +116,7 @@ fn attempt<T: Send + 'static>(
             send(sink, Answer::Constraints(describe::constraints(&constraints)))
         }
         Question::Watch => watch(system, None, sink, wanted),
-        Question::Commands => watch(system, Some(system.engine().commands().follow(EVENTS)), sink, wanted),
+        Question::Commands => watch(system, Some(system.engine().commands().follow(COMMANDS)), sink, wanted),
         Question::Stream { node, name, interval_ms } => {
             stream::values(system, node, name.as_deref(), Duration::from_millis(*interval_ms), sink, wanted)
         }
@@ -283,7 +285,7 @@ fn set<T: Send + 'static>(
 /// Events as they come, and commands, where they are followed.
 fn watch<T: Send + 'static>(
     system: &CommunicationSystem<T>,
-    commands: Option<Followed>,
+    mut commands: Option<Followed>,
     sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
@@ -308,9 +310,9 @@ fn watch<T: Send + 'static>(
         if missed > 0 {
             send(sink, notify("lost", format!("{missed} events came faster than they were read")))?;
         }
-        let Some((commands, lost)) = &commands else { continue };
-        commands.try_iter().try_for_each(|command| send(sink, command))?;
-        let missed = lost.swap(0, Ordering::Relaxed);
+        let Some(commands) = &mut commands else { continue };
+        let (mut commands, missed) = commands.take();
+        commands.try_for_each(|command| send(sink, command))?;
         if missed > 0 {
             send(sink, notify("lost", format!("{missed} commands came faster than they were read")))?;
         }

@@ -1,5 +1,6 @@
 //! Values between the control socket's form and parameters.
 
+use cara_core::distribution::block;
 use cara_core::distribution::function::VariableSpecs;
 use cara_core::distribution::parameters::{ParametersView, Type, Value};
 
@@ -47,11 +48,16 @@ fn put(parameters: &mut GrowingParameters, specs: VariableSpecs<'_>, argument: &
 
 /// The variables of `specs` that are among the parameters.
 pub(super) fn arguments(specs: VariableSpecs<'_>, parameters: &ParametersView) -> Vec<Argument> {
-    let values = specs.filter_map(|spec| {
-        let value = parameters.value(spec.name).ok()?;
-        Some(Argument { name: spec.name.to_owned(), size: value.size(), value: read(&value) })
-    });
-    values.collect()
+    specs.filter_map(|spec| Some(argument(spec.name, &parameters.value(spec.name).ok()?))).collect()
+}
+
+/// The values of a block.
+pub(super) fn in_block(specs: VariableSpecs<'_>, block: &[u8]) -> Vec<Argument> {
+    block::values(specs, block).map(|(name, value)| argument(name, &value)).collect()
+}
+
+fn argument(name: &str, value: &Value<'_>) -> Argument {
+    Argument { name: name.to_owned(), size: value.size(), value: read(value) }
 }
 
 fn read(value: &Value<'_>) -> ArgumentValue {
@@ -154,8 +160,13 @@ mod tests {
         );
         let signature = signature.unwrap();
         let parameters = parameters(&read_back, signature.signature().arguments()).unwrap();
-        let results = arguments(signature.signature().results(), &parameters);
+        let specs = signature.signature().results();
+        let results = arguments(specs, &parameters);
         assert_eq!(results, every_type());
+        let mut block = vec![0; block::measure(specs, &parameters).unwrap()];
+        block::write(specs, &parameters, &mut block::SliceWriter::new(&mut block));
+        assert_eq!(in_block(specs, &block), every_type());
+        assert_eq!(in_block(specs, &block[..16]), every_type()[..1], "what is no block ends it");
         assert_eq!(serde_json::to_string(&results).unwrap(), text);
         let in_order = r#"{"z":9223372036854775807,"a":true,"k":0.5}"#;
         assert!(text.contains(in_order), "members stand as in the signature: {text}");

@@ -55,7 +55,7 @@ pub struct Pending<T: Send + 'static> {
     alarm: Alarm,
     mark: Option<Mark>,
     /// For the audit log and those who follow, which get it also if the call is dropped before it has ended.
-    recorded: Option<Recorded>,
+    recorded: Option<Box<Recorded>>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -92,7 +92,7 @@ impl<T: Send + 'static> Pending<T> {
             made,
             alarm: Alarm::new(engine.driver.clone()),
             mark: None,
-            recorded: engine.notes.recorded(&link, callee.name(), options),
+            recorded: engine.notes.recorded(&link, callee.name(), options).map(Box::new),
             link,
         }
     }
@@ -107,9 +107,6 @@ impl<T: Send + 'static> Pending<T> {
             return self.over(Err(Error::Cancelled.into()));
         }
         let (parameters, options) = (&*outgoing.parameters, outgoing.options);
-        if self.stage == Stage::Unsent {
-            self.recorded.iter_mut().for_each(|recorded| recorded.asks(parameters));
-        }
         let (polled, again) = match self.send(outgoing.callee, parameters, options, cx.waker(), PAUSE) {
             Err(error) => return self.over(Err(error)),
             Ok(again) => (if again.is_some() { Poll::Pending } else { self.poll_reply(outgoing, cx) }, again),
@@ -136,6 +133,7 @@ impl<T: Send + 'static> Pending<T> {
         if self.stage != Stage::Unsent {
             return Ok(None);
         }
+        self.recorded.iter_mut().for_each(|recorded| recorded.asks(parameters));
         let now = self.engine.now();
         let options = RequestOptions { timeout: Some(self.deadline.since(now)), made: Some(self.made), ..*options };
         match self.begin(now, callee, parameters, &options, waker) {

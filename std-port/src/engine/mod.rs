@@ -247,7 +247,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Those that follow what operators and the program do.
     #[cfg(feature = "control")]
-    pub(crate) fn commands(&self) -> &crate::control::Commands {
+    pub(crate) fn commands(&self) -> &Arc<crate::control::Commands> {
         self.notes.commands()
     }
 

@@ -58,23 +58,22 @@ impl Notes {
         if options.operator || self.audit.is_none() && !is_followed {
             return None;
         }
-        let (attributes, definition) = {
-            let link = link.lock();
-            let known = link.session.their_function_list().named(function);
-            let definition = known.filter(|_| is_followed).map(|known| known.signature.to_definition());
-            (known.map(|known| *known.attributes), definition)
-        };
         let peer = link.peer.get();
+        let (attributes, followed) = {
+            let state = link.lock();
+            let known = state.session.their_function_list().named(function);
+            let followed = known
+                .zip(peer.filter(|_| is_followed))
+                .map(|(known, peer)| FollowedCall::of(&self.commands, peer, known.signature, options.take_over));
+            (known.map(|known| *known.attributes), followed)
+        };
         let node = || peer.map(|peer| peer.identity.to_string()).unwrap_or_default();
         let audited =
             self.audit.as_ref().and_then(|audit| ProgramCall::of(audit, function, attributes, options.take_over, node));
-        let followed = peer
-            .zip(definition)
-            .map(|(peer, definition)| FollowedCall::of(&self.commands, &peer.identity, definition, options.take_over));
         Recorded::of(audited, followed)
     }
 
-    pub(super) fn commands(&self) -> &Commands {
+    pub(super) fn commands(&self) -> &Arc<Commands> {
         &self.commands
     }
 

@@ -116,7 +116,7 @@ impl PeerCell {
         Ok(())
     }
 
-    pub(super) fn new(identity: &Identity) -> Arc<Self> {
+    pub(crate) fn new(identity: &Identity) -> Arc<Self> {
         Arc::new(Self {
             identity: identity.clone(),
             link: Mutex::new(None),

@@ -287,6 +287,13 @@ fn who_follows_commands_gets_arguments_and_outcomes_also_of_the_program() {
     assert_eq!((asked.node.as_deref(), asked.function.as_str(), asked.arguments), (Some("agv/7"), "go_to", position()));
     assert!(matches!(outcome.as_deref(), Some(Answer::Called { error: None, took_us: 1.., .. })), "{outcome:?}");
 
+    // So has each of a call to all.
+    arguments.set_value("position", [1_i64, 2]).unwrap();
+    depot.system.call_all("go_to", &arguments).wait();
+    let Answer::Command { question, outcome, .. } = next().unwrap() else { panic!("no command") };
+    assert!(matches!(*question, Question::Call(asked) if asked.arguments == position()));
+    assert!(matches!(outcome.as_deref(), Some(Answer::Called { error: None, .. })), "{outcome:?}");
+
     assert!(peer.block_request("fail", &mut Parameters::new()).is_err());
     let Answer::Command { outcome, .. } = next().unwrap() else { panic!("no command") };
     let Some(Answer::Called { error: Some(failure), .. }) = outcome.as_deref() else { panic!("{outcome:?}") };

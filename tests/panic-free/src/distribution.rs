@@ -132,6 +132,7 @@ entry!(signatures, {
         drain(signature.results());
         keep(signature.arguments().named(unknown_text()));
         keep((signature.name(), signature.as_bytes(), signature.parameters_bytes()));
+        keep(Signature::of_checked(signature.as_bytes()));
         keep(signature.to_definition());
         keep((signature.help(), signature.unit_of(unknown_text())));
         signature.units().for_each(|unit| keep(unit));

@@ -41,6 +41,7 @@ entry!(blocks_written, {
 
 entry!(blocks_read, {
     keep(block::check(specs(), unknown_slice()));
+    block::values(specs(), unknown_slice()).for_each(keep);
     keep(block::check_results_fit(specs(), parameters()));
     keep(block::read(specs(), unknown_slice(), parameters()));
     keep(block::read_arguments(specs(), unknown_slice(), parameters()));
