@@ -1,6 +1,7 @@
 //! The connections that have a place: what each is doing, whether it has shown the token, and which one gives its place up where
 //! all are taken.
 
+use std::cmp::Reverse;
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Waker};
@@ -106,7 +107,7 @@ impl Lines {
             .enumerate()
             .filter(|(_, (_, is_proven, phase, _))| !is_proven || *phase != Phase::Asked)
             .max_by_key(|(_, (address, is_proven, _, since))| {
-                (*is_proven == are_few, if *is_proven { 0 } else { unproven(Some(*address)) }, since.elapsed())
+                (*is_proven == are_few, if *is_proven { 0 } else { unproven(Some(*address)) }, Reverse(*since))
             });
         let Some((index, _)) = least else { return false };
         let line = open.swap_remove(index);
