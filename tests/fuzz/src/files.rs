@@ -16,7 +16,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value as Json;
 use tempfile::NamedTempFile;
 
-use crate::script::Script;
+use crate::script::{Script, text};
 use crate::unit::identity;
 
 /// Pieces of an access table, of a key file, and of lines on the control socket.
@@ -164,19 +164,6 @@ pub(crate) fn run(data: &[u8]) {
             values(variable, &text(script, QUESTIONS));
         }
     }
-}
-
-/// Pieces where they are meant, and other characters as they are.
-pub(crate) fn text(mut script: Script<'_>, pieces: &[&str]) -> String {
-    let mut text = String::new();
-    while !script.is_over() {
-        let byte = script.byte();
-        match pieces.get(usize::from(byte.wrapping_sub(128))) {
-            Some(piece) => text.push_str(piece),
-            None => text.push(char::from(byte)),
-        }
-    }
-    text
 }
 
 fn access(text: &str) {

@@ -1,6 +1,6 @@
 //! What libFuzzer drives, and what a plain test replays: each [target](TARGETS) is a function of bytes that panics where
 //! something that must hold does not. `cargo xtask fuzz` runs them; the inputs in `corpus` and `crashes` are replayed by
-//! `tests/replay.rs`.
+//! `tests/replay.rs`. `page` has the target of the command line, on which nothing else here stands.
 
 mod discovery;
 mod files;
@@ -17,6 +17,10 @@ mod vda5050;
 mod whole;
 
 use std::cell::RefCell;
+use std::fs;
+use std::path::Path;
+
+pub use script::{Script, text};
 
 /// Something to fuzz.
 pub struct Target {
@@ -51,9 +55,23 @@ pub fn inputs(mut file: &[u8]) -> impl Iterator<Item = &[u8]> {
     })
 }
 
-/// The target of this name.
-pub fn target(name: &str) -> Option<&'static Target> {
-    TARGETS.iter().find(|target| target.name == name)
+/// Runs each input below `folder` again: those in `corpus`, of which each target has a file, and those in `crashes`, whose names
+/// begin with that of their target.
+pub fn replay(folder: &Path, targets: &[Target]) {
+    for target in targets {
+        let corpus = folder.join("corpus").join(target.name).with_extension("inputs");
+        let corpus = fs::read(corpus).expect("each target has a corpus");
+        let inputs: Vec<_> = inputs(&corpus).collect();
+        assert!(inputs.len() > 20, "{} has {} inputs", target.name, inputs.len());
+        inputs.into_iter().for_each(target.run);
+    }
+    for crash in fs::read_dir(folder.join("crashes")).into_iter().flatten() {
+        let path = crash.expect("it can be read").path();
+        let name = path.file_name().and_then(|name| name.to_str()).and_then(|name| name.split('-').next());
+        let target = targets.iter().find(|target| Some(target.name) == name).expect("a crash has a target");
+        println!("{}", path.display());
+        (target.run)(&fs::read(&path).expect("it can be read"));
+    }
 }
 
 /// Bytes of the wire format that a target gave to the core's decoders, and as what.

@@ -17,8 +17,7 @@ use cara_fuzz_vda5050::version::Version;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::files::text;
-use crate::script::Script;
+use crate::script::{Script, text};
 
 /// Pieces of messages.
 const PIECES: &[&str] = &[

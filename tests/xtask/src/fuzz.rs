@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 
 use crate::command::Run;
@@ -26,7 +26,7 @@ pub(crate) struct Fuzz {
     /// How long to run each target instead, as in 90s, 10m or 2h.
     #[arg(long = "for", value_name = "TIME", value_parser = time)]
     time: Option<Duration>,
-    /// Writes the fewest inputs that reach all that was reached to `tests/fuzz/corpus`, from where tests replay them.
+    /// Writes the fewest inputs that reach all that was reached to the target's `corpus`, from where tests replay them.
     #[arg(long)]
     write: bool,
     /// Plants the bugs of `tests/fuzz/planted` in a clone of the last commit, one at a time; each has to be found in N runs.
@@ -34,9 +34,8 @@ pub(crate) struct Fuzz {
     planted: bool,
 }
 
-/// The targets, and the length of their longest inputs.
-const TARGETS: &str = "tests/fuzz/src/lib.rs";
-const CORPUS: &str = "tests/fuzz/corpus";
+/// Where targets are, in `src/lib.rs`, and what was found with them, in `corpus` and `crashes`.
+const FOLDERS: [&str; 2] = ["tests/fuzz", "tests/fuzz/page"];
 const PLANTED: &str = "tests/fuzz/planted";
 const TRIPLE: &str = "x86_64-unknown-linux-gnu";
 
@@ -61,29 +60,42 @@ pub(crate) fn time(text: &str) -> Result<Duration> {
     Ok(Duration::from_secs(number.parse::<u64>()?.saturating_mul(seconds)))
 }
 
-/// The targets by name, with the length of their longest input.
-fn targets(text: &str) -> BTreeMap<&str, &str> {
-    let rows = text.lines().filter_map(|line| line.trim().strip_prefix("Target { name: \""));
-    rows.filter_map(|row| {
-        let (name, rest) = row.split_once('"')?;
-        Some((name, rest.split_once("longest: ")?.1.split_once(' ')?.0))
-    })
-    .collect()
+/// What is known of a target here.
+#[derive(Debug, PartialEq, Eq)]
+struct Target {
+    /// The length of its longest input.
+    longest: String,
+    folder: &'static str,
+}
+
+/// The targets by name.
+fn targets() -> Result<BTreeMap<String, Target>> {
+    let mut targets = BTreeMap::new();
+    for folder in FOLDERS {
+        let text = workspace::read(&Path::new(folder).join("src/lib.rs"))?;
+        let rows = text.lines().filter_map(|line| Some(line.split_once("Target { name: \"")?.1));
+        targets.extend(rows.filter_map(|row| {
+            let (name, rest) = row.split_once('"')?;
+            let longest = rest.split_once("longest: ")?.1.split_once(' ')?.0.to_owned();
+            Some((name.to_owned(), Target { longest, folder }))
+        }));
+    }
+    Ok(targets)
 }
 
 pub(crate) fn run(fuzz: &Fuzz) -> Result<ExitCode> {
-    let text = workspace::read(Path::new(TARGETS))?;
-    let mut targets = targets(&text);
+    let mut targets = targets()?;
     targets.retain(|name, _| fuzz.target == "all" || fuzz.target == *name);
-    ensure!(!targets.is_empty(), "{} is no target: see {TARGETS}", fuzz.target);
+    ensure!(!targets.is_empty(), "{} is no target: see src/lib.rs in {}", fuzz.target, FOLDERS.join(" and "));
     if fuzz.planted {
         return planted(fuzz, &targets);
     }
     let program = build(workspace::root(), &workspace::target().join("fuzz"))?;
     let mut crashes = 0;
-    for (name, longest) in targets {
+    for (name, Target { longest, folder: home }) in &targets {
+        let corpus = workspace::root().join(home).join("corpus").join(name).with_extension("inputs");
         let folder = workspace::target().join("fuzz/inputs").join(name);
-        unpack(name, &folder)?;
+        unpack(&corpus, &folder)?;
         let limit = match fuzz.time {
             Some(time) => format!("-max_total_time={}", time.as_secs()),
             None => format!("-runs={}", fuzz.runs),
@@ -94,9 +106,9 @@ pub(crate) fn run(fuzz: &Fuzz) -> Result<ExitCode> {
         println!("{name:<10} {:>9} executions in {took:.0} s, {} edges covered", told.executions, told.coverage);
         if let Some((input, why)) = &told.crash {
             crashes += 1;
-            println!("{name:<10} CRASHED: {why}\n{input}: mend it, and move it to tests/fuzz/crashes/{name}-WHAT");
+            println!("{name:<10} CRASHED: {why}\n{input}: mend it, and move it to {home}/crashes/{name}-WHAT");
         } else if fuzz.write {
-            let (count, bytes) = pack(&program, name, &folder)?;
+            let (count, bytes) = pack(&program, name, &folder, &corpus)?;
             println!("{name:<10} {count} inputs in {bytes} bytes");
         }
     }
@@ -151,14 +163,10 @@ fn inputs(mut file: &[u8]) -> impl Iterator<Item = &[u8]> {
     })
 }
 
-fn corpus(name: &str) -> PathBuf {
-    workspace::root().join(CORPUS).join(name).with_extension("inputs")
-}
-
 /// Puts the committed inputs into a folder.
-fn unpack(name: &str, folder: &Path) -> Result<()> {
+fn unpack(corpus: &Path, folder: &Path) -> Result<()> {
     fs::create_dir_all(folder)?;
-    let file = fs::read(corpus(name)).unwrap_or_default();
+    let file = fs::read(corpus).unwrap_or_default();
     for (number, input) in inputs(&file).enumerate() {
         fs::write(folder.join(format!("committed-{number}")), input)?;
     }
@@ -166,7 +174,7 @@ fn unpack(name: &str, folder: &Path) -> Result<()> {
 }
 
 /// Commits the fewest inputs that cover what those in a folder do; how many, and their bytes.
-fn pack(program: &Path, name: &str, folder: &Path) -> Result<(usize, usize)> {
+fn pack(program: &Path, name: &str, folder: &Path, corpus: &Path) -> Result<(usize, usize)> {
     let few = folder.with_extension("few");
     let _ = fs::remove_dir_all(&few);
     fs::create_dir_all(&few)?;
@@ -181,21 +189,21 @@ fn pack(program: &Path, name: &str, folder: &Path) -> Result<(usize, usize)> {
         packed.extend_from_slice(&u16::try_from(input.len())?.to_le_bytes());
         packed.extend_from_slice(&input);
     }
-    fs::create_dir_all(workspace::root().join(CORPUS))?;
-    fs::write(corpus(name), &packed)?;
+    fs::create_dir_all(corpus.parent().unwrap_or(corpus))?;
+    fs::write(corpus, &packed)?;
     fs::remove_dir_all(&few)?;
     Ok((files.len(), packed.len()))
 }
 
 /// A patch is `tests/fuzz/planted/TARGET-what-is-broken.patch`.
-fn planted(fuzz: &Fuzz, targets: &BTreeMap<&str, &str>) -> Result<ExitCode> {
+fn planted(fuzz: &Fuzz, targets: &BTreeMap<String, Target>) -> Result<ExitCode> {
     let place = workspace::target().join("fuzz/planted");
     let tree = Tree::at(place.join("tree"))?;
     let (mut found, mut tried) = (0, 0);
     for patch in workspace::files_with("patch")?.iter().filter(|file| file.starts_with(PLANTED)) {
         let name = patch.file_stem().unwrap_or_default().to_string_lossy();
         let target = name.split('-').next().unwrap_or_default();
-        let Some(longest) = targets.get(target) else { continue };
+        let Some(Target { longest, .. }) = targets.get(target) else { continue };
         tried += 1;
         let folder = place.join("inputs");
         let _ = fs::remove_dir_all(&folder);
@@ -214,7 +222,9 @@ fn planted(fuzz: &Fuzz, targets: &BTreeMap<&str, &str>) -> Result<ExitCode> {
         }
     }
     println!("{found} of {tried} found at {}", tree.commit);
-    if found == tried && tried > 0 { Ok(ExitCode::SUCCESS) } else { Err(anyhow!("not all were found")) }
+    ensure!(tried > 0, "no bug is planted for {}: see {PLANTED}", fuzz.target);
+    ensure!(found == tried, "not all were found");
+    Ok(ExitCode::SUCCESS)
 }
 
 #[cfg(test)]
@@ -222,14 +232,19 @@ mod tests {
     use std::path::Path;
     use std::time::Duration;
 
-    use super::{Told, inputs, targets, time, told};
+    use super::{FOLDERS, Target, Told, inputs, targets, time, told};
     use crate::workspace;
 
     #[test]
     fn the_targets_are_read_from_their_table() {
-        let text = workspace::read(Path::new(super::TARGETS)).unwrap();
-        assert_eq!(targets(&text).get("session"), Some(&"200"));
-        assert_eq!(targets(&text).len(), text.matches("Target { name: ").count());
+        let targets = targets().unwrap();
+        let known = |name, longest: &str, folder| {
+            assert_eq!(targets.get(name), Some(&Target { longest: longest.to_owned(), folder }), "{name}");
+        };
+        known("session", "200", "tests/fuzz");
+        known("page", "300", "tests/fuzz/page");
+        let texts = FOLDERS.map(|folder| workspace::read(&Path::new(folder).join("src/lib.rs")).unwrap());
+        assert_eq!(targets.len(), texts.concat().matches("Target { name: ").count());
     }
 
     #[test]

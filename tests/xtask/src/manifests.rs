@@ -44,6 +44,8 @@ enum Place {
     Gateway,
     Examples,
     Tests,
+    /// Tests of whole programs, on which no other crate stands.
+    ProgramTests,
 }
 
 /// Packages that need an operating system, a runtime or a network stack: never below the core.
@@ -115,6 +117,9 @@ impl Manifest {
 
     fn place(&self) -> Option<Place> {
         let mut folders = self.file.components().map(|component| component.as_os_str().to_str().unwrap_or_default());
+        if ["page", "libfuzzer"].iter().any(|folder| self.file.starts_with(Path::new("tests/fuzz").join(folder))) {
+            return Some(Place::ProgramTests);
+        }
         match (folders.next()?, folders.next()?) {
             ("core", "Cargo.toml") => Some(Place::Core),
             ("core", _) => Some(Place::CoreMember),
@@ -196,6 +201,8 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.
         (Place::Examples, Place::Tests) => for_tests,
+        (Place::ProgramTests, to) => to != Place::Gateway,
+        (_, Place::ProgramTests) => false,
         (Place::Provider | Place::Recording, Place::Provider | Place::Recording | Place::CommandLine) => false,
         (Place::CommandLine, Place::Provider) => false,
         (_, Place::Recording) => true,
@@ -249,6 +256,21 @@ mod tests {
     fn the_core_needs_no_runtime() {
         assert_eq!(wrong("", "[dependencies]\nembassy-time = \"1\"\ntokio = \"1\"").len(), 2);
         assert!(wrong("", "[dev-dependencies]\ntokio = \"1\"").is_empty());
+    }
+
+    #[test]
+    fn only_tests_of_programs_stand_on_the_command_line() {
+        let package = |name: &str, on: &str| format!("[package]\nname = \"{name}\"\n[dependencies]\n{on} = \"1\"");
+        let wrong = |folder: &str, other_on: &str| {
+            wrong_arrows(&[
+                manifest("std-port/cli/web/Cargo.toml", "[package]\nname = \"cara-web\""),
+                manifest(&format!("tests/{folder}/Cargo.toml"), &package("tested", "cara-web")),
+                manifest("tests/other/Cargo.toml", &package("other", other_on)),
+            ])
+        };
+        assert!(wrong("fuzz/page", "serde").is_empty());
+        assert_eq!(wrong("fuzz/page", "tested").len(), 1);
+        assert_eq!(wrong("page", "serde").len(), 1);
     }
 
     #[test]

@@ -76,13 +76,12 @@ pub(crate) async fn functions(State(shared): Asked, Extension(user): Of, body: B
 
 /// A call, or with `"hold": true` one that is kept: until its end, or until the page is gone or says nothing more.
 pub(crate) async fn call(State(shared): Asked, Extension(user): Of, body: Body) -> Response {
-    let mut asked = match read(body).await {
+    let asked = match read(body).await {
         Ok(asked) => asked,
         Err(refusal) => return refusal,
     };
-    let is_held = asked.as_object_mut().and_then(|asked| asked.remove("hold")) == Some(Value::Bool(true));
-    let question = match form::call(asked) {
-        Ok(question) => question,
+    let (question, is_held) = match form::call(asked) {
+        Ok(call) => call,
         Err(text) => return lines(&[failed(&Failure::configuration("BadCall", text))]),
     };
     let Some(place) = Place::take(&shared.limits, |limits| &limits.calls) else { return busy("calls", CALLS) };

@@ -69,8 +69,9 @@ pub(crate) fn streamed_all(stream: &str, values: &[Argument]) -> Value {
     values.iter().map(one).collect()
 }
 
-/// A call as a page asks for it: as on the control socket, with values in the page's form.
-pub(crate) fn call(mut asked: Value) -> Result<CallQuestion, String> {
+/// A call as a page asks for it: as on the control socket, with values in the page's form; and whether it is to be held.
+pub(crate) fn call(mut asked: Value) -> Result<(CallQuestion, bool), String> {
+    let is_held = asked.as_object_mut().and_then(|asked| asked.remove("hold")) == Some(Value::Bool(true));
     // Of a signature that the page cannot read.
     if let Some(text) = asked["arguments"].as_str() {
         asked["arguments"] =
@@ -98,7 +99,8 @@ pub(crate) fn call(mut asked: Value) -> Result<CallQuestion, String> {
             _ => {}
         }
     }
-    serde_json::from_value(asked).map_err(|error| format!("that is no call: {error}"))
+    let call = serde_json::from_value(asked).map_err(|error| format!("that is no call: {error}"))?;
+    Ok((call, is_held))
 }
 
 #[cfg(test)]
@@ -125,7 +127,7 @@ mod tests {
 
     #[test]
     fn whole_numbers_keep_all_their_digits() {
-        let call = call(asked(json!(["9223372036854775807", "-1"]))).unwrap();
+        let (call, _) = call(asked(json!(["9223372036854775807", "-1"]))).unwrap();
         assert_eq!(call.arguments[0].value, ArgumentValue::Int(vec![i64::MAX, -1]));
         assert_eq!(shown(&call.arguments[0])["value"], json!(["9223372036854775807", "-1"]));
     }
@@ -136,7 +138,7 @@ mod tests {
         let argument = json!({ "name": "l", "size": 1, "type": "record", "value": text });
         let mut asked = asked(json!(["1", "2"]));
         asked["arguments"] = json!([argument]);
-        let call = call(asked).unwrap();
+        let (call, _) = call(asked).unwrap();
         let shown = shown(&call.arguments[0])["value"].as_str().unwrap().split_whitespace().collect::<String>();
         assert_eq!(shown, text.split_whitespace().collect::<String>());
         let streamed = streamed(&call.arguments[0]);
@@ -148,7 +150,7 @@ mod tests {
         let mut asked = super::tests::asked(json!([]));
         asked["arguments"] = list.to_string().into();
         let exact = Value::Array(vec![json!([9_007_199_254_740_993_i64])]);
-        assert_eq!(super::call(asked).unwrap().arguments[0].value, ArgumentValue::List(exact));
+        assert_eq!(super::call(asked).unwrap().0.arguments[0].value, ArgumentValue::List(exact));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! are no secret, and are for everybody who asks for this host.
 
 use std::error::Error;
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv6Addr};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -81,10 +81,13 @@ impl std::str::FromStr for Outside {
         let uri: Uri = format!("{scheme}://{host}/").parse().map_err(|_| WRONG)?;
         let authority = uri.authority().filter(|authority| !authority.as_str().contains('@')).ok_or(WRONG)?;
         let host = Some(authority.host()).filter(|host| !host.is_empty()).ok_or(WRONG)?.to_ascii_lowercase();
-        let port = match authority.port_u16() {
-            None if authority.as_str().len() > host.len() => return Err(WRONG),
-            Some(port) if port.to_string() != own_port => format!(":{port}"),
-            _ => String::new(),
+        // With brackets in its midst an authority has parts that are neither.
+        let behind = authority.as_str().get(host.len()..).unwrap_or_default();
+        let port = match behind.strip_prefix(':').map(str::parse::<u16>) {
+            None if behind.is_empty() => String::new(),
+            Some(Ok(port)) if port.to_string() == own_port => String::new(),
+            Some(Ok(port)) => format!(":{port}"),
+            _ => return Err(WRONG),
         };
         let path = if path.ends_with('/') { path.to_owned() } else { format!("{path}/") };
         Ok(Self { origin: format!("{scheme}://{host}{port}"), host, path })
@@ -132,11 +135,11 @@ impl Guard {
     }
 
     fn is_this_host(&self, host: &str) -> bool {
-        let name = match host.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
-            Some((address, _)) => address,
-            None => host.rsplit_once(':').map_or(host, |(name, _)| name),
-        };
-        let name = name.to_ascii_lowercase();
+        if let Some(rest) = host.strip_prefix('[') {
+            let address = rest.split_once(']').filter(|(_, port)| port.is_empty() || port.starts_with(':'));
+            return address.is_some_and(|(address, _)| address.parse::<Ipv6Addr>().is_ok());
+        }
+        let name = host.rsplit_once(':').map_or(host, |(name, _)| name).to_ascii_lowercase();
         name.parse::<IpAddr>().is_ok() || name == "localhost" || self.names.contains(&name)
     }
 
@@ -310,9 +313,16 @@ mod tests {
         ] {
             assert_eq!(guard().check(&Method::GET, &headers(&[("host", host)]), false), Ok(()), "{host}");
         }
-        for host in
-            ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost.evil.example", "", "[evil"]
-        {
+        for host in [
+            "evil.example",
+            "evil.example:8420",
+            "127.0.0.1.evil.example",
+            "localhost.evil.example",
+            "",
+            "[evil",
+            "[localhost]",
+            "[::1].evil.example",
+        ] {
             assert_eq!(guard().check(&Method::GET, &headers(&[("host", host)]), false), Err(Refusal::Host), "{host}");
         }
         assert_eq!(guard().check(&Method::GET, &HeaderMap::new(), false), Err(Refusal::Host));
@@ -413,6 +423,7 @@ mod tests {
             "ftp://fleet.example",
             "https://",
             "https://:80",
+            "http://a[::1]:443",
             "https:///x",
             "https://a@b",
             "https://a:x",

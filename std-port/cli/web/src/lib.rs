@@ -7,6 +7,8 @@
 
 mod asking;
 mod door;
+#[doc(hidden)]
+pub mod entrance;
 mod form;
 mod guard;
 mod limits;
