@@ -35,9 +35,11 @@ const KINDS: [(Fault, u32, f64); 7] = [
 ];
 /// As above, in a run that cuts links.
 const CUTS: (Fault, u32, f64) = (Fault::Cut, 1, 40.0);
-/// A soak looks for what grows while a manager lives, and where vehicles start again and again.
+/// A soak looks for what grows while a manager lives: they are killed less often, and in its first part only.
 const SOAK_KILLS: f64 = 4.0;
-const SOAK_STARTS: f64 = 0.2;
+const SOAK_KILLS_PART: std::ops::Range<f64> = 0.06..0.2;
+/// And where vehicles start again and again: the memory of a process fills up over some 60 starts of each of its vehicles.
+const SOAK_STARTS: f64 = 0.03;
 /// The part of a run in which things are broken; the rest is left to finish.
 const PART: std::ops::Range<f64> = 0.06..0.86;
 
@@ -52,12 +54,14 @@ pub fn schedule(seed: u64, span: Duration, is_soak: bool) -> Vec<(Duration, Faul
             _ => every,
         };
         let count = least.max((span.as_secs_f64() / every) as u32);
-        let width = (PART.end - PART.start) / f64::from(count);
+        let kills = matches!(fault, Fault::KillManager | Fault::TakeOver);
+        let parts = if is_soak && kills { SOAK_KILLS_PART } else { PART };
+        let width = (parts.end - parts.start) / f64::from(count);
         // Those that happen once are kept apart: each has its own place in the run.
         let place = (index as f64 + 0.5) / KINDS.len() as f64;
         for number in 0..count {
             let within = if count == 1 { place } else { rng.f64() };
-            let part = PART.start + width * (f64::from(number) + within);
+            let part = parts.start + width * (f64::from(number) + within);
             faults.push((span.mul_f64(part), fault));
         }
     }
@@ -92,7 +96,13 @@ mod tests {
         };
         assert_eq!((count(true, Fault::Cut), count(false, Fault::Cut)), (180, 0));
         assert_eq!((count(true, Fault::KillManager), count(false, Fault::KillManager)), (12, 48));
-        assert_eq!((count(true, Fault::Off), count(false, Fault::Off)), (2_400, 480));
+        assert_eq!((count(true, Fault::Off), count(false, Fault::Off)), (16_000, 480));
+        let faults = schedule(1, Duration::from_secs(7_200), true);
+        let kills = faults.iter().filter(|(_, fault)| matches!(fault, Fault::KillManager | Fault::TakeOver));
+        assert!(
+            kills.map(|(at, _)| *at).max() < Some(Duration::from_secs(1_500)),
+            "managers live for an hour and a half"
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! `cargo xtask soak`: the warehouse with its standby and page for hours, links cut and processes killed, and nothing may grow.
+//! `cargo xtask soak`: the warehouse with its standby and page for hours, links cut and processes killed, and nothing may grow; or
+//! the gateway to VDA 5050 with its broker and vehicles.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,6 +10,7 @@ use anyhow::{Result, bail};
 use cara_processes::files;
 use clap::Args;
 
+use crate::command::Run;
 use crate::fuzz::time;
 use crate::{binaries, demo};
 
@@ -22,23 +24,32 @@ pub(crate) struct Soak {
     #[arg(long = "for", value_name = "TIME", default_value = "2h", value_parser = time)]
     time: Duration,
     /// What processes held, each 10 s; a run that was stopped goes on with it.
-    #[arg(long, value_name = "FILE", default_value = "target/soak.csv")]
-    csv: PathBuf,
+    /// `target/soak.csv` or `target/soak-gateway.csv` unless given.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
     /// Draws it here, as soak.svg.
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
     /// The last vehicle is firmware in QEMU.
     #[arg(long)]
     board: bool,
+    /// The gateway in place of the warehouse, with 20 vehicles of its own; needs mosquitto.
+    #[arg(long, conflicts_with_all = ["vehicles", "board"])]
+    gateway: bool,
 }
 
 /// Runs for what is left of the time, then judges all that the file has.
 pub(crate) fn run(soak: &Soak) -> Result<ExitCode> {
-    files::can_write(&soak.csv)?;
-    let csv = std::path::absolute(&soak.csv)?;
+    let usual = if soak.gateway { "target/soak-gateway.csv" } else { "target/soak.csv" };
+    let csv = std::path::absolute(soak.csv.as_deref().unwrap_or(usual.as_ref()))?;
+    files::can_write(&csv)?;
     let (segments, done) = measured(&csv);
     let minutes = soak.time.saturating_sub(done).as_secs().div_ceil(60) as u32;
-    if minutes > 0 {
+    if minutes > 0 && soak.gateway {
+        let test = "test --locked --manifest-path gateways/vda5050/Cargo.toml --target-dir target/vda5050 --test soak";
+        let run = Run::cargo().args(test.split(' ')).args(["--", "--nocapture"]);
+        run.env("CARA_SOAK_FILE", &csv.to_string_lossy()).env("CARA_SOAK_MINUTES", &minutes.to_string()).stream()?;
+    } else if minutes > 0 {
         let options = demo::Options::soak(soak.vehicles, minutes, segments + 1, soak.board, csv.clone());
         if demo::warehouse(&options)? != ExitCode::SUCCESS {
             bail!("the warehouse was not as it has to be, see above; {} has what it held", csv.display());

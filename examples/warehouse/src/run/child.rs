@@ -135,9 +135,8 @@ impl Child {
         }
     }
 
-    /// What it holds now; `None` once it is gone.
-    pub(super) fn held(&self) -> Option<Held> {
-        held(self.process.id())
+    pub(super) fn id(&self) -> u32 {
+        self.process.id()
     }
 }
 
@@ -149,7 +148,8 @@ impl Drop for Child {
     }
 }
 
-fn usage(pid: u32) -> Option<Usage> {
+/// `None` once it is gone.
+pub(super) fn usage(pid: u32) -> Option<Usage> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     // The name of the program, in brackets, may have spaces.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
@@ -161,7 +161,7 @@ fn usage(pid: u32) -> Option<Usage> {
     Some(Usage { cpu, resident_kib, threads })
 }
 
-fn held(pid: u32) -> Option<Held> {
+pub(super) fn held(pid: u32) -> Option<Held> {
     let memory = std::fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?;
     let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).ok()?.count();
     Some(Held { proportional_kib: field(&memory, "Pss:")?, descriptors })

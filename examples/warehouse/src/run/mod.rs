@@ -3,7 +3,7 @@
 mod board;
 mod child;
 mod report;
-mod soak;
+pub mod soak;
 mod stage;
 pub mod truth;
 
@@ -128,11 +128,13 @@ pub fn run(options: &Options) -> Result<ExitCode> {
         commanding: false,
         old_manager: None,
         killed: None,
+        stopping_all: false,
+        is_alone: false,
         frozen: false,
         looked: Instant::now(),
         progress: Instant::now(),
         stopped: HashSet::new(),
-        samples: options.soak.as_deref().map(Samples::open).transpose()?,
+        samples: options.soak.as_deref().map(|file| soak::may_cut().and_then(|()| Samples::open(file))).transpose()?,
         cut: false,
     };
     run.stage.show(&format!("{} vehicles, {} orders, seed {}", options.vehicles, orders.len(), options.seed));
@@ -188,6 +190,10 @@ struct Run<'m> {
     old_manager: Option<usize>,
     /// When the manager was killed, until a vehicle drives for its standby.
     killed: Option<Instant>,
+    /// All are told to stop, and the manager has not said how many have.
+    stopping_all: bool,
+    /// Nobody stands by, since one was killed and is not started again yet.
+    is_alone: bool,
     /// It hangs.
     frozen: bool,
     looked: Instant,
@@ -231,6 +237,8 @@ impl Run<'_> {
                 self.progress = Instant::now();
                 self.stage.show(&format!("{} of {} orders are done", self.truth.done.len(), self.tally.orders));
             }
+            let is_alone = options.standby && self.killed.is_some_and(|killed| killed.elapsed() > FINISHING);
+            ensure!(!is_alone, "no vehicle drives for the standby {FINISHING:?} after its manager was killed");
             let late = span + FINISHING;
             ensure!(start.elapsed() < late, "{} orders are not done", self.tally.orders - self.truth.done.len());
         }
@@ -294,6 +302,7 @@ impl Run<'_> {
             }
             ["stopped-all", stopped, asked, micros] => {
                 let took = Duration::from_micros(micros.parse()?);
+                self.stopping_all = false;
                 self.stage.show(&format!("stop-all: {stopped} of {asked} have stopped"));
                 self.tally.stopped_all.push((stopped.parse()?, asked.parse()?, took));
             }
@@ -324,7 +333,9 @@ impl Run<'_> {
     /// Does one thing; what follows from it, after what time.
     fn do_one(&mut self, due: Due) -> Result<Option<(Duration, Due)>> {
         // A manager that is away or new is left to come up first.
-        let is_calm = self.commanding && self.old_manager.is_none() && !self.frozen && !self.cut;
+        let is_whole = self.commanding && self.old_manager.is_none() && !self.is_alone;
+        // What else breaks meanwhile would keep vehicles from acknowledging a stop of all.
+        let is_calm = is_whole && !self.frozen && !self.cut && !self.stopping_all;
         Ok(match due {
             Due::Break(fault) if !is_calm => Some((AGAIN, Due::Break(fault))),
             Due::Break(fault) => self.break_one(fault)?,
@@ -364,6 +375,7 @@ impl Run<'_> {
                 } else {
                     self.stage.start_manager(false)?;
                 }
+                self.is_alone = false;
                 self.tally.kills += 1;
                 None
             }
@@ -397,6 +409,7 @@ impl Run<'_> {
             }
             Fault::StopAll => {
                 self.stage.notify_manager("stop-all");
+                self.stopping_all = true;
                 self.stopped.extend((1..=self.stage.vehicles()).map(vehicle_name));
                 Some((STOPPED, Due::GoOn(None)))
             }
@@ -424,6 +437,7 @@ impl Run<'_> {
                 self.stage.kill_manager()?;
                 self.commanding = false;
                 self.killed = Some(Instant::now());
+                self.is_alone = true;
                 Some((AWAY, Due::StartManager))
             }
         })

@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 
+use super::child::{Held, Usage, held, usage};
+
 /// Where the page of a soak listens, in a network of its own.
 pub(super) const PAGE: u16 = 8420;
 /// Between two looks at what processes hold.
@@ -19,7 +21,7 @@ const COLUMNS: &str =
 const OWN_NETWORK: &str = "CARA_OWN_NETWORK";
 
 /// The file of a soak.
-pub(super) struct Samples {
+pub struct Samples {
     file: File,
     segment: u32,
     /// Seconds of earlier runs.
@@ -30,11 +32,7 @@ pub(super) struct Samples {
 
 impl Samples {
     /// Goes on with a file, or begins one.
-    pub(super) fn open(path: &Path) -> Result<Self> {
-        ensure!(
-            std::env::var_os(OWN_NETWORK).is_some(),
-            "a soak cuts links: `cargo xtask soak` runs it in its own network"
-        );
+    pub fn open(path: &Path) -> Result<Self> {
         let mut file = OpenOptions::new().read(true).append(true).create(true).open(path)?;
         let mut text = String::new();
         file.read_to_string(&mut text)?;
@@ -54,7 +52,7 @@ impl Samples {
     }
 
     /// Whether it is time to look again.
-    pub(super) fn is_due(&mut self) -> bool {
+    pub fn is_due(&mut self) -> bool {
         let is_due = self.last.elapsed() >= EACH;
         if is_due {
             self.last = Instant::now();
@@ -63,11 +61,27 @@ impl Samples {
     }
 
     /// Adds a line for each process, which have its columns from `process` on.
-    pub(super) fn write(&mut self, processes: &[String]) -> Result<()> {
+    pub fn write(&mut self, processes: &[String]) -> Result<()> {
         let (segment, seconds) = (self.segment, self.before + self.began.elapsed().as_secs());
         let lines: String = processes.iter().map(|line| format!("{segment},{seconds},{line}\n")).collect();
         self.file.write_all(lines.as_bytes()).context("the file of the soak")
     }
+}
+
+/// The line of a process, in its life of this number, with the messages and datagrams that it has sent; `None` once it is gone.
+pub fn line(process: &str, life: usize, pid: u32, sent: [u64; 2]) -> Option<String> {
+    let (Usage { cpu, resident_kib, threads }, Held { proportional_kib, descriptors }) = (usage(pid)?, held(pid)?);
+    let ([messages, datagrams], cpu) = (sent, cpu.as_millis());
+    Some(format!(
+        "{process},{life},{resident_kib},{proportional_kib},{descriptors},{threads},{cpu},{messages},{datagrams}"
+    ))
+}
+
+/// Links are cut in a network of its own only.
+pub(super) fn may_cut() -> Result<()> {
+    let why = "a soak cuts links: `cargo xtask soak` runs it in its own network";
+    ensure!(std::env::var_os(OWN_NETWORK).is_some(), why);
+    Ok(())
 }
 
 /// A rule that cuts links of some kind; an eighth of all streams, or a fifth of all packets.

@@ -155,8 +155,7 @@ impl Stage {
     /// What each process holds, a line each: columns of the file of a soak.
     pub(super) fn held(&self) -> Vec<String> {
         let line = |number: &usize| {
-            let (child, usage) = (&self.children[*number], self.children[*number].usage);
-            let (held, sent) = (child.held()?, self.sent.get(number).copied().unwrap_or_default());
+            let sent = self.sent.get(number).copied().unwrap_or_default();
             let process = match &self.roles[*number] {
                 Role::Vehicles { first, count } => format!("vehicles {first} to {}", first + count - 1),
                 Role::Board => "board".to_owned(),
@@ -165,9 +164,7 @@ impl Stage {
                 Role::Mechanic => "mechanic".to_owned(),
                 Role::Page => "page".to_owned(),
             };
-            let (memory, cpu) = (usage.resident_kib, usage.cpu.as_millis());
-            let counts = format!("{},{},{cpu},{},{}", held.descriptors, usage.threads, sent[0], sent[1]);
-            Some(format!("{process},{number},{memory},{},{counts}", held.proportional_kib))
+            soak::line(&process, *number, self.children[*number].id(), sent)
         };
         self.running.iter().filter_map(line).collect()
     }

@@ -8,8 +8,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
 
-/// Seconds of each life in which it fills up: memory of a unit until it has started and lost its links a few times.
-const WARM_UP: f64 = 1_800.0;
+/// Seconds of each life in which it fills up: the memory of a process with many vehicles until each has started some 30 times.
+const WARM_UP: f64 = 3_600.0;
 const MINUTE: f64 = 60.0;
 
 /// Something that must not grow.
@@ -166,15 +166,15 @@ fn mean(samples: &[(f64, Sample)]) -> Sample {
 mod tests {
     use super::{Slope, parse};
 
-    /// Two lives of two hours, the second on a higher level; threads jitter by one, memory grows by `leak` KiB an hour.
+    /// Two lives of three hours, the second on a higher level; threads jitter by one, memory grows by `leak` KiB an hour.
     fn file(leak: f64) -> String {
         let line = |life: u32, step: u32| {
-            let seconds = life * 7_200 + step * 10;
+            let seconds = life * 10_800 + step * 10;
             let memory =
                 20_000.0 + f64::from(life) * 5_000.0 + leak * f64::from(step) / 360.0 + f64::from(step % 7) * 30.0;
             format!("0,{seconds},manager,{life},{memory:.0},{memory:.0},210,{},{step},0,0\n", 20 + (step / 6) % 2)
         };
-        (0..2).flat_map(|life| (0..720).map(move |step| line(life, step))).collect()
+        (0..2).flat_map(|life| (0..1_080).map(move |step| line(life, step))).collect()
     }
 
     #[test]
@@ -190,8 +190,8 @@ mod tests {
     fn the_start_of_a_life_and_half_lines_do_not_count() {
         let text = file(0.0) + "0,90000,manager,1,5\nsegment,seconds\n";
         let lives = &parse(&text)["manager"];
-        assert_eq!(lives.iter().map(Vec::len).collect::<Vec<_>>(), [90, 90]);
-        assert!(lives[0][0].hours * 3_600.0 >= 1_800.0);
+        assert_eq!(lives.iter().map(Vec::len).collect::<Vec<_>>(), [120, 120]);
+        assert!(lives[0][0].hours * 3_600.0 >= super::WARM_UP);
         assert!(parse("0,10,manager,1,5,5,5,5,5,5,5\n").is_empty());
     }
 }
