@@ -38,7 +38,7 @@ const CUTS: (Fault, u32, f64) = (Fault::Cut, 1, 40.0);
 /// A soak looks for what grows while a manager lives: they are killed less often, and in its first part only.
 const SOAK_KILLS: f64 = 4.0;
 const SOAK_KILLS_PART: std::ops::Range<f64> = 0.06..0.2;
-/// And where vehicles start again and again: the memory of a process fills up over some 60 starts of each of its vehicles.
+/// And where vehicles start again and again: the memory of a process fills up over the first 30 starts of each of its vehicles.
 const SOAK_STARTS: f64 = 0.03;
 /// The part of a run in which things are broken; the rest is left to finish.
 const PART: std::ops::Range<f64> = 0.06..0.86;

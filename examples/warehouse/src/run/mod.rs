@@ -237,8 +237,8 @@ impl Run<'_> {
                 self.progress = Instant::now();
                 self.stage.show(&format!("{} of {} orders are done", self.truth.done.len(), self.tally.orders));
             }
-            let is_alone = options.standby && self.killed.is_some_and(|killed| killed.elapsed() > FINISHING);
-            ensure!(!is_alone, "no vehicle drives for the standby {FINISHING:?} after its manager was killed");
+            let is_stuck = options.standby && self.killed.is_some_and(|killed| killed.elapsed() > FINISHING);
+            ensure!(!is_stuck, "no vehicle drives for the standby {FINISHING:?} after its manager was killed");
             let late = span + FINISHING;
             ensure!(start.elapsed() < late, "{} orders are not done", self.tally.orders - self.truth.done.len());
         }
