@@ -1,5 +1,6 @@
 //! Builds the tests that judge, and runs them.
 
+use std::io::{BufReader, Read};
 use std::ops::Range;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
@@ -126,8 +127,18 @@ impl Programs {
         judge.arg("-c").arg(limited).arg(program).args(tests).arg("--quiet").current_dir(folder);
         judge.env("CARA_SIM_SEEDS", SEEDS).env("CARA_MUTANT", number.to_string()).env("RUST_BACKTRACE", "0");
         judge.env("PROPTEST_FAILURE_PERSISTENCE", "off").env("CARA_CHAOS_UNEXPLAINED", "1");
-        let status = judge.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status()?;
+        let mut judge = judge.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
+        let has_failed = fails(judge.stdout.take().context("its output is read")?);
+        if has_failed {
+            judge.kill()?;
+        }
+        let status = judge.wait()?;
         ensure!(!matches!(status.signal(), Some(SIGINT | SIGTERM)), "interrupted");
-        Ok(status.success())
+        Ok(!has_failed && status.success())
     }
+}
+
+/// Reads until the first test has failed, of which `--quiet` writes an `F` in place of a dot; else to the end.
+fn fails(output: impl Read) -> bool {
+    BufReader::new(output).bytes().map_while(Result::ok).any(|byte| byte == b'F')
 }

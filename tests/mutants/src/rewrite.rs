@@ -139,7 +139,9 @@ impl Finder<'_> {
                 && !self.placed.contains(number)
                 && body.stmts.first().is_some_and(|first| first.span().byte_range().start == place.start)
         };
-        let values: Vec<_> = self.wanted.iter().filter(mine).cloned().collect();
+        // Behind `impl Trait` the value and what replaces it are two types.
+        let is_opaque = matches!(&signature.output, syn::ReturnType::Type(_, output) if names_no_type(output));
+        let values: Vec<_> = self.wanted.iter().filter(mine).filter(|_| !is_opaque).cloned().collect();
         for (number, place) in values {
             self.placed.insert(number);
             let text = format!("if crate::mutant::on({number}) {{ return {}; }} ", self.mutants[number].replacement);
@@ -147,6 +149,19 @@ impl Finder<'_> {
         }
         true
     }
+}
+
+/// Whether a function's type is, or has in it, `impl Trait`.
+fn names_no_type(output: &syn::Type) -> bool {
+    struct Opaque(bool);
+    impl Visit<'_> for Opaque {
+        fn visit_type_impl_trait(&mut self, _: &syn::TypeImplTrait) {
+            self.0 = true;
+        }
+    }
+    let mut opaque = Opaque(false);
+    opaque.visit_type(output);
+    opaque.0
 }
 
 /// Whether an expression is, or ends in, a pattern, which only a condition may be.

@@ -29,7 +29,7 @@ pub fn lasts(number: usize, each: usize) -> Duration {
 pub struct Calls {
     answered: HashMap<i64, bool>,
     runs: HashMap<i64, usize>,
-    /// Answers that were another call's, and calls without an outcome.
+    /// Answers that were another call's, calls that ran elsewhere, and those without an outcome.
     wrong: usize,
 }
 
@@ -37,6 +37,11 @@ impl Calls {
     /// The callee runs one.
     pub fn ran(&mut self, number: i64) {
         *self.runs.entry(number).or_default() += 1;
+    }
+
+    /// Another node than the callee runs one.
+    pub fn strayed(&mut self, _number: i64) {
+        self.wrong += 1;
     }
 
     /// One has ended after this time, with an answer or an error. `more` is how long its caller stood still meanwhile.
@@ -109,6 +114,8 @@ mod tests {
         assert_eq!(calls.lost(), 4, "it has no outcome in time");
         calls.ended(3, None, TIMEOUT + LATE * 2, LATE);
         assert_eq!(calls.lost(), 4, "its caller stood still");
+        calls.strayed(0);
+        assert_eq!(calls.lost(), 5, "it ran elsewhere");
     }
 
     #[test]

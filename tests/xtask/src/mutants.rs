@@ -60,8 +60,9 @@ pub(crate) fn run(mutants: &Mutants) -> Result<ExitCode> {
     println!("at {}", tree.commit);
     let tool = Run::cargo().args(["run", "--quiet", "--locked", "--manifest-path", MANIFEST, "--target-dir"]);
     let tool = tool.args([&place.join("tool")]).args(["--"]).args([&tree.root, &listed, &place.join("state")]);
-    // Debugging information takes a third of the build.
+    // Debugging information takes a third of the build; judges run hundreds of times.
     let tool = tool.env("CARGO_TARGET_DIR", &place.join("build").to_string_lossy()).env("CARGO_PROFILE_DEV_DEBUG", "0");
+    let tool = tool.env("CARGO_PROFILE_DEV_OPT_LEVEL", "1");
     let code = tool.args([EQUIVALENT, &mutants.shard]).code()?;
     Ok(if code == Some(0) { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

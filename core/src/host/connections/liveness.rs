@@ -385,6 +385,22 @@ mod tests {
     }
 
     #[test]
+    fn a_coarse_clock_loses_nobody_and_finds_who_is_silent_three_ticks_later_at_most() {
+        for tick in [10, 100, 250, 333, 500, 900] {
+            let mut liveness = Liveness::new(at(0), PERIOD);
+            let coarse = |millis: u64| at(millis - millis % tick);
+            for millis in (0..60_000).step_by(10) {
+                if millis % 1_000 == 0 {
+                    liveness.heard_datagram(coarse(millis));
+                }
+                assert!(!poll(&mut liveness, coarse(millis)).lost, "ticks of {tick} ms, at {millis}");
+            }
+            let lost = (60_000..80_000).step_by(10).find(|millis| poll(&mut liveness, coarse(*millis)).lost).unwrap();
+            assert!((62_500..=62_510 + 3 * tick).contains(&lost), "ticks of {tick} ms: {lost}");
+        }
+    }
+
+    #[test]
     fn no_period_at_all_is_a_millisecond() {
         let mut liveness = Liveness::new(at(0), Duration::ZERO);
         liveness.heard_datagram(at(0));

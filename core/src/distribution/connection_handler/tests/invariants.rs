@@ -1,6 +1,6 @@
 //! Invariants of the node, whatever a port and its peers do, compared with a simple model of its links.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use proptest::prelude::*;
 
@@ -13,10 +13,10 @@ const MAXIMUM: u16 = 3;
 enum Step {
     /// A new link with a hello of this peer and boot.
     Hello { peer: u8, life: u64 },
-    /// The n-th open link ends.
-    End(prop::sample::Index),
+    /// The n-th open link ends, counted round and round.
+    End(usize),
     /// The n-th open link answers a challenge, whether it was challenged or not.
-    Answer(prop::sample::Index),
+    Answer(usize),
     /// A peer that this unit dials answers.
     Heard(u8),
     /// Time passes.
@@ -26,8 +26,8 @@ enum Step {
 fn step() -> impl Strategy<Value = Step> {
     prop_oneof![
         3 => (0u8..6, 1u64..3).prop_map(|(peer, life)| Step::Hello { peer, life }),
-        2 => any::<prop::sample::Index>().prop_map(Step::End),
-        1 => any::<prop::sample::Index>().prop_map(Step::Answer),
+        2 => any::<usize>().prop_map(Step::End),
+        1 => any::<usize>().prop_map(Step::Answer),
         1 => (0u8..6).prop_map(Step::Heard),
         2 => (0u64..2_000).prop_map(Step::Wait),
     ]
@@ -51,9 +51,19 @@ struct Port {
     node: Node<InMemory>,
     now: Instant,
     open: BTreeMap<u16, (u8, Open)>,
+    /// Links that were asked whether they live, and have not answered yet.
+    challenged: BTreeSet<u16>,
 }
 
 impl Port {
+    fn new(nodes: usize) -> Self {
+        let storage =
+            NodeStorage { nodes: slice(nodes), order: slice(nodes), links: slice(LINKS.into()), findings: slice(2) };
+        let mut node = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage);
+        node.set_maximum_nodes(MAXIMUM);
+        Self { node, now: at(0), open: BTreeMap::new(), challenged: BTreeSet::new() }
+    }
+
     fn free(&self) -> Option<u16> {
         (0..LINKS).find(|link| !self.open.contains_key(link))
     }
@@ -66,13 +76,14 @@ impl Port {
                     self.hello(link, number, life);
                 }
             }
-            Step::End(index) => {
-                if let Some(link) = self.choose(index) {
+            Step::End(number) => {
+                if let Some(link) = self.choose(number) {
                     self.end(link);
                 }
             }
-            Step::Answer(index) => {
-                if let Some(link) = self.choose(index) {
+            Step::Answer(number) => {
+                if let Some(link) = self.choose(number) {
+                    self.challenged.remove(&link);
                     self.node.challenge_answered(self.now, LinkId(link));
                 }
             }
@@ -90,9 +101,8 @@ impl Port {
         self.check();
     }
 
-    fn choose(&self, index: prop::sample::Index) -> Option<u16> {
-        let links: Vec<_> = self.open.keys().copied().collect();
-        (!links.is_empty()).then(|| links[index.index(links.len())])
+    fn choose(&self, number: usize) -> Option<u16> {
+        self.open.keys().copied().nth(number % self.open.len().max(1))
     }
 
     fn hello(&mut self, link: u16, number: u8, life: u64) {
@@ -120,6 +130,7 @@ impl Port {
 
     fn end(&mut self, link: u16) {
         self.open.remove(&link);
+        self.challenged.remove(&link);
         self.node.left(self.now, LinkId(link), CloseReason::Reset);
     }
 
@@ -143,7 +154,11 @@ impl Port {
     fn reported(&mut self, link: u16, directive: Directive) {
         let open = self.open.get_mut(&link).unwrap();
         match directive {
-            Directive::Challenge | Directive::Yield => assert_eq!(open.1, Open::Joined),
+            Directive::Challenge => {
+                assert_eq!(open.1, Open::Joined);
+                self.challenged.insert(link);
+            }
+            Directive::Yield => assert_eq!(open.1, Open::Joined),
             Directive::Admit => {
                 assert_eq!(open.1, Open::Waiting, "only who waits is taken");
                 open.1 = Open::Joined;
@@ -154,6 +169,7 @@ impl Port {
             }
             Directive::Close(_) => {
                 assert_eq!(open.1, Open::Joined);
+                assert!(self.challenged.contains(&link), "who answers keeps its place");
                 self.end(link);
             }
         }
@@ -175,10 +191,7 @@ impl Port {
 proptest! {
     #[test]
     fn the_books_agree_whatever_happens(steps in prop::collection::vec(step(), 1..80), nodes in 4usize..8) {
-        let storage = NodeStorage { nodes: slice(nodes), order: slice(nodes), links: slice(LINKS.into()), findings: slice(2) };
-        let mut node = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage);
-        node.set_maximum_nodes(MAXIMUM);
-        let mut port = Port { node, now: at(0), open: BTreeMap::new() };
+        let mut port = Port::new(nodes);
         for step in steps {
             port.step(step);
         }
@@ -186,5 +199,24 @@ proptest! {
             port.end(link);
         }
         prop_assert_eq!(port.node.connected(), 0);
+    }
+}
+
+/// A unit, and one that runs with its name and id: all that can happen to them, in all orders.
+#[test]
+fn of_two_twins_the_one_that_answers_stays_whatever_the_order() {
+    const STEPS: [Step; 7] = [
+        Step::Hello { peer: 1, life: 1 },
+        Step::Hello { peer: 1, life: 2 },
+        Step::Answer(0),
+        Step::Answer(1),
+        Step::End(0),
+        Step::End(1),
+        Step::Wait(350),
+    ];
+    const LENGTH: u32 = 6;
+    for order in 0..STEPS.len().pow(LENGTH) {
+        let mut port = Port::new(4);
+        (0..LENGTH).for_each(|place| port.step(STEPS[order / STEPS.len().pow(place) % STEPS.len()]));
     }
 }

@@ -100,6 +100,21 @@ fn everything_is_switched_on_at_once() {
     }
 }
 
+/// One question in four is answered, and half of what would hold back others is not heard.
+#[test]
+fn where_half_of_all_datagrams_are_lost_everybody_joins_in_the_end() {
+    title("At once, 50 % loss");
+    for size in [20, 100, 250] {
+        let mut worst = Worst::default();
+        for seed in 0..SEEDS {
+            let mut network = Network::new(seed, 50, LATENCY);
+            network.add_fleet(MANAGER, size, at(0), at(0), Duration::ZERO);
+            measure(&mut worst, network, at(0), at(0), 600);
+        }
+        worst.assert_within(Duration::from_secs(600), 250, &std::format!("{size}"));
+    }
+}
+
 #[test]
 fn units_and_manager_are_switched_on_at_random() {
     for (spread, broadcasts) in [(1_000, 20), (2_000, 20), (5_000, 40), (30_000, 160)] {

@@ -270,6 +270,64 @@ fn a_total_that_the_chunks_do_not_have_ends_the_link() {
 }
 
 #[test]
+fn each_length_of_a_frame_waits_or_ends_the_link() {
+    for length in 0..=u16::MAX {
+        let outcome = outcome(&mut link(Plain), &length.to_le_bytes());
+        match length {
+            0 => assert_eq!(outcome, Err(CloseReason::Protocol)),
+            1..=1024 => assert_eq!(outcome, Ok(Vec::new()), "{length}"),
+            _ => assert_eq!(outcome, Err(CloseReason::Oversize), "{length}"),
+        }
+    }
+}
+
+#[test]
+fn each_total_waits_or_ends_the_link() {
+    let whole = message(Priority::Normal, b"four", 1024);
+    let mut first = message(Priority::Normal, &pattern(1, 1500), 1024);
+    first.truncate(crate::host::frame::first_frame_length(&first).unwrap());
+    let held = first.len() as u32 - 8;
+    let totals = (0..10_000).chain([15, 16, 31].map(|bits| (1 << bits) - 1)).chain([1 << 16, 1 << 31, u32::MAX]);
+    for total in totals {
+        let with = |frame: &[u8]| {
+            let mut frame = frame.to_vec();
+            frame[4..8].copy_from_slice(&total.to_le_bytes());
+            outcome(&mut link(Plain), &frame)
+        };
+        match total {
+            4 => assert_eq!(with(&whole).unwrap().len(), 1),
+            0..=8192 => assert_eq!(with(&whole), Err(CloseReason::Protocol), "{total}"),
+            _ => assert_eq!(with(&whole), Err(CloseReason::Oversize), "{total}"),
+        }
+        match total {
+            0..=8192 if total <= held => assert_eq!(with(&first), Err(CloseReason::Protocol), "{total}"),
+            0..=8192 => assert_eq!(with(&first), Ok(Vec::new()), "{total}"),
+            _ => assert_eq!(with(&first), Err(CloseReason::Oversize), "{total}"),
+        }
+    }
+}
+
+/// Each byte of a stream of all kinds of frames, changed to each other byte.
+#[test]
+fn each_changed_byte_ends_the_link_or_is_data_and_never_leaks() {
+    let frames = [
+        plain_frame(&Frame::Ping),
+        plain_frame(&Frame::Session(b"alive")),
+        message(Priority::High, b"list", 1024),
+        message(Priority::Low, &pattern(1, MINIMUM_CHUNK_BYTES), MINIMUM_CHUNK_BYTES),
+        message(Priority::Emergency, b"stop", 1024),
+    ];
+    let bytes = frames.concat();
+    for at in 0..bytes.len() {
+        for change in 1..=255 {
+            let mut changed = bytes.clone();
+            changed[at] ^= change;
+            hostile(&changed, 100);
+        }
+    }
+}
+
+#[test]
 fn half_a_frame_waits_for_the_rest() {
     let (mut link, mut pool, mut items) = (link(Plain), pool(1, 8300), Vec::new());
     let mut half = message(Priority::Normal, &pattern(1, 900), 1024);
