@@ -72,7 +72,7 @@ pub(crate) const GROUPS: [Group; 42] = [
     },
     Group {
         name: "links",
-        what: "every relative link of the documents leads somewhere",
+        what: "links of the documents lead to files and headings, and the tests that they name exist",
         budget: 2,
         quick: Some(2),
         by_default: true,
