@@ -16,7 +16,7 @@ use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::port::Port as _;
 use cara_core::services::Context;
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Stage};
 use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
@@ -64,6 +64,12 @@ impl<T> Machine<T> {
     /// Whether a call of a peer moves something.
     pub(crate) fn moves(&self) -> bool {
         self.links.iter().any(|link| link.session.as_ref().is_some_and(LinkSession::moves))
+    }
+
+    /// Whether everything stands: nothing moves for a call, and nothing slows down any more.
+    fn stands(&self) -> bool {
+        let mut leases = self.functions.iter().filter_map(|function| function.handler.lease);
+        !self.moves() && leases.all(|lease| lease.stage(now()) == Stage::Dead)
     }
 
     /// Lets the session of a link do what is due, or look whether it is: `None` when nothing is.
@@ -168,7 +174,7 @@ impl<T> Machine<T> {
             Some(_) => {}
         }
         // Writing to flash may hold up the processor.
-        if !self.moves()
+        if self.stands()
             && let Some((manager, tagged)) = self.unstored.take()
         {
             let away = self.hub.node.handed_over(&manager);

@@ -106,9 +106,12 @@ impl<T> MyFunctionList<T> {
                 #[cfg(feature = "streams")]
                 stream: None,
             };
-            let replaced = machine.functions.find(signature.name()).and_then(|slot| machine.functions.function(slot));
-            let replaced = replaced.map(|function| *function.handler);
+            let known = machine.functions.find(signature.name());
+            let replaced = known.and_then(|slot| machine.functions.function(slot)).map(|function| *function.handler);
             put(&mut machine.functions, signature, attributes, listed)?;
+            if let Some(slot) = known {
+                machine.refuse_calls_of(slot);
+            }
             // What a call of the service before started would go on to the end of its lease.
             let stop = replaced.and_then(Listed::clear);
             // Another service that had this lease may have left it dead, and no call would begin.
@@ -130,6 +133,7 @@ impl<T> MyFunctionList<T> {
             // What a call of it started would go on to the lease's end.
             let stop = removed.clear();
             machine.wakers.leases.wake();
+            machine.refuse_calls_of(slot);
             machine.hub.publications.withdraw(slot);
             machine.each_link(|session, cx| {
                 session.withdraw(cx, slot);

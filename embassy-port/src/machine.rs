@@ -103,6 +103,8 @@ pub(crate) struct Machine<T: 'static> {
     #[cfg(feature = "streams")]
     pub(crate) readings: crate::readings::Readings,
     pub(crate) tasks: &'static mut [TaskSlot],
+    /// Calls that were left to tasks so far.
+    pub(crate) left_to_tasks: u32,
     pub(crate) events: Events,
     pub(crate) started: Started,
     /// The link that it came on.

@@ -281,6 +281,7 @@ impl<
             tasks: self
                 .tasks
                 .write(self.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized())))),
+            left_to_tasks: 0,
             events: Events::new(self.events.write([const { None }; EVENTS])),
             yields: false,
             lost_hook: None,

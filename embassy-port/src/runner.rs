@@ -125,6 +125,9 @@ impl<T> Runner<T> {
     }
 
     fn read(&mut self, machine: &mut Machine<T>) -> Step {
+        if self.begin_emergency(machine) {
+            return Step::Again;
+        }
         let busy = self.unanswered.is_some();
         // Peers take turns: the one whose call began last comes last.
         let last = usize::from(machine.started_on);
@@ -143,6 +146,25 @@ impl<T> Runner<T> {
         Step::Idle
     }
 
+    /// Begins an emergency that waits, on whichever link: neither for an answer that nobody reads, nor for a claim to be stored.
+    fn begin_emergency(&mut self, machine: &mut Machine<T>) -> bool {
+        for index in machine.indices() {
+            let session = machine.link(index).and_then(|link| link.session.as_ref());
+            if !session.is_some_and(LinkSession::has_next_emergency) {
+                continue;
+            }
+            // Its arguments come where results wait: their caller is told that they are lost.
+            if let Some((_, result)) = &mut self.unanswered {
+                *result = result.and(Err(Error::ResultLost));
+            }
+            if let Some(Some(call)) = machine.with(index, |session, cx| session.next_emergency(cx, self.arguments)) {
+                (machine.started, machine.started_on) = (Started::Call(call), index);
+                return true;
+            }
+        }
+        false
+    }
+
     /// Whether nothing is due before the task is woken.
     #[inline(never)]
     fn rest(&mut self, context: &mut Context<'_>) -> bool {
@@ -150,7 +172,8 @@ impl<T> Runner<T> {
         for (link, line) in machine.links.iter().zip(machine.mail.connections.iter()) {
             line.wake_on_news(context, link.session.as_ref().is_some_and(LinkSession::wants_to_write));
         }
-        self.rested_until = machine.next_look();
+        let unanswered = self.unanswered.map_or(Instant::FAR_FUTURE, |(running, _)| running.deadline);
+        self.rested_until = machine.next_look().min(unanswered);
         pin!(timer(self.rested_until)).poll(context).is_pending()
     }
 
@@ -204,7 +227,10 @@ impl<T> Runner<T> {
         let machine = &mut *self.shared.machine.borrow_mut();
         let answer = result.map(|()| &*self.arguments);
         if !machine.answer(&running, answer) && !machine.park(running, answer) {
-            self.unanswered = Some((running, result));
+            // Behind an emergency there may be another one, which is given up: there is one place.
+            if let Some((earlier, _)) = self.unanswered.replace((running, result)) {
+                machine.give_up_answer(&earlier);
+            }
         }
     }
 
@@ -269,7 +295,8 @@ impl<T> Machine<T> {
     /// When something is due, or may be: an interrupt that stops what moves wakes no task.
     fn next_look(&self) -> Instant {
         let deadline = self.deadline();
-        if self.moves() { deadline.min(now() + LOOK) } else { deadline }
+        // What slows down has no deadline here: a claim is stored behind it.
+        if self.moves() || self.unstored.is_some() { deadline.min(now() + LOOK) } else { deadline }
     }
 
     /// When something is due.

@@ -1,6 +1,7 @@
 //! Calls that a task takes.
 
 use cara_core::config::Priority;
+use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
@@ -19,7 +20,11 @@ use crate::time::{now, timer};
 pub(crate) const PAUSE: Duration = Duration::from_millis(5);
 
 impl<T> Machine<T> {
+    /// A slot that is free, or becomes free as what it holds is of no use any more.
     fn free_slot(&mut self) -> Option<&mut TaskSlot> {
+        if !self.tasks.iter().any(TaskSlot::is_free) {
+            self.answer_parked();
+        }
         self.tasks.iter_mut().find(|slot| slot.is_free())
     }
 
@@ -31,9 +36,11 @@ impl<T> Machine<T> {
         caller: Identity,
         arguments: &ParametersView,
     ) -> Result<(), Error> {
+        self.left_to_tasks = self.left_to_tasks.wrapping_add(1);
+        let number = self.left_to_tasks;
         let slot = self.free_slot().ok_or(Error::Busy)?;
         slot.parameters.copy_from(arguments).map_err(|_| Error::Busy)?;
-        slot.holds = Holds::Call { running, call, caller };
+        slot.holds = Holds::Call { running, call, caller, number };
         self.wakers.calls.wake();
         Ok(())
     }
@@ -44,6 +51,13 @@ impl<T> Machine<T> {
             return true;
         }
         self.with(running.link, |session, cx| answer(session, cx, running, result)).unwrap_or(true)
+    }
+
+    /// Drops the answer of a call for which there is no room at all, and counts it.
+    pub(crate) fn give_up_answer(&mut self, running: &Running) {
+        if self.link(running.link).is_some_and(|link| link.serial == running.serial) {
+            self.with(running.link, |session, _| session.drop_answer(running.ticket));
+        }
     }
 
     /// Keeps an answer until there is room for it; `false` when there is no room here either.
@@ -57,9 +71,10 @@ impl<T> Machine<T> {
         true
     }
 
-    /// Tries again to answer what could not be answered.
+    /// Refuses calls that no task has taken in time, or whose order has ended, and tries again to answer what could not be answered.
     pub(crate) fn answer_parked(&mut self) {
         for index in 0..self.tasks.len() {
+            self.refuse_dead(index);
             let Self { tasks, links, mail, pool, functions, access, hub, proof, .. } = self;
             let Some(TaskSlot { parameters, holds }) = tasks.get_mut(index) else { return };
             let Holds::Answer { running, result } = *holds else { continue };
@@ -75,10 +90,31 @@ impl<T> Machine<T> {
         }
     }
 
-    /// When an answer that waits for room is given up.
+    fn refuse_dead(&mut self, index: usize) {
+        let Some(Holds::Call { running, call, .. }) = self.tasks.get(index).map(|slot| &slot.holds) else { return };
+        let lease = self.functions.function(call.slot).and_then(|function| function.handler.lease);
+        let is_over = now() >= running.deadline || LeaseWatch::new(lease, call).is_some_and(|lease| !lease.is_live());
+        #[cfg(feature = "details")]
+        let is_over = is_over || self.is_given_up(running);
+        if is_over && let Some(slot) = self.tasks.get_mut(index) {
+            slot.refuse(Error::Expired);
+        }
+    }
+
+    /// Calls of a function that goes, or becomes another one, must not reach what takes its place in the list.
+    pub(crate) fn refuse_calls_of(&mut self, function: Slot) {
+        for slot in self.tasks.iter_mut().filter(|slot| slot.number_of(function).is_some()) {
+            slot.refuse(Error::StaleFunction);
+        }
+        // A task that waits for its calls learns that it is gone.
+        self.wakers.calls.wake();
+        self.wake_runner();
+    }
+
+    /// When a call that waits, or an answer, is given up.
     pub(crate) fn parked_deadline(&self) -> Instant {
-        let parked = self.tasks.iter().filter(|slot| matches!(slot.holds, Holds::Answer { .. }));
-        parked.filter_map(TaskSlot::running).map(|running| running.deadline).min().unwrap_or(Instant::FAR_FUTURE)
+        let waiting = self.tasks.iter().filter_map(TaskSlot::running);
+        waiting.map(|running| running.deadline).min().unwrap_or(Instant::FAR_FUTURE)
     }
 
     /// What waits for a task is not begun once its link has ended.
@@ -90,37 +126,30 @@ impl<T> Machine<T> {
         }
     }
 
-    /// Gives a call of `function` to a task. One that is no longer wanted is answered instead.
+    /// Gives the oldest call of `function` to a task. One that is no longer wanted is refused instead.
     fn take_call(
         &mut self,
         function: &str,
         parameters: &mut ParametersView,
     ) -> Option<Result<(Running, Incoming, Identity), Error>> {
-        let wanted = self.functions.find(function);
-        if wanted.is_none() {
+        let Some(wanted) = self.functions.find(function) else {
             return Some(Err(Error::UnknownFunction));
+        };
+        self.answer_parked();
+        let newest = self.left_to_tasks;
+        let waiting =
+            self.tasks.iter_mut().filter_map(|slot| Some((newest.wrapping_sub(slot.number_of(wanted)?), slot)));
+        let (_, slot) = waiting.max_by_key(|(age, _)| *age)?;
+        let copied = parameters.copy_from(slot.parameters);
+        // Room for another call, or an answer.
+        self.wakers.runner.wake();
+        if let Err(error) = copied {
+            slot.refuse(Error::Service(ServiceError::NotReady));
+            return Some(Err(error));
         }
-        loop {
-            let slot = self.tasks.iter_mut().find(|slot| slot.function() == wanted)?;
-            let copied = parameters.copy_from(slot.parameters);
-            let Holds::Call { running, call, caller } = core::mem::replace(&mut slot.holds, Holds::Nothing) else {
-                return None;
-            };
-            // Room for another call.
-            self.wakers.runner.wake();
-            let listed = self.functions.function(call.slot)?;
-            let ended = LeaseWatch::new(listed.handler.lease, &call).is_some_and(|lease| !lease.is_live());
-            #[cfg(feature = "details")]
-            let ended = ended || self.is_given_up(&running);
-            if ended || now() >= running.deadline {
-                self.answer(&running, Err(Error::Expired));
-                continue;
-            }
-            if let Err(error) = copied {
-                self.answer(&running, Err(Error::Service(ServiceError::NotReady)));
-                return Some(Err(error));
-            }
-            return Some(Ok((running, call, caller)));
+        match core::mem::replace(&mut slot.holds, Holds::Nothing) {
+            Holds::Call { running, call, caller, .. } => Some(Ok((running, call, caller))),
+            _ => None,
         }
     }
 }
@@ -214,7 +243,7 @@ impl<T> Drop for TakenCall<T> {
         machine.wake_runner();
         let error = Err(Error::Service(ServiceError::NotReady));
         if !machine.answer(&running, error) && !machine.park(running, error) {
-            machine.with(running.link, |session, _| session.drop_answer(running.ticket));
+            machine.give_up_answer(&running);
         }
     }
 }

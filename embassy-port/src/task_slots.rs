@@ -28,11 +28,12 @@ pub(crate) struct TaskSlot {
 
 pub(crate) enum Holds {
     Nothing,
-    /// Its arguments wait for a task.
+    /// Its arguments wait for a task. The oldest of a function, by `number`, is taken first.
     Call {
         running: Running,
         call: Incoming,
         caller: Identity,
+        number: u32,
     },
     /// Its results wait for room on the link.
     Answer {
@@ -57,10 +58,18 @@ impl TaskSlot {
         }
     }
 
-    pub(crate) fn function(&self) -> Option<Slot> {
+    /// The number of a call of this function that waits.
+    pub(crate) fn number_of(&self, function: Slot) -> Option<u32> {
         match &self.holds {
-            Holds::Call { call, .. } => Some(call.slot),
+            Holds::Call { call, number, .. } if call.slot == function => Some(*number),
             _ => None,
+        }
+    }
+
+    /// Refuses the call that waits, as soon as there is room for that.
+    pub(crate) fn refuse(&mut self, error: Error) {
+        if let Holds::Call { running, .. } = self.holds {
+            self.holds = Holds::Answer { running, result: Err(error) };
         }
     }
 }
