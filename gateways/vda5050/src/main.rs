@@ -1,5 +1,6 @@
 //! `cara-vda5050`: vehicles of CARA under VDA 5050.
 
+use std::io::ErrorKind;
 use std::net::TcpListener;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
@@ -8,8 +9,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use anyhow::{Context, Result};
-use cara_std::{StartError, UnitEvent};
+use anyhow::{Context, Error, Result};
+use cara_std::{BuildError, Cause, CommunicationSystem, StartError, UnitEvent};
 use cara_vda5050::config::{Config, Vehicle};
 use cara_vda5050::gateway::{self, End};
 use cara_vda5050::metrics::{self, Seen};
@@ -22,7 +23,7 @@ use clap::Parser;
 struct Options {
     /// The configuration.
     config: PathBuf,
-    /// Check the configuration, the keys, the factsheet and the records, and end.
+    /// Check the configuration, the keys, the factsheet, the certificates and the records, and end: 2 if something is wrong.
     #[arg(long)]
     check: bool,
 }
@@ -39,20 +40,28 @@ fn main() -> Result<ExitCode> {
     let options = Options::parse();
     let config = match Config::read(&options.config) {
         Ok(config) => config,
-        Err(error) => {
-            eprintln!("{error:#}");
-            return Ok(ExitCode::from(WRONG_FILE));
-        }
+        Err(error) => return Ok(wrong(&error)),
     };
     if options.check {
-        gateway::check(&config)?;
+        if let Err(error) = gateway::check(&config) {
+            return Ok(wrong(&error));
+        }
         println!("{} vehicles, VDA 5050 {}", config.vehicle.len(), config.vda5050.version);
         return Ok(ExitCode::SUCCESS);
     }
-    let system = gateway::system(&config)?;
-    gateway::check_vehicles(&config, &system)?;
+    let system = match build(&config) {
+        Ok(system) => system,
+        Err(error) if is_mistake(&error, &config) => return Ok(wrong(&error)),
+        Err(error) => return Err(error),
+    };
     let events = system.events();
-    system.start()?;
+    match system.start() {
+        Err(error) if error.is_running_already() => {
+            eprintln!("{error}");
+            return Ok(ExitCode::from(StartError::ALREADY_RUNNING_EXIT));
+        }
+        started => started?,
+    }
     ctrlc::set_handler(|| END.is_due.store(true, Ordering::SeqCst)).context("cannot take signals")?;
     let seen = |vehicle: &Vehicle| Arc::new(Seen { serial_number: vehicle.serial_number.clone(), ..Seen::default() });
     let seen: Vec<Arc<Seen>> = config.vehicle.iter().map(seen).collect();
@@ -96,4 +105,33 @@ fn main() -> Result<ExitCode> {
     system.stop();
     recording.end();
     Ok(if is_fenced { ExitCode::from(StartError::FENCED_EXIT) } else { ExitCode::SUCCESS })
+}
+
+/// The unit, not started yet, and that all is there that its start needs.
+fn build(config: &Config) -> Result<CommunicationSystem> {
+    let folder = &config.manager.state_folder;
+    std::fs::create_dir_all(folder).with_context(|| format!("state_folder {} cannot be made", folder.display()))?;
+    let system = gateway::system(config)?;
+    gateway::check_vehicles(config, &system)?;
+    Ok(system)
+}
+
+/// The configuration cannot be used.
+fn wrong(error: &Error) -> ExitCode {
+    eprintln!("{error:#}");
+    ExitCode::from(WRONG_FILE)
+}
+
+/// Whether the mistake is in the configuration or in a file that it names, which no restart mends. Keys that it does not name may
+/// come later, a port may become free, and a disk may have space again.
+fn is_mistake(error: &Error, config: &Config) -> bool {
+    if error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == ErrorKind::StorageFull) {
+        return false;
+    }
+    match error.downcast_ref::<BuildError>() {
+        Some(BuildError::Keys(_)) => config.manager.key_file.is_some(),
+        Some(BuildError::Unit(error)) => error.cause() == Cause::Configuration,
+        Some(_) => false,
+        None => true,
+    }
 }

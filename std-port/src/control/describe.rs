@@ -178,7 +178,7 @@ pub fn event(event: &UnitEvent, at: Duration) -> Answer {
         UnitEvent::Leading { claim } => ("leading", None, format!("this manager leads, with the claim {claim}")),
         UnitEvent::NotLeading => ("not_leading", None, "this manager does not lead: links and orders go on".to_owned()),
         UnitEvent::ClaimNotKept { peer, claim } => (
-            "claim not stored",
+            "claim_not_stored",
             Some(peer),
             format!("the claim {claim} is obeyed until the next start: it could not be stored"),
         ),

@@ -107,8 +107,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     if over.stands_by && settings.manager.is_some() {
         return Err(Ended::usage("--standby is for an m_unit: an s_unit commands nobody"));
     }
+    // Also without --check, so that a service manager sees the code of a mistake and does not try again.
+    check_start(&settings)?;
     if arguments.check {
-        check_start(&settings)?;
         report_correct(&settings, global)?;
         return Ok(Exit::Done.into());
     }
@@ -193,7 +194,10 @@ fn address(text: &str) -> Result<SocketAddr, String> {
 /// What the file names and what is elsewhere, which shows only when the node starts. Keys that it does not name may come later.
 fn check_start(settings: &Settings) -> anyhow::Result<()> {
     let Settings { name, id, .. } = settings;
-    let wrong = |text: String| Ended::usage(format!("{}: {text}", settings.source.name));
+    let wrong = |text: String| match settings.source.name.as_str() {
+        "" => Ended::usage(text),
+        file => Ended::usage(format!("{file}: {text}")),
+    };
     let own = if settings.manager.is_some() { Identity::s_unit(name, *id) } else { Identity::m_unit(name, *id) };
     if let (Keys::File(path), Ok(own)) = (&settings.keys, own) {
         KeyRing::load_of(path, &own, Fleet(settings.fleet)).map_err(|error| wrong(format!("keys: {error}")))?;

@@ -127,7 +127,8 @@ fn not_made(error: Error, settings: &Settings) -> anyhow::Error {
     let refused = refused.or(settings.discovery_port.as_ref().filter(is_reserved));
     if let Some(Placed { value, span: Some(span) }) = refused {
         let what = format!("the system does not permit port {value}");
-        return Ended::failed("PortNotPermitted", settings.mistake(span.clone(), &what, NOT_PERMITTED).to_string());
+        // No restart mends it.
+        return wrong(settings.mistake(span.clone(), &what, NOT_PERMITTED));
     }
     let which = port.or(refused).map_or(String::new(), |port| format!("port {}: ", port.value));
     Ended::failed(format!("{error:?}"), format!("{which}{error}"))
@@ -186,7 +187,7 @@ fn reload(settings: &mut Settings, over: &Overrides, node: &Node, logging: &Logg
         Err(error) => return tracing::error!("the old configuration stays: {error}"),
     };
     if let Err(error) = node.set_constraints(fresh.constraints) {
-        return tracing::error!(%error, "the old configuration stays; more nodes than at the start and 16 need a restart");
+        return tracing::error!(%error, "the old configuration stays; more nodes need more open files (`LimitNOFILE=`)");
     }
     logging.change(fresh.file_log.as_deref());
     *settings = fresh;
