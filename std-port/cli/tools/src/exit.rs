@@ -16,7 +16,7 @@ Exit codes:
   0  done
   1  a node or the network failed it
   2  wrong usage, a mistake in a call's arguments included
-  3  no unit to talk to: no m_unit runs on this host, and --as is not given
+  3  no unit to talk to: no m_unit that lets this user in runs on this host, and --as is not given
   4  the doctor found something
   5  a live m_unit has this one's name and ID: `cara node` does not start
   6  another m_unit of this name and ID has taken over from `cara node`
