@@ -26,6 +26,12 @@ chown --recursive cara:cara /etc/cara/keys /run/cara /var/lib/cara /var/lib/cara
 as_unit="setpriv --reuid=cara --regid=cara --init-groups --no-new-privs env CARA_CONTROL_DIR=/run/cara STATE_DIRECTORY=/var/lib/cara"
 $as_unit cara node --check /etc/cara/plant.toml
 $as_unit env CARA_KEYS=/etc/cara/keys cara-vda5050 --check /etc/cara/vda5050.toml
+# What systemd does not try again: RestartPreventExitStatus= of both units.
+for program in 'cara node' cara-vda5050; do
+    code=0
+    $as_unit $program /etc/cara/none.toml || code=$?
+    [ "$code" = 2 ]
+done
 $as_unit cara node /etc/cara/plant.toml > /node.log 2>&1 &
 node=$!
 for _ in $(seq 300); do
