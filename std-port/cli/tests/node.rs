@@ -183,6 +183,8 @@ fn a_check_refuses_what_could_not_start() {
     ] {
         let (code, reported) = check(&more);
         assert!(code == Some(2) && reported.contains(part) && !reported.contains("chmod"), "{reported}");
+        // So does a start, by which a service manager knows that no restart mends it.
+        assert_eq!(outcome(folder.path(), &["a.toml"]).status.code(), Some(2));
     }
     std::fs::write(folder.path().join("a.toml"), [0xFF, 0xFE, b'n', 0]).unwrap();
     assert!(text(&outcome(folder.path(), &["--check", "a.toml"]).stderr).contains("is UTF-16"));

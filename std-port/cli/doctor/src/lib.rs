@@ -37,7 +37,7 @@ use self::which::Which;
 ///
 /// It asks the m_units of the network to show themselves, listens, tries to connect to those that do, and asks the
 /// units that run on this host. It joins nothing and manages no node. Each finding is explained in
-/// docs/troubleshooting.md. The exit code is 4 if something was found.
+/// docs/troubleshooting.md. The exit code is 4 at an error or a warning.
 #[derive(clap::Args)]
 pub struct Arguments {
     /// NAME, NAME/ID or #ID of a node.

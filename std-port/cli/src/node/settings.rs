@@ -330,7 +330,7 @@ fn control(table: &file::Control, role: Role, mistakes: &mut Vec<Mistake>) -> Co
     }
     if let Some(operators) = table.operators.as_ref().filter(|_| table.path.is_none()) {
         let help =
-            "write path = \"/run/cara-plant/plant.sock\", in a directory of this user's that the operators' group may enter";
+            "write path = \"/run/cara-plant/plant.sock\", in a directory of yours that the operators' group enters";
         mistakes.push(Mistake::new(
             operators.span(),
             "other users cannot reach the control socket in its usual place",
