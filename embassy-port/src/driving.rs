@@ -66,7 +66,7 @@ impl<T> Machine<T> {
         self.links.iter().any(|link| link.session.as_ref().is_some_and(LinkSession::moves))
     }
 
-    /// Whether everything stands: nothing moves for a call, and nothing slows down any more.
+    /// Whether all that is listed stands: nothing moves for a call, and nothing slows down any more.
     fn stands(&self) -> bool {
         let mut leases = self.functions.iter().filter_map(|function| function.handler.lease);
         !self.moves() && leases.all(|lease| lease.stage(now()) == Stage::Dead)
@@ -128,7 +128,10 @@ impl<T> Machine<T> {
     pub(crate) fn has_read_all(&self) -> bool {
         self.links.iter().zip(self.mail.connections.iter()).all(|(link, line)| {
             let session = link.session.as_ref();
-            line.has_been_read() && session.is_none_or(|session| !session.holds_received() && !session.has_next_call())
+            line.has_been_read()
+                && session.is_none_or(|session| {
+                    !session.holds_received() && !session.has_next_call() && !session.has_next_emergency()
+                })
         })
     }
 

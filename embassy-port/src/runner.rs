@@ -146,16 +146,18 @@ impl<T> Runner<T> {
         Step::Idle
     }
 
-    /// Begins an emergency that waits, on whichever link: neither for an answer that nobody reads, nor for a claim to be stored.
+    /// Begins an emergency that waits, on whichever link, also while an answer waits for room: results that nobody reads give way.
     fn begin_emergency(&mut self, machine: &mut Machine<T>) -> bool {
         for index in machine.indices() {
             let session = machine.link(index).and_then(|link| link.session.as_ref());
-            if !session.is_some_and(LinkSession::has_next_emergency) {
+            // One that moves something waits for its claim as any other call.
+            if !session.is_some_and(|session| session.has_next_emergency() && !session.awaits_claim()) {
                 continue;
             }
-            // Its arguments come where results wait: their caller is told that they are lost.
-            if let Some((_, result)) = &mut self.unanswered {
-                *result = result.and(Err(Error::ResultLost));
+            // Arguments come where results are kept. The order of that call goes on.
+            if let Some((running, Ok(()))) = self.unanswered {
+                self.unanswered = None;
+                machine.give_up_answer(&running);
             }
             if let Some(Some(call)) = machine.with(index, |session, cx| session.next_emergency(cx, self.arguments)) {
                 (machine.started, machine.started_on) = (Started::Call(call), index);
@@ -227,7 +229,7 @@ impl<T> Runner<T> {
         let machine = &mut *self.shared.machine.borrow_mut();
         let answer = result.map(|()| &*self.arguments);
         if !machine.answer(&running, answer) && !machine.park(running, answer) {
-            // Behind an emergency there may be another one, which is given up: there is one place.
+            // An emergency's, beside an error that waits: there is one place.
             if let Some((earlier, _)) = self.unanswered.replace((running, result)) {
                 machine.give_up_answer(&earlier);
             }
@@ -296,7 +298,7 @@ impl<T> Machine<T> {
     fn next_look(&self) -> Instant {
         let deadline = self.deadline();
         // What slows down has no deadline here: a claim is stored behind it.
-        if self.moves() || self.unstored.is_some() { deadline.min(now() + LOOK) } else { deadline }
+        if self.moves() || (self.unstored.is_some() && !self.stopped) { deadline.min(now() + LOOK) } else { deadline }
     }
 
     /// When something is due.
