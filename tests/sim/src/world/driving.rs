@@ -378,10 +378,6 @@ impl Inner {
         };
         let owner = Owner { host, life: unit.life };
         let job = async move {
-            // As on Linux: its link may have ended, and its safe hook have run, before it is the job's turn.
-            if reported.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
-                return handle.answer(stream, ticket, Err(Box::new(CallError::new(Error::Expired, None))));
-            }
             let outcome = service.run(reported, parameters).await;
             let failure = running.failure.take();
             let failed = |error| Box::new(CallError::new(Error::Service(error), failure.map(Detail::Service)));
