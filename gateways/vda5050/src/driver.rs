@@ -79,10 +79,9 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
     /// Asks the vehicle if that is due, and tells it what follows, once that is on disk. A stop waits for no disk. No state may be
     /// published unless [`is_kept`](Self::is_kept) afterwards.
     pub fn turn(&mut self, now: Duration) -> io::Result<()> {
-        if self.machine.must_halt(now) {
-            self.tell(&Command::Halt, now);
-        }
+        self.tell_stops(now);
         self.ask(now);
+        self.tell_stops(now);
         self.machine.reserve_header_ids();
         loop {
             let is_kept = self.keep(now)?;
@@ -100,7 +99,7 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
                 },
             };
             self.note_changes();
-            if command != Command::Halt && self.changes > self.kept && is_kept {
+            if !command.is_stop() && self.changes > self.kept && is_kept {
                 self.held = Some((command, self.changes));
                 continue;
             }
@@ -111,11 +110,22 @@ impl<V: Vehicle, K: Keep> Driver<V, K> {
         self.keep(now).map(drop)
     }
 
+    fn tell_stops(&mut self, now: Duration) {
+        while let Some(stop) = self.machine.next_stop(now)
+            && self.tell(&stop, now)
+        {}
+    }
+
     /// Whether the vehicle has done it.
     fn tell(&mut self, command: &Command, now: Duration) -> bool {
         let answer = self.vehicle.tell(command);
         let is_done = answer.is_ok();
-        self.failed = answer.as_ref().err().map(|failure| format!("{}: {failure}", command.word()));
+        match &answer {
+            Err(failure) => self.failed = Some(format!("{}: {failure}", command.word())),
+            // A drive that is refused is given up each time, and refused again for the same reason.
+            Ok(()) if command.is_stop() => {}
+            Ok(()) => self.failed = None,
+        }
         self.machine.answered(command, answer, now);
         // What it does now is asked at once.
         self.asked = None;

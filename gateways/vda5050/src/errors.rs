@@ -53,6 +53,8 @@ pub enum Kind {
     OutOfService,
     /// The order's end was not reached while the broker was away, by the configured limit. The standard has no name for it.
     BrokerLost,
+    /// The vehicle does not take the stretch that it is told to drive. The standard has no name for it.
+    DriveRefused,
 }
 
 /// A kind's name and level in 2.x, and in 3.0 (6.6.5.4).
@@ -60,7 +62,7 @@ type Row = (Kind, [(&'static str, ErrorLevel); 2]);
 
 /// `INVALID_ORDER` is in 3.0's list of words (7.8) only: its clauses have no name for what it stands for here.
 #[rustfmt::skip]
-const ROWS: [Row; 22] = {
+const ROWS: [Row; 23] = {
     use ErrorLevel::{Critical, Fatal, Urgent, Warning};
     [
         (Kind::Validation, [("validationError", Warning), ("VALIDATION_FAILURE", Warning)]),
@@ -85,6 +87,7 @@ const ROWS: [Row; 22] = {
         (Kind::CertificateExpires, [("certificateExpires", Warning), ("CERTIFICATE_EXPIRES", Warning)]),
         (Kind::OutOfService, [("outOfService", Fatal), ("OUT_OF_SERVICE", Fatal)]),
         (Kind::BrokerLost, [("brokerLost", Warning), ("BROKER_LOST", Urgent)]),
+        (Kind::DriveRefused, [("driveRefused", Warning), ("DRIVE_REFUSED", Urgent)]),
     ]
 };
 
@@ -171,6 +174,6 @@ mod tests {
     #[test]
     fn rows_are_in_the_order_of_their_kinds() {
         assert!(ROWS.iter().enumerate().all(|(index, (kind, _))| *kind as usize == index));
-        assert_eq!(Kind::BrokerLost as usize + 1, ROWS.len());
+        assert_eq!(Kind::DriveRefused as usize + 1, ROWS.len());
     }
 }

@@ -13,13 +13,15 @@ use serde::Serialize;
 use crate::config::{self, Config};
 use crate::driver::Driver;
 use crate::errors::{Kind, Refusal};
+use crate::log;
+use crate::machine::at_once::is_stop;
 use crate::machine::{ERRORS, Machine, Topic};
 use crate::message::{
-    Action, BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, Responses,
-    State, Visualization, ZoneSetMessage, read, write,
+    BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, Responses, State,
+    Visualization, ZoneSetMessage, read, write,
 };
 use crate::metrics::Seen;
-use crate::mqtt::{HEARD, Heard, Link, Place};
+use crate::mqtt::{HEARD, Heard, LARGEST, Link, Place};
 use crate::record::{RecordLock, Store};
 use crate::recording::Recording;
 use crate::tls::Whose;
@@ -34,7 +36,7 @@ const HEART: Duration = Duration::from_millis(crate::vehicle::LEASE_MS / 2);
 const LAST_WORDS: Duration = Duration::from_secs(2);
 /// A record that could not be read is tried so often.
 const TRIED_AGAIN: Duration = Duration::from_secs(2);
-/// Certificates are looked at so often, and at each connection.
+/// The ends of certificates are looked at so often, and at each connection.
 const LOOKED_AGAIN: Duration = Duration::from_secs(60);
 /// Days before the end of a certificate at which there is a warning, the fewest first.
 const EXPIRES_WITHIN: [u64; 2] = [7, 30];
@@ -109,8 +111,9 @@ struct Gateway {
     /// The header id of that, and whether it has come back.
     said: u32,
     is_echoed: bool,
-    /// Why the vehicle did not do something, as it was logged, and why there is no broker.
+    /// As it was logged: why the vehicle did not do something, why the record is not on disk, and why there is no broker.
     failed: Option<String>,
+    unwritten: Option<String>,
     lost: Option<String>,
     /// Of a vehicle whose record cannot be read: when it was tried last.
     tried: Option<Instant>,
@@ -140,10 +143,10 @@ impl Gateway {
         let (store, machine) = match Store::open(&folder, &vehicle.serial_number) {
             Ok((store, record)) => (store.locked(lock), Machine::new(record, config.policy(), Duration::ZERO)),
             Err(error) => {
-                eprintln!(
+                log::line(format_args!(
                     "{}: out of service until its record is mended or moved away: {error}",
                     vehicle.serial_number
-                );
+                ));
                 let machine = Machine::out_of_service(&error.to_string(), config.policy(), Duration::ZERO);
                 (Store::nowhere().locked(lock), machine)
             }
@@ -162,6 +165,7 @@ impl Gateway {
             broker: config.broker.clone(),
             client_id,
             prefix: prefix.clone(),
+            topics: [config.version().rules().topics, &["connection", "cara-probe"]].concat(),
             will: Box::new(last_words),
             recording: recording.clone(),
             expiry: seen.expiry.clone(),
@@ -183,6 +187,7 @@ impl Gateway {
             said: 0,
             is_echoed: false,
             failed: None,
+            unwritten: None,
             lost: None,
             tried,
             folder,
@@ -221,15 +226,16 @@ impl Gateway {
         let turned = self.driver.turn(now);
         let is_watched = !self.driver.is_stuck(self.began.elapsed()) && !self.driver.is_silent();
         self.driver.vehicle_mut().give_up(!is_watched);
-        if let Err(error) = turned {
-            eprintln!("{}: the record cannot be written: {error}", self.serial_number);
-        }
-        if self.driver.failed() != self.failed.as_deref() {
-            self.failed = self.driver.failed().map(str::to_owned);
-            if let Some(why) = &self.failed {
-                eprintln!("{}: {why}", self.serial_number);
+        match turned {
+            Err(error) => {
+                let why = format!("the record cannot be written: {error}");
+                self.log_news(|gateway| &mut gateway.unwritten, Some(why));
             }
+            Ok(()) if self.driver.is_kept() => self.unwritten = None,
+            Ok(()) => {}
         }
+        let failed = self.driver.failed().map(str::to_owned);
+        self.log_news(|gateway| &mut gateway.failed, failed);
         // Nothing is said that would not be known after a restart.
         if self.driver.is_kept() {
             self.publish();
@@ -238,10 +244,20 @@ impl Gateway {
         self.seen.out_of_service.store(self.tried.is_some(), Ordering::Relaxed);
     }
 
-    /// Warns of certificates that expire soon.
+    /// Logs why something is not done, unless that is what was logged last.
+    fn log_news(&mut self, last: impl Fn(&mut Self) -> &mut Option<String>, now: Option<String>) {
+        let last = last(self);
+        if *last != now {
+            *last = now;
+            if let Some(why) = last.clone() {
+                log::line(format_args!("{}: {why}", self.serial_number));
+            }
+        }
+    }
+
+    /// Warns of certificates that expire soon. Their files are read elsewhere, as their disk may hang.
     fn look_at_certificates(&mut self) {
         self.looked = Instant::now();
-        self.seen.expiry.read_client(&self.config.broker);
         let mut alarms = Vec::new();
         for whose in Whose::ALL {
             let Some(end) = self.seen.expiry.of(whose) else { continue };
@@ -251,7 +267,10 @@ impl Gateway {
             let Some(days) = within else { continue };
             let (word, end) = (whose.word(), humantime::format_rfc3339_seconds(end));
             if within != before {
-                eprintln!("{}: the {word}'s certificate expires within {days} days: {end}", self.serial_number);
+                log::line(format_args!(
+                    "{}: the {word}'s certificate expires within {days} days: {end}",
+                    self.serial_number
+                ));
             }
             let text = format!("the {word}'s certificate expires within {days} days");
             let refusal = Refusal::new(Kind::CertificateExpires, text);
@@ -263,10 +282,6 @@ impl Gateway {
     fn hear(&mut self, heard: Heard) {
         match heard {
             Heard::Connected(client) => {
-                let of_master = self.config.version().rules().topics;
-                for topic in of_master.iter().chain(&["connection", "cara-probe"]) {
-                    let _ = client.try_subscribe(format!("{}/{topic}", self.prefix), QoS::AtMostOnce);
-                }
                 self.client = Some(client);
                 self.probed = [Instant::now(); 2];
                 self.shown = None;
@@ -276,7 +291,7 @@ impl Gateway {
             Heard::Lost(why) => {
                 let was_there = self.client.take().is_some();
                 if was_there || self.lost.as_ref() != Some(&why) {
-                    eprintln!("{}: the broker is away: {why}", self.serial_number);
+                    log::line(format_args!("{}: the broker is away: {why}", self.serial_number));
                     self.lost = Some(why);
                 }
                 self.broker(false);
@@ -302,6 +317,11 @@ impl Gateway {
                 "connection" => self.hear_connection(&bytes),
                 _ => self.hear_probe(&bytes),
             },
+            Heard::TooLong(topic, bytes) => {
+                self.seen.received.fetch_add(1, Ordering::Relaxed);
+                let text = format!("the message has {bytes} bytes, and {LARGEST} at most are read");
+                self.refuse(&Refusal::new(Kind::Validation, text).about("topic", topic));
+            }
             Heard::Acknowledged => {}
         }
     }
@@ -309,8 +329,7 @@ impl Gateway {
     /// What came while the broker did not answer was sent who knows when. What stops the vehicle counts all the same.
     fn at_once(&mut self, mut message: InstantActions) {
         let sent = message.actions.len();
-        let stops = |action: &Action| matches!(action.action_type.as_str(), "startPause" | "cancelOrder");
-        message.actions.retain(|action| self.is_broker_there || stops(action));
+        message.actions.retain(|action| self.is_broker_there || is_stop(action));
         if message.actions.len() < sent {
             self.refuse(&late("instantActions", &message.header));
         }
@@ -386,7 +405,7 @@ impl Gateway {
         }
         let answers = self.probed[1].elapsed() < Duration::from_millis(self.config.broker.probe_timeout);
         if !answers && self.is_broker_there {
-            eprintln!("{}: the broker returns no probe", self.serial_number);
+            log::line(format_args!("{}: the broker returns no probe", self.serial_number));
         }
         self.broker(answers);
     }

@@ -9,6 +9,7 @@ pub mod config;
 pub mod driver;
 pub mod errors;
 pub mod gateway;
+pub mod log;
 pub mod machine;
 pub mod message;
 pub mod metrics;

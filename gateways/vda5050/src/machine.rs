@@ -3,7 +3,7 @@
 //! Messages and statuses change the [`Machine`]; [`Machine::next`] says what the vehicle is to be told. Whoever drives it writes
 //! [`Machine::record`] to disk when [`Machine::take_changed`] says so, before it tells the vehicle or the master anything.
 
-mod at_once;
+pub(crate) mod at_once;
 
 use std::time::Duration;
 
@@ -64,6 +64,10 @@ pub struct Machine {
     driven_at_node: Option<f64>,
     /// What is reported while it lasts, and concerns no order.
     alarms: Vec<Refusal>,
+    /// Why the vehicle does not take the stretch that it was told, which is told again and again.
+    drive_refused: Option<String>,
+    /// A command to drive or to stand has changed what the vehicle does since it said how it is.
+    is_status_old: bool,
     /// Why nothing is done with this vehicle, if so.
     out_of_service: Option<String>,
 }
@@ -88,6 +92,8 @@ impl Machine {
             is_factsheet_due: false,
             driven_at_node: None,
             alarms: Vec::new(),
+            drive_refused: None,
+            is_status_old: false,
             out_of_service: None,
         }
     }
@@ -255,6 +261,7 @@ impl Machine {
         let Order { order_id, order_update_id, zone_set_id, mut nodes, edges, .. } = order;
         let keeps_instant = self.policy.version.rules().lists_instant_actions;
         if verdict == Verdict::New {
+            self.drive_refused = None;
             let number = self.record.number;
             let mut old = std::mem::take(&mut self.record);
             // That of an instant action lasts until the next one.
@@ -352,7 +359,8 @@ impl Machine {
         let Some(status) = &self.status else { return };
         let is_controlled = is_controlled(status.mode);
         // What is driven by hand moves, and has no order all the same.
-        let stands = (!status.is_driving || !is_controlled) && !self.is_drive_sent && !self.is_halt_due;
+        let stands = !is_controlled || !status.is_driving && !self.is_status_old;
+        let stands = stands && !self.is_drive_sent && !self.is_halt_due;
         if !is_controlled {
             let why = "the vehicle is not in an automatic mode";
             if !self.record.is_cancelled && self.record.is_order_open() {
@@ -402,6 +410,7 @@ impl Machine {
         }
         (0..self.passed(&status)).for_each(|_| self.traverse(Some(status.driven)));
         self.is_drive_sent &= status.is_ordered;
+        self.is_status_old = false;
         for index in 0..self.record.actions.len() {
             self.learn(index, &status);
         }
@@ -485,6 +494,8 @@ impl Machine {
         self.is_drive_sent = false;
         self.is_halt_due = false;
         self.is_position_sent = false;
+        self.is_status_old = false;
+        self.drive_refused = None;
         for entry in &mut self.record.actions {
             (entry.is_sent, entry.is_end_sent) = (false, false);
         }
@@ -507,13 +518,14 @@ impl Machine {
     fn hold(&mut self, now: Duration) {
         let Some((since, from)) = &mut self.broker_lost else { return };
         let driven = self.status.as_ref().map(|status| status.driven);
-        let from = *from.get_or_insert(driven.unwrap_or_default());
+        // Counted from the first status, where there was none when the broker went.
+        *from = from.or(driven);
         let is_over = match self.policy.on_broker_loss {
             OnBrokerLoss::Stop => true,
             OnBrokerLoss::FinishBase { seconds, metres } => {
                 let too_long = now.saturating_sub(*since).as_secs_f64() > seconds;
                 // A comparison that a NaN fails.
-                too_long || !driven.is_none_or(|driven| driven - from <= metres)
+                too_long || !driven.zip(*from).is_none_or(|(driven, from)| driven - from <= metres)
             }
         };
         if !is_over || self.is_held {
@@ -528,17 +540,22 @@ impl Machine {
         }
     }
 
-    /// Whether the vehicle is to stop now. That needs no record: neither a disk nor a question to the vehicle may come before it.
-    pub fn must_halt(&mut self, now: Duration) -> bool {
+    /// What the vehicle is to give up now. That needs no record: neither a disk, a question to the vehicle nor a pause after a refusal
+    /// may come before it.
+    pub fn next_stop(&mut self, now: Duration) -> Option<Command> {
         self.hold(now);
-        if self.status.is_none() {
-            return false;
-        }
+        self.status.as_ref()?;
         if self.is_drive_sent && !self.may_drive() {
             self.is_drive_sent = false;
             self.is_halt_due = true;
         }
-        self.is_halt_due
+        if self.is_halt_due {
+            return Some(Command::Halt);
+        }
+        let is_due = |entry: &&mut Entry| entry.ends_as.is_some() && entry.runs() && !entry.is_end_sent;
+        let entry = self.record.actions.iter_mut().find(is_due)?;
+        entry.is_end_sent = true;
+        Some(Command::EndAction { number: entry.number })
     }
 
     /// The master is in control, and nothing has stopped the vehicle.
@@ -557,10 +574,10 @@ impl Machine {
         self.is_able() && !is_stopped && !block_driving(&self.record.actions)
     }
 
-    /// What the vehicle is to be told now, if anything. The record is to be written before.
+    /// What the vehicle is to be told now, if anything. The record is to be written before, unless it [is a stop](Command::is_stop).
     pub fn next(&mut self, now: Duration) -> Option<Command> {
-        if self.must_halt(now) {
-            return Some(Command::Halt);
+        if let Some(stop) = self.next_stop(now) {
+            return Some(stop);
         }
         let boot = self.status.as_ref()?.boot;
         if now < self.retry_at {
@@ -580,14 +597,11 @@ impl Machine {
         let may_begin = self.may_begin();
         match command {
             Command::Drive { .. } => self.is_drive_sent && self.may_drive(),
-            Command::Halt => true,
+            Command::Halt | Command::EndAction { .. } => true,
             Command::InitPosition { .. } => self.is_position_sent,
-            Command::Act { number, .. } | Command::EndAction { number } => {
+            Command::Act { number, .. } => {
                 let entry = self.record.actions.iter_mut().find(|entry| entry.number == *number && entry.runs());
                 let Some(entry) = entry else { return false };
-                if matches!(command, Command::EndAction { .. }) {
-                    return entry.is_end_sent;
-                }
                 entry.is_sent &= may_begin && entry.ends_as.is_none();
                 entry.is_sent
             }
@@ -597,10 +611,6 @@ impl Machine {
     fn next_action(&mut self, boot: u64) -> Option<Command> {
         let may_begin = self.may_begin();
         for entry in &mut self.record.actions {
-            if entry.ends_as.is_some() && entry.runs() && !entry.is_end_sent {
-                entry.is_end_sent = true;
-                return Some(Command::EndAction { number: entry.number });
-            }
             // Also one that has begun: it ended with the link or the lease, and the vehicle would go on with it.
             if may_begin && entry.runs() && entry.ends_as.is_none() && !entry.is_sent {
                 entry.is_sent = true;
@@ -616,7 +626,8 @@ impl Machine {
             return None;
         }
         let index = startable(&self.record.actions, self.policy.actions_at_once)?;
-        let moves = self.is_drive_sent || self.status.as_ref().is_none_or(|status| status.is_driving);
+        let drives = self.status.as_ref().is_none_or(|status| status.is_driving);
+        let moves = self.is_drive_sent || self.is_status_old || drives;
         if moves && self.record.actions[index].action.blocking_type.blocks_driving() {
             // The vehicle stops for it first.
             return None;
@@ -686,8 +697,14 @@ impl Machine {
     /// action, which fails.
     pub fn answered(&mut self, command: &Command, answer: Result<(), Failure>, now: Duration) {
         let failed = answer.as_ref().is_err();
+        self.is_status_old |= matches!(command, Command::Drive { .. } | Command::Halt);
         match command {
             Command::Drive { .. } => {
+                self.drive_refused = match &answer {
+                    Err(Failure::Refused(why) | Failure::Lost(why)) => Some(why.clone()),
+                    // That one is reported as long as it is stopped.
+                    Ok(()) | Err(Failure::Stopped(_)) => None,
+                };
                 self.is_drive_sent &= !failed;
                 // It may drive all the same, or on by what it was told before.
                 self.is_halt_due |= failed;
@@ -724,9 +741,11 @@ impl Machine {
         let since = self.driven_at_node.map(|driven| status.driven - driven);
         report.distance_since_last_node = since.filter(|metres| metres.is_finite() && *metres >= 0.0);
         let out_of_service = self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why));
-        report
-            .errors
-            .extend(out_of_service.iter().chain(&self.alarms).map(|refusal| refusal.error(self.policy.version)));
+        let is_to_drive = self.record.is_order_open() && !self.record.is_cancelled;
+        let drive = self.drive_refused.as_ref().filter(|_| is_to_drive);
+        let drive = drive.map(|why| Refusal::new(Kind::DriveRefused, why).about("orderId", &self.record.order_id));
+        let lasting = out_of_service.iter().chain(&drive).chain(&self.alarms);
+        report.errors.extend(lasting.map(|refusal| refusal.error(self.policy.version)));
         Some(report)
     }
 }

@@ -1,6 +1,6 @@
 //! `cara-vda5050`: vehicles of CARA under VDA 5050.
 
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Write, stdout};
 use std::net::TcpListener;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
@@ -15,6 +15,7 @@ use cara_vda5050::config::{Config, Vehicle};
 use cara_vda5050::gateway::{self, End};
 use cara_vda5050::metrics::{self, Seen};
 use cara_vda5050::recording::Recording;
+use cara_vda5050::{log, tls};
 use clap::Parser;
 
 /// Vehicles of CARA under VDA 5050 2.0, 2.1 and, as a preview, 3.0, over an MQTT broker.
@@ -35,6 +36,15 @@ const WRONG_FILE: u8 = 2;
 const BEGUN_ANEW: Duration = Duration::from_secs(2);
 
 static END: End = End { is_due: AtomicBool::new(false), is_silent: AtomicBool::new(false) };
+
+/// Ends all vehicles' loops when the main thread leaves for any reason: it waits for them, and nobody else would end them.
+struct EndsAll;
+
+impl Drop for EndsAll {
+    fn drop(&mut self) {
+        END.is_due.store(true, Ordering::SeqCst);
+    }
+}
 
 fn main() -> Result<ExitCode> {
     let options = Options::parse();
@@ -71,8 +81,14 @@ fn main() -> Result<ExitCode> {
         let text = move || metrics::text(&unit.upgrade().map(|unit| unit.metrics()).unwrap_or_default(), &seen);
         std::thread::Builder::new().name("metrics".into()).spawn(move || metrics::serve(&listener, text))?;
     }
+    // No line of the log holds a vehicle up from here on.
+    log::start()?;
+    let clients = config.vehicle.iter().zip(&seen);
+    let clients = clients.map(|(vehicle, seen)| (config.broker.of(vehicle), seen.expiry.clone())).collect();
+    tls::watch(clients)?;
     let recording = Recording::start(&config)?;
     let is_fenced = std::thread::scope(|scope| -> Result<bool> {
+        let _ends = EndsAll;
         for (vehicle, seen) in config.vehicle.iter().zip(&seen) {
             let (config, system, recording) = (&config, &system, &recording);
             std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
@@ -82,14 +98,15 @@ fn main() -> Result<ExitCode> {
                         gateway::run(config, vehicle, system, seen, recording, &END)
                     })) {
                         Ok(Ok(())) => return,
-                        Ok(Err(error)) => eprintln!("{}: {error:#}", vehicle.serial_number),
-                        Err(_) => eprintln!("{}: its loop has panicked", vehicle.serial_number),
+                        Ok(Err(error)) => log::line(format_args!("{}: {error:#}", vehicle.serial_number)),
+                        Err(_) => log::line(format_args!("{}: its loop has panicked", vehicle.serial_number)),
                     }
                     std::thread::sleep(BEGUN_ANEW);
                 }
             })?;
         }
-        println!("up with {} vehicles", config.vehicle.len());
+        // Whether anybody reads it or not.
+        let _ = writeln!(stdout(), "up with {} vehicles", config.vehicle.len());
         while !END.is_due.load(Ordering::SeqCst) {
             recording.turn();
             let event = events.recv_timeout(Duration::from_millis(200));
@@ -104,6 +121,7 @@ fn main() -> Result<ExitCode> {
     })?;
     system.stop();
     recording.end();
+    log::end();
     Ok(if is_fenced { ExitCode::from(StartError::FENCED_EXIT) } else { ExitCode::SUCCESS })
 }
 

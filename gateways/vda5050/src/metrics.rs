@@ -80,6 +80,9 @@ pub fn text(of_unit: &str, vehicles: &[Arc<Seen>]) -> String {
             let _ = writeln!(text, "{name}{{vehicle=\"{vehicle}\",certificate=\"{whose}\"}} {seconds}");
         }
     }
+    let name = "cara_vda5050_log_lost";
+    let _ = writeln!(text, "# HELP {name} Lines of the log that nobody has read.\n# TYPE {name} counter");
+    let _ = writeln!(text, "{name}_total {}", crate::log::lost());
     text + END
 }
 

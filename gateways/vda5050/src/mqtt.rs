@@ -8,15 +8,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
-use anyhow::{Context, Result};
-use rumqttc::{Client, Event, LastWill, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
+use anyhow::{Context, Result, ensure};
+use rumqttc::{
+    Client, Event, LastWill, MqttOptions, Packet, QoS, SubscribeFilter, SubscribeReasonCode, TlsConfiguration,
+    Transport,
+};
 
 use crate::config;
 use crate::recording::Recording;
 use crate::tls::{self, Expiry};
 
-/// The largest message that is read, in bytes.
+/// The largest message that is read, in bytes. A longer one is refused.
 pub const LARGEST: usize = 512 * 1024;
+/// One that is longer than that ends the connection: it would have to be held.
+const LARGEST_TAKEN: usize = 16 * 1024 * 1024;
 /// The largest that is sent: a state has all nodes and actions that are left, which came in many messages.
 const LARGEST_SENT: usize = 16 * 1024 * 1024;
 /// Messages that wait to be sent.
@@ -28,12 +33,14 @@ const BACK_OFF: Duration = Duration::from_secs(1);
 
 /// What came of the broker.
 pub enum Heard {
-    /// There is a connection.
+    /// There is a connection, and the broker has taken all subscriptions.
     Connected(Client),
     /// It has ended, or there is none.
     Lost(String),
     /// The last level of its topic, whether it is a retained one, and its bytes.
     Message(String, bool, Vec<u8>),
+    /// One with more than [`LARGEST`] bytes: the last level of its topic, and how many.
+    TooLong(String, usize),
     /// What was sent with quality of service 1 has arrived.
     Acknowledged,
 }
@@ -46,6 +53,8 @@ pub struct Place {
     pub client_id: String,
     /// Its topics without their last level.
     pub prefix: String,
+    /// The last levels of those that it hears.
+    pub topics: Vec<&'static str>,
     /// The message on topic `connection` if it goes away.
     pub will: Box<dyn Fn() -> Vec<u8> + Send>,
     /// Where what comes is recorded.
@@ -110,16 +119,34 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
     let mut client = Some(client);
     for event in connection.iter() {
         let heard = match event? {
-            Event::Incoming(Packet::ConnAck(_)) => match client.take() {
-                Some(client) => Heard::Connected(client),
-                None => continue,
-            },
+            Event::Incoming(Packet::ConnAck(_)) => {
+                let filter = |topic: &&str| SubscribeFilter::new(format!("{}/{topic}", place.prefix), QoS::AtMostOnce);
+                if let Some(client) = &client {
+                    client.try_subscribe_many(place.topics.iter().map(filter))?;
+                }
+                continue;
+            }
+            // Whom no stop reaches must not drive.
+            Event::Incoming(Packet::SubAck(answer)) => {
+                let is_refused = |code: &SubscribeReasonCode| *code == SubscribeReasonCode::Failure;
+                let codes = place.topics.iter().zip(&answer.return_codes);
+                let refused: Vec<_> = codes.filter(|(_, code)| is_refused(code)).map(|(topic, _)| *topic).collect();
+                ensure!(refused.is_empty(), "the broker refuses to send {} of {}", refused.join(", "), place.prefix);
+                match client.take() {
+                    Some(client) => Heard::Connected(client),
+                    None => continue,
+                }
+            }
             Event::Incoming(Packet::PubAck(_)) => Heard::Acknowledged,
             Event::Incoming(Packet::Publish(message)) => {
                 let topic = message.topic.strip_prefix(&place.prefix).and_then(|topic| topic.strip_prefix('/'));
                 let Some(topic) = topic else { continue };
-                place.recording.take(false, &message.topic, message.retain, &message.payload);
-                Heard::Message(topic.to_owned(), message.retain, message.payload.to_vec())
+                if message.payload.len() > LARGEST {
+                    Heard::TooLong(topic.to_owned(), message.payload.len())
+                } else {
+                    place.recording.take(false, &message.topic, message.retain, &message.payload);
+                    Heard::Message(topic.to_owned(), message.retain, message.payload.to_vec())
+                }
             }
             Event::Incoming(Packet::Disconnect) | Event::Outgoing(rumqttc::Outgoing::Disconnect) => return Ok(()),
             _ => continue,
@@ -134,7 +161,7 @@ fn options(place: &Place) -> Result<MqttOptions> {
     let Place { broker, client_id, prefix, will, expiry, .. } = place;
     let mut options = MqttOptions::new(client_id, &broker.host, broker.port);
     options.set_keep_alive(Duration::from_secs(broker.keep_alive.into()));
-    options.set_clean_session(true).set_max_packet_size(LARGEST, LARGEST_SENT);
+    options.set_clean_session(true).set_max_packet_size(LARGEST_TAKEN, LARGEST_SENT);
     options.set_last_will(LastWill::new(format!("{prefix}/connection"), will(), QoS::AtLeastOnce, true));
     if let Some(user) = &broker.user {
         let password = match &broker.password_file {

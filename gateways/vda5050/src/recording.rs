@@ -11,6 +11,7 @@ use anyhow::Result;
 use cara_recording::{Limits, Recorder, StartError};
 
 use crate::config::Config;
+use crate::log;
 
 /// What is recorded can be read after this time.
 const CHUNK: Duration = Duration::from_secs(1);
@@ -90,7 +91,7 @@ impl Recording {
         if recorder.lost() > *lost && warned.is_none_or(|warned| warned.elapsed() >= WARN) {
             (*lost, *warned) = (recorder.lost(), Some(Instant::now()));
             let why = recorder.held_up().map(|why| format!(": {why}")).unwrap_or_default();
-            eprintln!("{}: {lost} messages are not recorded until now{why}", shared.file.display());
+            log::line(format_args!("{}: {lost} messages are not recorded until now{why}", shared.file.display()));
         }
     }
 
@@ -100,7 +101,7 @@ impl Recording {
         let outcome = shared.recorder.get().map(|recorder| recorder.clone().end(LAST));
         let (messages, lost) = outcome.map_or((0, 0), |outcome| (outcome.messages, outcome.lost));
         let lost = lost + shared.missed.load(Ordering::Relaxed);
-        eprintln!("{}: {messages} messages recorded, {lost} lost", shared.file.display());
+        log::line(format_args!("{}: {messages} messages recorded, {lost} lost", shared.file.display()));
     }
 
     fn opened(&self) -> Option<(&Shared, &Recorder)> {
@@ -120,14 +121,14 @@ fn open_at_last(
         match open() {
             Ok(recorder) => {
                 if !why.is_empty() {
-                    eprintln!("recording from now on");
+                    log::line("recording from now on");
                 }
                 return Some(recorder);
             }
             Err(error) if error.to_string() == why => {}
             Err(error) => {
                 why = error.to_string();
-                eprintln!("nothing is recorded, next try in {} s: {why}", pause.as_secs());
+                log::line(format_args!("nothing is recorded, next try in {} s: {why}", pause.as_secs()));
             }
         }
         std::thread::sleep(pause);

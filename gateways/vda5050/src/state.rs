@@ -122,6 +122,11 @@ pub enum Command {
 }
 
 impl Command {
+    /// Whether it only makes something stop.
+    pub const fn is_stop(&self) -> bool {
+        matches!(self, Self::Halt | Self::EndAction { .. })
+    }
+
     /// For people.
     pub const fn word(&self) -> &'static str {
         match self {

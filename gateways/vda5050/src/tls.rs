@@ -14,6 +14,9 @@ use rustls::{ClientConfig, DigitallySignedStruct, Error, RootCertStore, Signatur
 
 use crate::config;
 
+/// Files of certificates are read so often.
+const READ_AGAIN: Duration = Duration::from_secs(60);
+
 /// Whose certificate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Whose {
@@ -53,11 +56,20 @@ impl Expiry {
     }
 
     /// The certificate's file may have been replaced since the connection was made.
-    pub fn read_client(&self, broker: &config::Broker) {
+    fn read_client(&self, broker: &config::Broker) {
         if let Some(first) = broker.certificate_file.as_deref().and_then(|file| certificates(file).ok()) {
             self.note(Whose::Client, &first[0]);
         }
     }
+}
+
+/// Reads all clients' certificates now and then, in a thread of its own: a disk that hangs holds up no vehicle.
+pub fn watch(clients: Vec<(config::Broker, Arc<Expiry>)>) -> std::io::Result<()> {
+    let watch = move || loop {
+        std::thread::sleep(READ_AGAIN);
+        clients.iter().for_each(|(broker, expiry)| expiry.read_client(broker));
+    };
+    std::thread::Builder::new().name("certificates".into()).spawn(watch).map(drop)
 }
 
 /// The TLS that a broker's settings ask for; its files are read now.

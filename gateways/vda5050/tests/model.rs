@@ -39,7 +39,9 @@ impl World {
         };
         let policy = Policy { version, on_broker_loss, resumes_by_itself: rng.bool(), ..policy() };
         let (sent, released, order_of_drive) = Default::default();
-        Self { rng, pair: Pair::with("a", policy.clone()), policy, sent, names: 0, released, order_of_drive }
+        let mut pair = Pair::with("a", policy.clone());
+        pair.vehicle.ramp = rng.u32(0..3);
+        Self { rng, pair, policy, sent, names: 0, released, order_of_drive }
     }
 
     /// A way from a node, with a base and a horizon and some actions.
@@ -137,6 +139,8 @@ impl World {
                 self.pair.vehicle.unlink();
             }
             12 if self.rng.u8(0..4) == 0 => {
+                // Edges that it had not reported would be driven again.
+                self.pair.machine.status(self.pair.vehicle.status.clone());
                 self.pair.machine.vehicle_lost();
                 self.pair.vehicle.reboot();
             }
@@ -188,10 +192,26 @@ impl World {
     fn turn(&mut self) {
         let reached = self.pair.vehicle.reached.len();
         let last = (self.pair.machine.record().last_node_sequence_id, self.pair.left());
-        self.pair.turn();
+        let had_ended = self.stops_that_ended();
+        self.pair.begin_turn();
         self.note(reached);
+        // Now and then it does not say how it is.
+        if self.rng.u8(0..4) > 0 {
+            self.pair.machine.status(self.pair.vehicle.status.clone());
+        }
         let record = self.pair.machine.record();
         assert!(!last.1.is_empty() || record.last_node_sequence_id == last.0);
+        let vehicle = &self.pair.vehicle.status;
+        let stands = !vehicle.is_driving || vehicle.mode != OperatingMode::Automatic;
+        let is_new = |id: &String| !had_ended.contains(id);
+        assert!(stands || !self.stops_that_ended().iter().any(is_new), "a stop is FINISHED, and it moves");
+    }
+
+    fn stops_that_ended(&self) -> Vec<String> {
+        let entries = self.pair.machine.record().actions.iter();
+        let stops = entries.filter(|entry| matches!(entry.action.action_type.as_str(), "startPause" | "cancelOrder"));
+        let ended = stops.filter(|entry| entry.status == ActionStatus::Finished);
+        ended.map(|entry| entry.action.action_id.clone()).collect()
     }
 
     fn check(&self) {
@@ -243,7 +263,7 @@ fn sequences_of(version: Version, sequences: u64) {
             let status = world.pair.vehicle.status.clone();
             world.pair.machine.status(status);
             world.pair.machine.instant_actions(instant("stopPause", "the end"));
-            (0..150).for_each(|_| world.turn());
+            (0..250).for_each(|_| world.turn());
             world.check();
             let record = world.pair.machine.record();
             assert!(record.nodes.iter().all(|node| !node.released), "{}", world.pair.left());

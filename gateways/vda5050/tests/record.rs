@@ -12,7 +12,7 @@ use std::time::Duration;
 use cara_vda5050::driver::{Driver, Vehicle};
 use cara_vda5050::errors::{Kind, Refusal};
 use cara_vda5050::machine::{Machine, Topic};
-use cara_vda5050::message::{OperatingMode, Order};
+use cara_vda5050::message::{ActionStatus, OperatingMode, Order};
 use cara_vda5050::record::{Keep, RecordLock, Store};
 use cara_vda5050::state::{Command, Failure, Record, Status};
 use fake::{Fake, Pair, instant, order, policy};
@@ -315,6 +315,25 @@ fn a_stop_waits_for_no_write_and_what_moves_does() {
     // The write that was under way, then that of what came meanwhile.
     [80, 100].into_iter().for_each(|at| driver.turn(Duration::from_millis(at)).unwrap());
     assert!(driver.is_kept() && !driver.is_stuck(Duration::from_secs(9)) && told("drive") == 1, "{:?}", done.borrow());
+}
+
+/// Neither a write that does not end nor one that fails holds up the end of what runs.
+#[test]
+fn the_end_of_an_action_waits_for_no_write() {
+    let (mut driver, done, writes) = idle();
+    driver.machine.order(order("o1", 0, 0, "a!:pick=HARD b!"));
+    driver.turn(Duration::ZERO).unwrap();
+    assert_eq!(done.borrow().last(), Some(&"act"));
+    let status = driver.vehicle_mut().status.as_mut().unwrap();
+    (status.action, status.action_status) = (1, ActionStatus::Running);
+    writes.set(0);
+    driver.machine.refuse(&Refusal::new(Kind::Validation, "a change"));
+    driver.turn(Duration::from_millis(20)).unwrap();
+    assert!(!driver.is_kept());
+    done.borrow_mut().clear();
+    driver.machine.instant_actions(instant("cancelOrder", "c1"));
+    driver.turn(Duration::from_millis(40)).unwrap();
+    assert_eq!(done.borrow()[0], "end an action", "{:?}", done.borrow());
 }
 
 /// What was decided before a pause or the order's end, and waits for its write, is not told after it.

@@ -41,13 +41,14 @@ const PREDEFINED: [(&str, ErrorLevel); 22] = [
     ("UNKNOWN_MAP_ID", Warning),
 ];
 /// Names that the table lacks: the first is in the list of 7.8, the others are the gateway's.
-const OWN: [(&str, ErrorLevel); 6] = [
+const OWN: [(&str, ErrorLevel); 7] = [
     ("INVALID_ORDER", Warning),
     ("ACTION_ERROR", Urgent),
     ("VEHICLE_STOPPED", Fatal),
     ("CERTIFICATE_EXPIRES", Warning),
     ("OUT_OF_SERVICE", Fatal),
     ("BROKER_LOST", Urgent),
+    ("DRIVE_REFUSED", Urgent),
 ];
 
 #[test]
@@ -63,6 +64,7 @@ fn errors_have_the_names_and_levels_of_their_version() {
         ("certificateExpires", Warning),
         ("outOfService", Fatal),
         ("brokerLost", Warning),
+        ("driveRefused", Warning),
     ];
     let second: BTreeMap<&str, ErrorLevel> = second.into_iter().collect();
     for kind in Kind::all() {

@@ -160,6 +160,27 @@ fn certificates_that_expire_are_an_alarm_until_they_are_replaced() {
     plant.wait_for_end("o1", "b");
 }
 
+/// Certificates are read each minute: a disk that hangs then holds up no vehicle.
+#[test]
+fn a_certificate_that_cannot_be_read_holds_up_no_stop() {
+    let tls = free_port();
+    let plant = Plant::with("{ do = \"stop\" }", "2.1.0", |folder| secured(folder, tls, 400));
+    plant.order("o1", 0, 0, "a! b!");
+    plant.wait_for_end("o1", "b");
+    // A pipe that nobody writes hangs who opens it.
+    let file = plant.folder.path().join("0001.pem");
+    std::fs::remove_file(&file).unwrap();
+    assert!(Command::new("mkfifo").arg(&file).status().unwrap().success());
+    // Who opens it for writing waits for a reader, which finds nothing to read then.
+    let (opened, is_opened) = std::sync::mpsc::channel();
+    std::thread::spawn(move || opened.send(std::fs::File::options().write(true).open(file).unwrap()));
+    let _written_by = is_opened.recv_timeout(Duration::from_secs(120)).expect("the file is read each minute");
+    plant.order("o2", 0, 0, "b! k!");
+    plant.wait_for("it drives", |plant| plant.state()["driving"] == true);
+    plant.instant("startPause", "p1");
+    plant.wait_for("it stands", |plant| plant.action("p1") == "FINISHED" && plant.state()["driving"] == false);
+}
+
 /// 20 vehicles, or as many as `CARA_TEST_VEHICLES` says: how much the gateway takes, and what a restart of the broker does.
 #[test]
 #[ignore = "measures"]

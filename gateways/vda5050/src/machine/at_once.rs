@@ -8,6 +8,11 @@ use crate::order::{ID_BYTES, PARAMETER_BYTES, parameters, performable};
 use crate::state::{Failure, copy_of};
 use crate::version::Version;
 
+/// Whether it makes the vehicle stand. Nothing that a stop is sent with refuses it.
+pub(crate) fn is_stop(action: &Action) -> bool {
+    matches!(action.action_type.as_str(), "startPause" | "cancelOrder")
+}
+
 impl Machine {
     /// A message on topic `instantActions`. A copy of one changes nothing.
     pub fn instant_actions(&mut self, message: InstantActions) {
@@ -16,21 +21,18 @@ impl Machine {
             self.record.errors.iter().filter(|of| Kind::is_of_instant_action(of)).cloned().collect();
         let mut is_one_taken = false;
         for action in message.actions {
-            if action.action_id.len() > ID_BYTES || parameters(&action).len() > PARAMETER_BYTES {
-                let refusal = Refusal::new(Kind::Validation, "the action's id or its parameters are too long");
-                self.refuse(&refusal.about("topic", "instantActions").about("actionType", &action.action_type));
-                continue;
-            }
-            if !self.is_due(&action, &stamp) {
-                continue;
-            }
-            self.forget_instant_actions(INSTANT_ACTIONS - 1);
-            // What stops finds a place where nothing else does.
-            let is_stop = matches!(action.action_type.as_str(), "startPause" | "cancelOrder");
-            let most = self.policy.can.max_actions + INSTANT_ACTIONS * (1 + usize::from(is_stop));
-            if self.record.actions.len() >= most {
-                self.refuse(&Refusal::new(Kind::Space, "too many actions").about("actionId", &action.action_id));
-                continue;
+            match self.is_due(&action, &stamp) {
+                Ok(true) => {}
+                Ok(false) => continue,
+                Err(refusal) => {
+                    self.refuse(&refusal.about("topic", "instantActions").about("actionType", &action.action_type));
+                    if is_stop(&action) {
+                        // It is done all the same, and cannot be listed.
+                        self.record.spend(copy_of(&action.action_id, &stamp));
+                        self.begin(&mut Entry::new(action, Place::Instant));
+                    }
+                    continue;
+                }
             }
             self.has_changed = true;
             self.is_report_due = true;
@@ -46,33 +48,43 @@ impl Machine {
         self.settle();
     }
 
-    /// Whether an action at once is new. What the gateway itself does has the same effect each time, and some masters send it under
-    /// the same id again, so that it counts by its message; what the vehicle does counts by its id.
-    fn is_due(&mut self, action: &Action, stamp: &str) -> bool {
+    /// Whether an action at once is new; fails for one that cannot be listed under its id. What the gateway itself does has the same
+    /// effect each time, and some masters send it under the same id again, so that it counts by its message; what the vehicle does
+    /// counts by its id.
+    fn is_due(&mut self, action: &Action, stamp: &str) -> Result<bool, Refusal> {
         let id = &action.action_id;
         if self.record.spent.contains(&copy_of(id, stamp)) {
-            return false;
+            return Ok(false);
+        }
+        if id.len() > ID_BYTES || parameters(action).len() > PARAMETER_BYTES {
+            return Err(Refusal::new(Kind::Validation, "the action's id or its parameters are too long"));
         }
         let is_own = self.policy.version.rules().own_actions.contains(&action.action_type.as_str());
         let known = self.record.actions.iter().position(|entry| entry.action.action_id == *id);
         if let Some(known) = known {
             let entry = &self.record.actions[known];
             let is_same = !entry.is_of_order() && entry.action.action_type == action.action_type;
-            if is_same && (entry.message == stamp || is_own && !entry.status.has_ended()) {
-                return false;
+            // A stop counts again before the last one has ended: it may have been taken back meanwhile.
+            if is_same && (entry.message == stamp || is_own && !entry.status.has_ended() && !is_stop(action)) {
+                return Ok(false);
             }
             if is_same && is_own {
                 let before = self.record.actions.remove(known);
                 self.record.spend(copy_of(id, &before.message));
-                return true;
+                return Ok(true);
             }
         }
         let is_new = known.is_none() && (is_own || !self.record.spent.contains(id));
         if !is_new {
-            let refusal = Refusal::new(Kind::Validation, "an action of this id was sent before");
-            self.refuse(&refusal.about("topic", "instantActions").about("actionId", id));
+            return Err(Refusal::new(Kind::Validation, "an action of this id was sent before").about("actionId", id));
         }
-        is_new
+        self.forget_instant_actions(INSTANT_ACTIONS - 1);
+        // What stops finds a place where nothing else does.
+        let most = self.policy.can.max_actions + INSTANT_ACTIONS * (1 + usize::from(is_stop(action)));
+        if self.record.actions.len() >= most {
+            return Err(Refusal::new(Kind::Space, "too many actions").about("actionId", id));
+        }
+        Ok(true)
     }
 
     fn begin(&mut self, entry: &mut Entry) {

@@ -116,6 +116,9 @@ pub struct Fake {
     pub reached: Vec<(String, u32)>,
     /// Steps of a drive and of an action.
     pub steps: u32,
+    /// Steps until it stands, and how many are left.
+    pub ramp: u32,
+    braking: u32,
 }
 
 impl Fake {
@@ -133,6 +136,8 @@ impl Fake {
             began: Vec::new(),
             reached: Vec::new(),
             steps: 2,
+            ramp: 0,
+            braking: 0,
         }
     }
 
@@ -156,6 +161,7 @@ impl Fake {
                 if self.status.drive < *number || self.status.has_arrived {
                     self.next_leg();
                 }
+                self.braking = 0;
                 self.status.is_ordered = !self.status.has_arrived;
                 self.status.is_driving = !self.status.has_arrived;
             }
@@ -195,7 +201,10 @@ impl Fake {
     }
 
     fn stop_driving(&mut self) {
-        (self.status.is_ordered, self.status.is_driving) = (false, false);
+        if self.status.is_ordered {
+            self.braking = self.ramp;
+        }
+        (self.status.is_ordered, self.status.is_driving) = (false, self.braking > 0);
     }
 
     fn stop_action(&mut self) {
@@ -214,12 +223,16 @@ impl Fake {
     /// Switched off and on.
     pub fn reboot(&mut self) {
         self.unlink();
+        self.braking = 0;
         let boot = self.status.boot + 1;
         self.status = Status { boot, position: self.status.position.clone(), ..Status::default() };
     }
 
     pub fn step(&mut self) {
-        if self.status.is_driving
+        if self.braking > 0 {
+            self.braking -= 1;
+            self.status.is_driving = self.braking > 0;
+        } else if self.status.is_driving
             && let Some((node, left)) = &mut self.target
         {
             *left = left.saturating_sub(1);
@@ -270,10 +283,15 @@ impl Pair {
 
     /// The vehicle gets all that it is to be told, moves a step, and reports.
     pub fn turn(&mut self) {
+        self.begin_turn();
+        self.machine.status(self.vehicle.status.clone());
+    }
+
+    /// Without a report.
+    pub fn begin_turn(&mut self) {
         self.now += Duration::from_millis(100);
         self.tell();
         self.vehicle.step();
-        self.machine.status(self.vehicle.status.clone());
     }
 
     pub fn tell(&mut self) {

@@ -1,0 +1,132 @@
+//! What the gateway makes of brokers and readers of its log that do not do their part.
+
+mod fake;
+mod plant;
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use cara_vda5050::mqtt::{Heard, Link, Place};
+use plant::{PATIENCE, Plant, Process};
+use rumqttc::QoS;
+
+/// Takes a connection and its subscriptions, with these answers.
+fn broker(listener: &TcpListener, answers: &[u8]) -> TcpStream {
+    let (mut stream, _) = listener.accept().unwrap();
+    let packet = |stream: &mut TcpStream| {
+        // No packet of this test has 128 bytes or more but the first, whose length takes two.
+        let mut head = [0; 2];
+        stream.read_exact(&mut head).unwrap();
+        let mut length = usize::from(head[1] & 0x7f);
+        if head[1] >= 0x80 {
+            let mut more = [0];
+            stream.read_exact(&mut more).unwrap();
+            length += usize::from(more[0]) << 7;
+        }
+        let mut body = vec![0; length];
+        stream.read_exact(&mut body).unwrap();
+        (head[0] >> 4, body)
+    };
+    assert_eq!(packet(&mut stream).0, 1, "CONNECT");
+    stream.write_all(&[0x20, 2, 0, 0]).unwrap();
+    let (kind, body) = packet(&mut stream);
+    assert_eq!(kind, 8, "SUBSCRIBE");
+    stream.write_all(&[0x90, 2 + answers.len() as u8, body[0], body[1]]).unwrap();
+    stream.write_all(answers).unwrap();
+    stream
+}
+
+/// A vehicle that no stop would reach is not ONLINE.
+#[test]
+fn a_subscription_that_is_refused_is_a_broker_that_is_away() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let link = Link::start(Place {
+        broker: toml::from_str(&format!("host = \"127.0.0.1\"\nport = {port}")).unwrap(),
+        client_id: "KIT-0001".into(),
+        prefix: "uagv/v2/KIT/0001".into(),
+        topics: vec!["order", "instantActions", "connection"],
+        will: Box::new(Vec::new),
+        recording: Default::default(),
+        expiry: Arc::default(),
+    })
+    .unwrap();
+    let refusing = broker(&listener, &[0, 0x80, 0]);
+    match link.heard.recv_timeout(PATIENCE).unwrap() {
+        Heard::Lost(why) => assert_eq!(why, "the broker refuses to send instantActions of uagv/v2/KIT/0001"),
+        _ => panic!("something else"),
+    }
+    drop(refusing);
+    let _takes_all = broker(&listener, &[0, 0, 0]);
+    assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::Connected(_)));
+}
+
+/// One that is retained would come again with each connection.
+#[test]
+fn a_message_that_is_too_long_is_refused_and_nothing_else() {
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    let long = vec![b' '; 600 * 1024];
+    plant.client.publish("uagv/v2/KIT/0001/order", QoS::AtMostOnce, true, long).unwrap();
+    plant.wait_for("it is refused", |plant| plant.has_error("validationError"));
+    plant.order("o1", 0, 0, "a! b!");
+    plant.wait_for_end("o1", "b");
+    plant.kill_gateway();
+    plant.wait_for("the last will", |plant| plant.connection() == "CONNECTIONBROKEN");
+    plant.start_gateway();
+    plant.wait_for("it is refused again", |plant| plant.has_error("validationError"));
+    plant.order("o2", 0, 0, "b! a!");
+    plant.wait_for_end("o2", "a");
+}
+
+/// Starts the gateway with this for its log.
+fn logs_to(plant: &mut Plant, stderr: Stdio) {
+    plant.kill_gateway();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cara-vda5050"));
+    command.arg(plant.file()).env("CARA_KEYS", plant.folder.path().join("keys"));
+    command.env("XDG_RUNTIME_DIR", plant.folder.path()).stderr(stderr);
+    plant.heard.lock().unwrap().clear();
+    plant.gateway = Some(Process::start(&mut command));
+    plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE");
+}
+
+/// The loss of a broker, about which there is a line, and a stop behind that.
+fn lose_the_broker(plant: &mut Plant) {
+    plant.broker.take().unwrap().kill();
+    std::thread::sleep(Duration::from_millis(500));
+    plant.heard.lock().unwrap().clear();
+    plant.restart_broker();
+    plant.wait_for("ONLINE again", |plant| plant.connection() == "ONLINE");
+    plant.order("o1", 0, 0, "a! k!");
+    plant.wait_for("it drives", |plant| plant.state()["driving"] == true);
+    plant.instant("startPause", "p1");
+    plant.wait_for("it stands", |plant| plant.action("p1") == "FINISHED" && plant.state()["driving"] == false);
+}
+
+#[test]
+fn a_log_that_nobody_reads_ends_no_vehicle() {
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    let (reader, writer) = std::io::pipe().unwrap();
+    logs_to(&mut plant, writer.into());
+    drop(reader);
+    lose_the_broker(&mut plant);
+    // The lines are counted.
+    plant.wait_for("lost lines", |plant| {
+        let text = plant.scrape();
+        let lost = text.lines().find_map(|line| line.strip_prefix("cara_vda5050_log_lost_total "));
+        lost.is_some_and(|lost| lost.parse::<u64>().unwrap() > 0)
+    });
+}
+
+#[test]
+fn a_log_that_is_held_up_holds_up_no_vehicle() {
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    let (_reader, writer) = std::io::pipe().unwrap();
+    let mut filling = writer.try_clone().unwrap();
+    // Until it is full, and then for ever.
+    std::thread::spawn(move || while filling.write_all(b" ").is_ok() {});
+    logs_to(&mut plant, writer.into());
+    lose_the_broker(&mut plant);
+}
