@@ -12,13 +12,15 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 
 use super::audit::{ProgramCall, Who, changes_something};
-use super::protocol::{Answer, By, CallQuestion, Question, unix_ms};
+use super::protocol::{Answer, By, CallQuestion, LONGEST_LINE, Question, unix_ms};
 use super::values;
 use crate::engine::peer_cell::PeerCell;
 use crate::locks::Rank;
 
-/// Bytes that may wait for a follower. What comes when nothing waits has room in any case.
+/// Bytes that may wait for a follower. A report that comes when nothing waits has room in any case.
 const MOST_BYTES: usize = 8 << 20;
+/// The largest report. Who follows reads no line much longer, so a larger one is counted and dropped.
+const LARGEST: usize = LONGEST_LINE / 4;
 /// Room that is never given back.
 const KEPT: usize = 64 << 10;
 
@@ -85,7 +87,8 @@ impl Follower {
     fn take(&mut self, report: &Report, bytes: &[u8]) {
         let Waiting { reports, bytes: all, lost } = &mut self.waiting;
         let start = all.len();
-        if reports.len() >= self.capacity || start > 0 && start + bytes.len() > MOST_BYTES {
+        let is_full = reports.len() >= self.capacity || start > 0 && start + bytes.len() > MOST_BYTES;
+        if is_full || bytes.len() > LARGEST {
             *lost += 1;
             return;
         }

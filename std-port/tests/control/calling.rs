@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use cara_std::control::execute;
-use cara_std::control::protocol::{Answer, ArgumentValue, CallQuestion, Failure, Number, Question};
+use cara_std::control::protocol::{Answer, ArgumentValue, CallQuestion, Failure, LONGEST_LINE, Number, Question};
 use cara_std::{Parameters, ParametersView, Served, ServiceError, ServiceOptions};
 
 use crate::support::{Depot, argument, ask, call, ping, refused, until};
@@ -298,6 +298,30 @@ fn who_follows_commands_gets_arguments_and_outcomes_also_of_the_program() {
     let Answer::Command { outcome, .. } = next().unwrap() else { panic!("no command") };
     let Some(Answer::Called { error: Some(failure), .. }) = outcome.as_deref() else { panic!("{outcome:?}") };
     assert_eq!(failure.error, "Service");
+    agv.stop();
+}
+
+/// The longest question that is read would be a report that no follower reads: it is counted, and the next one comes.
+#[test]
+fn who_follows_commands_outlives_the_longest_question() {
+    let (depot, agv) = Depot::with_agv();
+    let (mut following, mut other) = (depot.client(), depot.client());
+    let mut answers = following.ask(&Question::Commands).unwrap();
+    assert!(matches!(answers.next().unwrap().unwrap(), Answer::Event { event, .. } if event == "watching"));
+    let long = argument("y", 8, ArgumentValue::Bytes("0".repeat(LONGEST_LINE - 1_000)));
+    let asked = ask(&mut other, Question::Call(call(Some("agv"), "echo", vec![long]))).unwrap();
+    assert!(matches!(&asked[..], [Answer::Called { error: Some(_), .. }]));
+    let mut is_told_lost = false;
+    for _ in 0..2 {
+        ask(&mut other, Question::Stop { node: None }).unwrap();
+        let stop = answers.find(|answer| {
+            let answer = answer.as_ref().unwrap();
+            is_told_lost |= matches!(answer, Answer::Event { event, .. } if event == "lost");
+            matches!(answer, Answer::Command { question, .. } if matches!(**question, Question::Stop { .. }))
+        });
+        assert!(stop.is_some(), "one connection for all");
+    }
+    assert!(is_told_lost);
     agv.stop();
 }
 
