@@ -177,6 +177,24 @@ pub(crate) fn hand_over() -> Outcome {
     })
 }
 
+/// The emulated board's firmware of other sources beside this version's manager, and the other way round; the programs of the
+/// other version are in a folder.
+pub(crate) fn beside(sources: &Path, theirs: &Path) -> Outcome {
+    emulated(|| {
+        let board = boards::find(TESTED)?;
+        install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+        let image = board.build_of(sources, &boards::AGV, theirs)?;
+        let restarts = ["--restarts", "3"];
+        let checked = tests(board, &image)?.args(restarts).code()?;
+        if checked != Some(0) {
+            return Ok(checked);
+        }
+        let image = board.build(&boards::AGV)?;
+        let tests = Run::new(&theirs.join("cara-firmware-tests").to_string_lossy()).args(["--board", board.name]);
+        tests.args(["--image".as_ref(), image.as_os_str()]).args(restarts).code()
+    })
+}
+
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.
 pub(crate) fn attack(figures: &Path) -> Result<Option<String>> {
     attacked(&["security".as_ref(), "--json".as_ref(), figures.as_os_str()])

@@ -5,10 +5,11 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, ensure};
+use anyhow::{Result, bail, ensure};
 
 use crate::command::Run;
-use crate::{binaries, demo, planted, upgrade, workspace};
+use crate::groups::Outcome;
+use crate::{binaries, demo, firmware, install, planted, upgrade, workspace};
 
 const LATER: &str = "a-later-version";
 
@@ -29,7 +30,7 @@ pub(crate) fn check() -> Result<()> {
     both_ways(&later, "a later one")
 }
 
-/// The demonstration and a fleet in motion beside builds of earlier revisions: the tags `wire-N` and `v*`, or else the last commit
+/// The demonstration, a fleet in motion, an emulated board and gateways beside builds of earlier revisions: the tags `wire-N` and `v*`, or else the last commit
 /// of the day before this one's.
 pub(crate) fn versions(revisions: &[String]) -> Result<()> {
     let tags = Run::new("git").args(["tag", "--list", "wire-*", "v*"]).text()?;
@@ -48,6 +49,17 @@ pub(crate) fn versions(revisions: &[String]) -> Result<()> {
         both_ways(&theirs, revision)?;
         println!("== a fleet of {revision} becomes one of this version, and goes back");
         upgrade::there_and_back(&theirs, &workspace::target().join("debug"))?;
+        let sources = theirs.with_file_name("tree");
+        println!("== an emulated board of {revision} and a manager of this version, and the other way round");
+        match firmware::beside(&sources, &theirs) {
+            Outcome::Passed => {}
+            Outcome::Skipped(why) => println!("skipped: {why}"),
+            Outcome::Failed(why) => bail!("{why}"),
+        }
+        println!(
+            "== gateways of {revision} and of this version in turn, with a vehicle of this version, then of {revision}"
+        );
+        gateways(&sources)?;
     }
     Ok(())
 }
@@ -63,8 +75,30 @@ fn build_of(revision: &str) -> Result<PathBuf> {
         clone.args([tree.as_os_str()]).text()?;
     }
     Run::new("git").within(&tree).args(["checkout", "--quiet", "--detach", commit.trim()]).text()?;
-    binaries::of_another_tree(binaries::debug_build(&demo::PROGRAMS), &folder)?.stream()?;
+    let programs = [&demo::PROGRAMS[..], &["cara-firmware-tests"]].concat();
+    binaries::of_another_tree(binaries::debug_build(&programs), &folder)?.stream()?;
     Ok(folder.join("debug"))
+}
+
+/// The gateway is killed under way and started again as the other version, ten times, with a vehicle of either.
+fn gateways(sources: &Path) -> Result<()> {
+    /// The test that kills it.
+    const TEST: &str = "connection_ends_online_after_each_fail_over";
+    install::program("mosquitto", "mosquitto").map_err(anyhow::Error::msg)?;
+    let cargo = |command| {
+        let place = ["--quiet", "--locked", "--manifest-path", "gateways/vda5050/Cargo.toml", "--target-dir"];
+        Run::cargo().args([command]).args(place)
+    };
+    let theirs = sources.with_file_name("vda5050");
+    let programs = ["--bins", "--example", "vehicle"];
+    cargo("build").within(sources).args([&theirs]).args(programs).stream()?;
+    cargo("build").args(["target/vda5050"]).args(programs).stream()?;
+    let test = || cargo("test").args(["target/vda5050", "--test", "broker", TEST, "--", "--nocapture"]);
+    let of_theirs = |program: &str| theirs.join("debug").join(program).to_string_lossy().into_owned();
+    let gateway = of_theirs("cara-vda5050");
+    test().env("CARA_TEST_OTHER_GATEWAY", &gateway).stream()?;
+    let vehicle = of_theirs("examples/vehicle");
+    test().env("CARA_TEST_OTHER_GATEWAY", &gateway).env("CARA_TEST_OTHER_VEHICLE", &vehicle).stream()
 }
 
 fn both_ways(theirs: &Path, name: &str) -> Result<()> {

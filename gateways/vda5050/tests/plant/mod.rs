@@ -3,6 +3,7 @@
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
@@ -235,7 +236,7 @@ impl Plant {
 
     /// One with this configuration.
     pub fn gateway_of(&self, file: &Path) -> Process {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_cara-vda5050"));
+        let mut command = Command::new(gateway_program());
         command.arg(file).env("CARA_KEYS", self.folder.path().join("keys"));
         command.env("XDG_RUNTIME_DIR", self.folder.path());
         let gateway = Process::start(&mut command);
@@ -371,6 +372,14 @@ pub fn keys(folder: &Path, fleet: u32, vehicles: u32) {
     Store::create(&folder.join("keys"), keys).unwrap();
 }
 
+/// In turn that of this version and that of another one, which `CARA_TEST_OTHER_GATEWAY` names, if it does.
+fn gateway_program() -> OsString {
+    static STARTED: AtomicU32 = AtomicU32::new(0);
+    let is_other = STARTED.fetch_add(1, Ordering::SeqCst) % 2 == 0;
+    let other = std::env::var_os("CARA_TEST_OTHER_GATEWAY").filter(|_| is_other);
+    other.unwrap_or(env!("CARGO_BIN_EXE_cara-vda5050").into())
+}
+
 pub fn vehicle(folder: &Path, fleet: u32, number: u32) -> Process {
     vehicles_from(folder, fleet, number, 1, &[])
 }
@@ -378,7 +387,7 @@ pub fn vehicle(folder: &Path, fleet: u32, number: u32) -> Process {
 fn vehicles_from(folder: &Path, fleet: u32, number: u32, count: u32, cells: &[String]) -> Process {
     // Examples are beside the programs.
     let file = Path::new(env!("CARGO_BIN_EXE_cara-vda5050")).with_file_name("examples").join("vehicle");
-    let mut command = Command::new(file);
+    let mut command = Command::new(std::env::var_os("CARA_TEST_OTHER_VEHICLE").unwrap_or(file.into()));
     let (name, id) = (format!("agv-{number}"), (100 + number).to_string());
     command.args([&name, &id]).args(["--vehicles", &count.to_string(), "--speed", "2", "--fleet", &fleet.to_string()]);
     if let Some(cell) = cells.get(number as usize - 1) {

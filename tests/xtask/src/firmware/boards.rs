@@ -173,7 +173,12 @@ impl Board {
 
     /// Builds an image; where it is.
     pub(crate) fn build(&self, image: &Image) -> Result<PathBuf> {
-        let folder = Path::new("examples/firmware").join(self.folder);
+        self.build_of(workspace::root(), image, &place().join("images").join(self.name))
+    }
+
+    /// Builds an image of the project's sources in another folder, to a folder; where it is.
+    pub(crate) fn build_of(&self, sources: &Path, image: &Image, to: &Path) -> Result<PathBuf> {
+        let folder = sources.join("examples/firmware").join(self.folder);
         // Boards with one processor, and an image with and without logs, are built into the same file: another build must
         // not begin before this one's is copied.
         std::fs::create_dir_all(place()).with_context(|| format!("cannot make {}", place().display()))?;
@@ -200,13 +205,12 @@ impl Board {
         };
         let build = build.args(["--no-default-features"]);
         features.iter().fold(build, |build, feature| build.args(["--features", feature])).stream()?;
-        self.kept(image)
+        self.kept(image, to)
     }
 
-    /// Copies an image to the board's own folder. Whole or not at all: an emulator of another group may load it meanwhile.
-    fn kept(&self, image: &Image) -> Result<PathBuf> {
-        let folder = place().join("images").join(self.name);
-        std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    /// Copies an image to a folder. Whole or not at all: an emulator of another group may load it meanwhile.
+    fn kept(&self, image: &Image, folder: &Path) -> Result<PathBuf> {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
         let (built, kept) = (built(self.target, image.program), folder.join(image.name));
         let whole = kept.with_extension("new");
         std::fs::copy(&built, &whole).with_context(|| format!("cannot copy {}", built.display()))?;
