@@ -84,7 +84,9 @@ impl Agv {
         }
         let before = body.at();
         let lease = (DRIVING.stage(now), DRIVING.left(now).map(|left| time(left.as_micros())));
-        let turned = motor.turn(time(now.as_micros()), time(elapsed.as_micros()), lease, None, false, body);
+        // It has no map, and charges wherever it stands.
+        let station = true;
+        let turned = motor.turn(time(now.as_micros()), time(elapsed.as_micros()), lease, None, station, body);
         HAS_TARGET.store(body.at() != body.next(), Ordering::Release);
         if turned.arrived {
             (self.note)(format_args!("leave {before}"));

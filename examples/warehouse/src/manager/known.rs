@@ -191,6 +191,11 @@ impl Known {
         }
     }
 
+    /// Whether it stands at its station.
+    pub(super) fn is_charging(&self) -> bool {
+        matches!(self.job, Job::Charge(station) if self.cells == Some([station, station]))
+    }
+
     /// Whether it waits for the mechanic.
     pub(super) fn is_faulty(&self) -> bool {
         self.state == State::Stopped { by: 0, reason: FAULT }

@@ -1,6 +1,6 @@
 //! Which vehicle may enter which cell now.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::time::Instant;
 
 use super::known::{Job, Known, State};
@@ -9,14 +9,12 @@ use crate::map::{Cell, Map};
 use crate::orders::Order;
 use crate::plan::{Agent, Ground, next_cells};
 
-/// Ways that are kept at most, before all are made anew.
-const KEPT: usize = 1_024;
-
 /// The floor with what stands on it.
 pub(super) struct Traffic {
     pub(super) map: Map,
     /// Cells of vehicles that stand for a while.
     standing: Vec<bool>,
+    /// To the goals that vehicles have now.
     ways: HashMap<Cell, Distances>,
 }
 
@@ -36,6 +34,8 @@ impl Traffic {
             let [at, next] = cells.map(|cell| self.map.index(cell));
             (occupied[at], occupied[next]) = (true, true);
             match vehicle.state {
+                // It goes when it is full, and makes way for nobody: others drive around it.
+                State::Ready if vehicle.is_charging() => (ground[at], standing[at]) = (Ground::Taken, true),
                 State::Ready => {}
                 State::Sent | State::Moves(..) => {
                     // It leaves the one, unless it was sent on within its own.
@@ -48,10 +48,13 @@ impl Traffic {
                 }
             }
         }
-        if standing != self.standing || self.ways.len() > KEPT {
+        if standing != self.standing {
             (self.standing, self.ways) = (standing, HashMap::new());
         }
-        let ready = || vehicles.iter().enumerate().filter(|(_, vehicle)| vehicle.state == State::Ready);
+        let goals: HashSet<Cell> = vehicles.iter().filter_map(|vehicle| goal(vehicle.job, orders)).collect();
+        self.ways.retain(|goal, _| goals.contains(goal));
+        let is_ready = |vehicle: &Known| vehicle.state == State::Ready && !vehicle.is_charging();
+        let ready = || vehicles.iter().enumerate().filter(|(_, vehicle)| is_ready(vehicle));
         for goal in ready().filter_map(|(_, vehicle)| goal(vehicle.job, orders)) {
             self.ways.entry(goal).or_insert_with(|| Distances::to(&self.map, goal, &self.standing));
         }
@@ -79,5 +82,44 @@ pub(super) fn goal(job: Job, orders: &[Order]) -> Option<Cell> {
         Job::Fetch(order) => Some(orders[order - 1].pick),
         Job::Carry(order) => Some(orders[order - 1].drop),
         Job::Charge(station) => Some(station),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::channel;
+    use std::time::Duration;
+
+    use cara_std::{CommunicationSystem, Identity};
+
+    use super::{Job, Known, Order, State, Traffic};
+    use crate::manager::Desk;
+    use crate::map::{Cell, Map};
+    use crate::network::{MANAGER, Network, vehicle_id, vehicle_name};
+
+    #[test]
+    fn one_that_charges_is_driven_around() {
+        let cell = |x, y| Cell { x, y };
+        let network = Network { fleet: 4_242, everywhere: false };
+        let own = Identity::m_unit(MANAGER.0, MANAGER.1).unwrap();
+        let keys = network.draw_keys(2).unwrap().ring(&own).unwrap();
+        let builder = network.place(CommunicationSystem::builder(MANAGER.0, MANAGER.1).unwrap());
+        let system = builder.keys(keys).state(Desk::default()).build().unwrap();
+        let vehicle = |id: u32, at: Cell, job| {
+            let identity = Identity::s_unit(&vehicle_name(id), vehicle_id(id)).unwrap();
+            let mut known = Known::new(vehicle_name(id), system.node(&identity).unwrap(), Some([at; 2]), channel().0);
+            (known.state, known.job) = (State::Ready, job);
+            known
+        };
+        let map = Map::parse("m", "type octile\nheight 2\nwidth 4\nmap\n....\n....\n").unwrap();
+        let orders = [Order { pick: cell(0, 0), drop: cell(3, 1), release: Duration::ZERO }];
+        let mut vehicles = [vehicle(1, cell(1, 0), Job::Charge(cell(1, 0))), vehicle(2, cell(2, 0), Job::Fetch(1))];
+        let mut traffic = Traffic::new(map);
+        assert_eq!(traffic.grants(&vehicles, &orders), [(1, cell(2, 1))]);
+        assert_eq!(traffic.ways.len(), 1);
+        // Once it is full it makes way, and the other way is as short.
+        vehicles[0].job = Job::Idle;
+        vehicles[1].job = Job::Idle;
+        assert!(traffic.grants(&vehicles, &orders).is_empty() && traffic.ways.is_empty());
     }
 }
