@@ -93,7 +93,9 @@ struct Inner {
     mode: Mode,
     /// What all units have sealed with.
     seals: Seals,
-    /// Hooks that run before anything else.
+    /// Safe hooks, and what hears of orders that have begun, in the order in which it happened: they run before anything else.
+    of_orders: VecDeque<Box<dyn FnOnce()>>,
+    /// Programs that start, and hooks of events: they run next.
     urgent: VecDeque<Box<dyn FnOnce()>>,
     spawned: Vec<(Owner, Job)>,
 }
@@ -158,6 +160,7 @@ impl World {
             sleepers: Queue::new(),
             mode,
             seals: Seals::default(),
+            of_orders: VecDeque::new(),
             urgent: VecDeque::new(),
             spawned: Vec::new(),
         };
@@ -305,8 +308,11 @@ impl Drop for World {
         // Futures may use the world while they are dropped, so they go first.
         let jobs = self.shared.tasks.borrow_mut().take_all();
         drop(jobs);
-        let urgent = std::mem::take(&mut self.shared.inner.borrow_mut().urgent);
-        drop(urgent);
+        let hooks = {
+            let mut inner = self.shared.inner.borrow_mut();
+            [std::mem::take(&mut inner.of_orders), std::mem::take(&mut inner.urgent)]
+        };
+        drop(hooks);
     }
 }
 
@@ -325,14 +331,14 @@ impl Shared {
     /// Runs programs and hooks that are due.
     fn run_urgent(&self) {
         loop {
-            let hook = self.inner.borrow_mut().urgent.pop_front();
+            let hook = self.inner.borrow_mut().next_hook();
             let Some(hook) = hook else { return };
             hook();
         }
     }
 
     fn step(self: &Rc<Self>, limit: Instant) -> bool {
-        let hook = self.inner.borrow_mut().urgent.pop_front();
+        let hook = self.inner.borrow_mut().next_hook();
         if let Some(hook) = hook {
             hook();
             return true;
@@ -387,6 +393,10 @@ impl Shared {
 }
 
 impl Inner {
+    fn next_hook(&mut self) -> Option<Box<dyn FnOnce()>> {
+        self.of_orders.pop_front().or_else(|| self.urgent.pop_front())
+    }
+
     fn is_alive(&self, owner: Owner) -> bool {
         self.units.get(owner.host.index()).is_some_and(|unit| unit.life == owner.life && unit.machine.is_some())
     }

@@ -172,6 +172,7 @@ fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
             let earlier = judge.borrow_mut().ordered.insert((number, function), n);
             assert!(earlier < Some(n), "{function} {n} begins after {earlier:?}, which was made later");
             let Some(watch) = watch else { return Ok(()) };
+            assert!(watch.is_live(), "{function} {n} begins, and its order has ended");
             let moving = Rc::clone(&moving);
             moving.set(Some(n));
             call.unit.spawn(async move {

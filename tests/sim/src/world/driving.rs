@@ -17,7 +17,7 @@ use cara_core::services::session::Event;
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
 use super::replies::{CallError, Promise};
-use super::service::{BoxedParameters, Handler, LeaseWatch, Served, Serving};
+use super::service::{BoxedParameters, Handler, LeaseWatch, Served, Serving, boxed_parameters};
 use super::state::{NODE_TIMER, Storing};
 use super::streams::Sample;
 use super::tasks::Owner;
@@ -376,8 +376,18 @@ impl Inner {
             lease: LeaseWatch::new(&service, call.order, &handle),
             unit: handle.clone(),
         };
+        if service.begun.is_some() && reported.lease.is_some() {
+            let (service, reported) = (Rc::clone(&service), reported.clone());
+            let mut arguments = boxed_parameters(size_of_val(&*parameters));
+            arguments.copy_from(&parameters).expect("there is as much room");
+            self.of_orders.push_back(Box::new(move || service.order_begun(&reported, &arguments)));
+        }
         let owner = Owner { host, life: unit.life };
         let job = async move {
+            // As on Linux and on boards: its order may have ended, and its safe hook have run, before it is its turn.
+            if reported.lease.as_ref().is_some_and(|lease| !lease.is_live()) {
+                return handle.answer(stream, ticket, Err(Box::new(CallError::new(Error::Expired, None))));
+            }
             let outcome = service.run(reported, parameters).await;
             let failure = running.failure.take();
             let failed = |error| Box::new(CallError::new(Error::Service(error), failure.map(Detail::Service)));
@@ -394,7 +404,7 @@ impl Inner {
         let Handler(service) = function.handler;
         let service = Rc::clone(service);
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
-        self.urgent.push_front(Box::new(move || {
+        self.of_orders.push_back(Box::new(move || {
             if let Some(actuator) = &service.actuator {
                 actuator.make_safe(&handle);
             }

@@ -31,6 +31,8 @@ pub type Outcome = Result<BoxedParameters, ServiceError>;
 
 type Running = Pin<Box<dyn Future<Output = Outcome>>>;
 
+type Begun = dyn Fn(&Served, &ParametersView);
+
 type AtOnce = dyn FnMut(&Served, &mut ParametersView) -> Result<(), ServiceError>;
 
 enum Body {
@@ -166,6 +168,8 @@ pub struct Service {
     pub(super) attributes: Attributes,
     /// What it moves, or what it alone stops or resets.
     pub(super) actuator: Option<Actuator>,
+    /// What hears of its orders.
+    pub(super) begun: Option<Box<Begun>>,
     /// The newest value, of a stream.
     pub(super) values: Option<Values>,
 }
@@ -211,7 +215,15 @@ impl Service {
 
     fn with(body: Body) -> Self {
         let attributes = Attributes::default();
-        Self { body, takes: Duration::ZERO, survives_panics: false, attributes, actuator: None, values: None }
+        Self {
+            body,
+            takes: Duration::ZERO,
+            survives_panics: false,
+            attributes,
+            actuator: None,
+            begun: None,
+            values: None,
+        }
     }
 
     /// It answers this much later; the unit goes on with everything else meanwhile.
@@ -235,6 +247,12 @@ impl Service {
     pub fn moves(self, actuator: &Actuator, length: Duration) -> Self {
         let attributes = Attributes { lease: Some(length), ..self.attributes };
         Self { attributes, actuator: Some(actuator.clone()), ..self }
+    }
+
+    /// `begun` hears of each order that begins, before its handler and in turn with the safe hooks of the orders before and behind
+    /// it: also of one that ends at once, whose handler never runs.
+    pub fn on_order(self, begun: impl Fn(&Served, &ParametersView) + 'static) -> Self {
+        Self { begun: Some(Box::new(begun)), ..self }
     }
 
     /// Before its handler runs, whichever order moves this ends, and none begins until it is reset.
@@ -270,6 +288,13 @@ impl Service {
     /// Whether its lease is live at `now`; `None` without one.
     pub(super) fn lease_is_live(&self, now: Instant) -> Option<bool> {
         self.actuator.as_ref().map(|actuator| actuator.word().is_live(now))
+    }
+
+    /// Tells what hears of its orders.
+    pub(super) fn order_begun(&self, call: &Served, arguments: &ParametersView) {
+        if let Some(begun) = &self.begun {
+            begun(call, arguments);
+        }
     }
 
     pub(super) async fn run(self: Rc<Self>, call: Served, mut parameters: BoxedParameters) -> Outcome {

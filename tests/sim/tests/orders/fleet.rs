@@ -267,9 +267,8 @@ fn race(world: &World, mut caller: Caller, vehicles: &[UnitHandle]) {
 
 fn seen(unit: &UnitHandle, actuators: &[Actuator; 2]) -> Seen {
     let latched = [DRIVE, FORK].map(|actuator| actuators[actuator].latch().is_some());
-    let live = [DRIVE, FORK].map(|actuator| actuators[actuator].is_live(unit));
     let stopped = [DRIVE, FORK].map(|actuator| actuators[actuator].stopped_at(unit));
-    Seen { now: unit.now(), term: unit.claim(), live, latched, stopped }
+    Seen { now: unit.now(), term: unit.claim(), latched, stopped }
 }
 
 /// One life of a vehicle.
@@ -355,6 +354,7 @@ fn plain(watch: &Shared, number: usize, does: Does, actuators: &[Actuator; 2]) -
 
 /// What moves: it commits at once, moves while it may, and commits again.
 fn mover(watch: &Shared, number: usize, actuator: usize, actuators: &[Actuator; 2]) -> Service {
+    let (begun, known) = (Rc::clone(watch), actuators.clone());
     let (watch, all) = (Rc::clone(watch), actuators.clone());
     let service = Service::future(move |call, parameters| {
         let (watch, actuators, n) = (Rc::clone(&watch), all.clone(), number_of(&parameters));
@@ -364,7 +364,6 @@ fn mover(watch: &Shared, number: usize, actuator: usize, actuators: &[Actuator; 
             watch.borrow_mut().handler(n, number, Some(&order), seen(&call.unit));
             let commit = || watch.borrow_mut().commit(n, actuator, call.commit(|| ()).is_ok(), seen(&call.unit));
             commit();
-            call.unit.spawn(moving(Rc::clone(&watch), n, actuator, actuators.clone(), call.clone()));
             if n % 3 == 0 {
                 call.unit.sleep(millis(20 * (n as u64 % 23))).await;
                 commit();
@@ -372,12 +371,19 @@ fn mover(watch: &Shared, number: usize, actuator: usize, actuators: &[Actuator; 
             if n % 16 == 1 { Err(ServiceError::NotReady) } else { Ok(parameters) }
         }
     });
-    service.moves(&actuators[actuator], LENGTHS[actuator])
+    let service = service.moves(&actuators[actuator], LENGTHS[actuator]);
+    // The loop looks at orders whose handlers never run, too.
+    service.on_order(move |call, parameters| {
+        let (n, order) = (number_of(parameters), call.lease.as_ref().expect("it has a lease"));
+        begun.borrow_mut().order(n, number, actuator, order, seen(&call.unit, &known));
+        call.unit.spawn(moving(Rc::clone(&begun), n, actuator, known.clone(), call.clone()));
+    })
 }
 
 /// The loop of one order.
 async fn moving(watch: Shared, n: usize, actuator: usize, actuators: [Actuator; 2], call: cara_sim::Served) {
     let order = call.lease.clone().expect("it has a lease");
+    watch.borrow().look_at_others(n);
     for turn in 0_u64.. {
         call.unit.sleep(PULSE).await;
         if n % 16 == 2 && turn == 40 && order.is_live() {

@@ -57,6 +57,8 @@ struct Call {
     /// Calls from this number on were made after the vehicle was told that.
     reported: Option<usize>,
     has_started: bool,
+    /// It has been given an order of what it moves.
+    has_begun: bool,
     /// Its order has ended: it moves nothing any more, ever.
     is_dead: bool,
 }
@@ -100,8 +102,6 @@ struct Vehicle {
 pub(crate) struct Seen {
     pub(crate) now: Instant,
     pub(crate) term: Claim,
-    /// Whether its actuators may move, for whichever order.
-    pub(crate) live: [bool; 2],
     /// Whether they say that they are stopped.
     pub(crate) latched: [bool; 2],
     /// When they were stopped last.
@@ -143,7 +143,7 @@ pub(crate) const MUST_REACH: [&str; 27] = [
 ];
 
 /// What comes seldom, and has to come in many runs.
-pub(crate) const SELDOM: [&str; 2] = ["busy", "dead when its handler starts"];
+pub(crate) const SELDOM: [&str; 2] = ["busy", "dead before its handler"];
 
 #[derive(Default)]
 pub(crate) struct Watch {
@@ -193,7 +193,8 @@ impl Watch {
     }
 
     pub(crate) fn make(&mut self, made: Made) -> usize {
-        self.calls.push(Call { made, ended: None, reported: None, has_started: false, is_dead: false });
+        let (ended, reported) = (None, None);
+        self.calls.push(Call { made, ended, reported, has_started: false, has_begun: false, is_dead: false });
         self.calls.len() - 1
     }
 
@@ -276,18 +277,35 @@ impl Watch {
         (vehicle.moved, vehicle.executed) = (Default::default(), vehicle.stored);
     }
 
+    /// An order begins. It is heard of in turn with safe hooks and before its handler, which does not run if the order has ended
+    /// by then.
+    pub(crate) fn order(&mut self, n: usize, vehicle: usize, actuator: usize, order: &LeaseWatch, seen: Seen) {
+        let Made { vehicle: of, does, .. } = self.calls[n].made;
+        assert_eq!((of, does), (vehicle, Does::Move(actuator)), "call {n} moves what it is for");
+        assert!(!std::mem::replace(&mut self.calls[n].has_begun, true), "call {n} begins two orders");
+        self.executes(n, seen);
+        self.may_begin(n, actuator, seen);
+        let before = self.vehicles[vehicle].moved[actuator].open.replace((n, order.clone()));
+        self.reach("begun");
+        if let Some((before, _)) = before {
+            self.gives_way(before, n, actuator, seen.now);
+        }
+    }
+
     /// The handler of a call starts. `order` is its hold of what it moves.
     pub(crate) fn handler(&mut self, n: usize, vehicle: usize, order: Option<&LeaseWatch>, seen: Seen) {
         let made = self.calls[n].made.clone();
         assert_eq!(made.vehicle, vehicle, "a call runs where it was sent");
         assert!(!std::mem::replace(&mut self.calls[n].has_started, true), "call {n} runs twice");
         self.executes(n, seen);
-        let moves = if let Does::Move(actuator) = made.does { Some(actuator) } else { None };
-        for actuator in [DRIVE, FORK].into_iter().filter(|actuator| moves != Some(*actuator)) {
-            self.look_at_open(n, actuator, seen.live[actuator]);
-        }
+        self.look_at_others(n);
         match made.does {
-            Does::Move(actuator) => self.order_begins(n, actuator, order.expect("it moves something"), seen),
+            Does::Move(actuator) => {
+                let is_live = order.expect("it moves something").is_live();
+                assert!(is_live, "the handler of {n} starts, and its order has ended");
+                self.has_order(n, actuator);
+                self.may_begin(n, actuator, seen);
+            }
             Does::Stop(actuators) => self.stops(n, actuators, seen),
             Does::Reset(_) | Does::Nothing => {}
         }
@@ -319,46 +337,47 @@ impl Watch {
         assert!(is_obeyed, "call {n} of claims {claims:?} is live, and {obeyed} is obeyed");
     }
 
-    /// A handler starts while another order has an actuator.
-    fn look_at_open(&self, n: usize, actuator: usize, moves: bool) {
-        let Made { by, vehicle, is_emergency, .. } = self.calls[n].made;
-        let Some((open, watch)) = &self.vehicles[vehicle].moved[actuator].open else { return };
-        let other = &self.calls[*open];
-        if other.made.by != by {
-            return;
+    /// The handler of a call starts, or would start if its order had not ended: a look at what it does not move.
+    pub(crate) fn look_at_others(&self, n: usize) {
+        let Made { by, vehicle, does, is_emergency, .. } = self.calls[n].made;
+        for actuator in [DRIVE, FORK].into_iter().filter(|actuator| does != Does::Move(*actuator)) {
+            let Some((open, watch)) = &self.vehicles[vehicle].moved[actuator].open else { continue };
+            let other = &self.calls[*open];
+            if other.made.by != by {
+                continue;
+            }
+            let is_live = watch.is_live();
+            assert!(is_live, "call {n} runs before the safe hook of {open}, which has ended");
+            // An emergency overtakes what was sent before it.
+            let was_reported = other.reported.is_some_and(|reported| reported <= n) && !is_emergency;
+            assert!(!was_reported, "call {open} was released before {n} was made, and still moves");
         }
-        let is_live = watch.is_live();
-        // The handler of the order that has taken its place may be still to start.
-        assert!(is_live || moves, "call {n} runs before the safe hook of {open}, which has ended");
-        // An emergency overtakes what was sent before it.
-        let was_reported = other.reported.is_some_and(|reported| reported <= n) && !is_emergency;
-        assert!(!(was_reported && is_live), "call {open} was released before {n} was made, and still moves");
     }
 
-    fn order_begins(&mut self, n: usize, actuator: usize, order: &LeaseWatch, seen: Seen) {
-        let now = seen.now;
-        let made = self.calls[n].made.clone();
-        let moved = &mut self.vehicles[made.vehicle].moved[actuator];
-        if !order.is_live() {
-            self.calls[n].is_dead = true;
-            // It had the place for no time at all: a third order has it now, whose handler follows.
-            let before = moved.open.take_if(|(_, before)| seen.live[actuator] && !before.is_live());
-            if let Some((before, _)) = before {
-                self.gives_way(before, n, actuator, now);
-            }
-            return self.reach("dead when its handler starts");
-        }
+    /// What must hold when an order begins, and still when its handler starts.
+    fn may_begin(&self, n: usize, actuator: usize, seen: Seen) {
+        let Made { by, vehicle, .. } = self.calls[n].made;
         self.term_is_obeyed(n, seen);
-        assert!(now < self.end_of(n, actuator, now), "call {n} begins when it is not wanted any more");
-        let moved = &mut self.vehicles[made.vehicle].moved[actuator];
+        assert!(seen.now < self.end_of(n, actuator, seen.now), "call {n} begins when it is not wanted any more");
+        let moved = &self.vehicles[vehicle].moved[actuator];
         assert!(moved.latched.is_none_or(|(_, lifted)| lifted), "call {n} begins while its vehicle is stopped");
-        for stop in moved.stops.iter().filter(|stop| self.calls[**stop].made.by == made.by) {
+        for stop in moved.stops.iter().filter(|stop| self.calls[**stop].made.by == by) {
             assert!(*stop < n, "call {n} begins behind {stop}, which stopped it");
         }
-        let before = moved.open.replace((n, order.clone()));
-        self.reach("begun");
-        if let Some((before, _)) = before {
-            self.gives_way(before, n, actuator, now);
+    }
+
+    /// The order of this call is the last that has begun, and was not made safe.
+    fn has_order(&self, n: usize, actuator: usize) {
+        let moved = &self.vehicles[self.calls[n].made.vehicle].moved[actuator];
+        assert!(moved.open.as_ref().is_some_and(|(open, _)| *open == n), "call {n} moves what another one has");
+    }
+
+    /// The order of a call has ended.
+    fn is_over(&mut self, n: usize) {
+        let call = &mut self.calls[n];
+        call.is_dead = true;
+        if !call.has_started {
+            self.reach("dead before its handler");
         }
     }
 
@@ -375,7 +394,7 @@ impl Watch {
             (self.processes[by].id, operator)
         });
         assert!(other == own || takes_over, "call {n} of {own:?} takes what {before} of {other:?} holds");
-        self.calls[before].is_dead = true;
+        self.is_over(before);
         self.reach(if other == own { "replaced" } else { "taken over" });
     }
 
@@ -442,7 +461,7 @@ impl Watch {
         let is_stopped = moved.latched.is_some_and(|(_, lifted)| !lifted) || seen.latched[actuator];
         let Some((open, watch)) = moved.open.take() else { return };
         assert!(!watch.is_live(), "the safe hook of another order runs while {open} moves");
-        self.calls[open].is_dead = true;
+        self.is_over(open);
         if is_stopped {
             self.reach("order ended by a stop");
         }
@@ -497,9 +516,9 @@ impl Watch {
             self.calls[n].made
         );
         assert!(!self.calls[n].is_dead, "call {n} moves, and its order had ended");
+        self.has_order(n, actuator);
         let Made { vehicle, .. } = self.calls[n].made;
         let moved = &self.vehicles[vehicle].moved[actuator];
-        assert!(moved.open.as_ref().is_some_and(|(open, _)| *open == n), "call {n} moves what another one has");
         let is_stopped = moved.latched.is_some_and(|(_, lifted)| !lifted);
         assert!(!is_stopped && !seen.latched[actuator], "call {n} moves what is stopped");
         self.term_is_obeyed(n, seen);

@@ -1,6 +1,7 @@
 //! A vehicle moves only while its manager wants it to.
 
 use super::*;
+use cara_core::error::Error;
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
@@ -101,4 +102,37 @@ fn what_is_finished_is_one_order_and_ends_without_the_safe_hook() {
     world.run_for(secs(2));
     assert_eq!((*lifted.borrow(), *stopped.borrow(), agv.lease_is_live("drive")), (0, 0, true));
     assert_eq!(manager.count(|event| matches!(event, UnitEvent::LeaseEnded { why: LeaseEnd::Finished, .. })), 1);
+}
+
+#[test]
+fn an_order_that_has_ended_by_then_begins_without_its_handler() {
+    let (mut world, manager, agv, _, stopped) = driving(5);
+    let (heard, happened) = shared(String::new());
+    let [began, safe] = [(); 2].map(|()| Rc::clone(&happened));
+    let lift = Service::new(move |call, _| {
+        assert!(call.lease.as_ref().is_some_and(LeaseWatch::is_live));
+        *heard.borrow_mut() += "handler ";
+        Ok(())
+    });
+    let lift = lift.lease(LEASE, move |_| *safe.borrow_mut() += "hook ");
+    let lift = lift.on_order(move |call, parameters| {
+        let n: i64 = parameters.variable("n").unwrap();
+        let is_live = call.lease.as_ref().is_some_and(LeaseWatch::is_live);
+        *began.borrow_mut() += &format!("{n} {is_live} ");
+    });
+    agv.my_function_list().add_service("lift(n: int)", lift).unwrap();
+    agv.publish_my_function_list().unwrap();
+    assert!(world.run_until(|_| manager.knows("agv", "lift"), secs(10)));
+    // Both are read at once, and the second takes the place of the first.
+    world.suspend(&agv, millis(100));
+    for n in [1_i64, 2] {
+        let mut parameters = Parameters::new();
+        parameters.add_int("n", 1).unwrap();
+        parameters.set_value("n", n).unwrap();
+        manager.request_with("agv", "lift", &parameters, RequestOptions::default()).unwrap();
+    }
+    world.run_for(secs(2));
+    assert_eq!(*happened.borrow(), "1 false 2 true handler hook ");
+    let expired = |event: &UnitEvent| matches!(event, UnitEvent::RequestFailed { error: Error::Expired, .. });
+    assert_eq!((manager.count(expired), *stopped.borrow()), (1, 0));
 }
