@@ -20,7 +20,9 @@ use cara_core::random::Random;
 use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_sim::{Action, Actuator, Fault, FaultCounts, FaultPlan, Service, Storing, UnitHandle, World, for_each_seed};
+use cara_sim::{
+    Action, Actuator, Fault, FaultCounts, FaultPlan, LeaseWatch, Service, Storing, UnitHandle, World, for_each_seed,
+};
 
 const LEASE: Duration = Duration::from_millis(400);
 /// A manager shows so often that it runs.
@@ -163,17 +165,22 @@ fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
     });
     let moves = |function| {
         // The call whose order the safe hook has not ended.
-        let (judge, moving) = (of(judge), Rc::new(Cell::new(None)));
+        let (starts, judge, moving) = (of(judge), of(judge), Rc::new(Cell::new(None)));
         let hook = Rc::clone(&moving);
         let actuator = Actuator::new(move |_| hook.set(None));
         let service = Service::new(move |call, parameters| {
-            let (n, judge, watch, unit) = (number_of(parameters), of(&judge), call.lease.clone(), call.unit.clone());
-            judge.borrow_mut().starts(n);
+            let n = number_of(parameters);
+            starts.borrow_mut().starts(n);
+            let is_live = call.lease.as_ref().is_some_and(LeaseWatch::is_live);
+            assert!(is_live, "the handler of {function} {n} starts, and its order has ended");
+            Ok(())
+        });
+        // Of orders that end before their handlers as well.
+        let service = service.on_order(move |call, parameters| {
+            let (n, judge, unit) = (number_of(parameters), of(&judge), call.unit.clone());
             let earlier = judge.borrow_mut().ordered.insert((number, function), n);
             assert!(earlier < Some(n), "{function} {n} begins after {earlier:?}, which was made later");
-            let Some(watch) = watch else { return Ok(()) };
-            assert!(watch.is_live(), "{function} {n} begins, and its order has ended");
-            let moving = Rc::clone(&moving);
+            let (watch, moving) = (call.lease.clone().expect("it is an order"), Rc::clone(&moving));
             moving.set(Some(n));
             call.unit.spawn(async move {
                 while watch.is_live() {
@@ -186,7 +193,6 @@ fn vehicle(unit: &UnitHandle, number: u32, judge: &Shared) {
                     assert_ne!(moving.get(), Some(n), "no hook has run for call {n}");
                 }
             });
-            Ok(())
         });
         service.moves(&actuator, LEASE)
     };
