@@ -74,12 +74,16 @@ pub enum Network {
 }
 
 impl Settings {
-    /// Whether a unit can be made of them: an s_unit has a manager, an m_unit has none; a name has 1 to 32 bytes.
+    /// Whether a unit can be made of them: an s_unit has a manager, an m_unit has none; a name has 1 to 32 bytes; each address is
+    /// one that a host can have.
     pub fn is_sound(&self) -> bool {
         let network = match self.network {
             Network::Dhcp => true,
-            Network::Static { prefix, .. } => prefix <= 32,
+            Network::Static { address, prefix, gateway } => {
+                prefix <= 32 && is_of_host(address) && gateway.is_none_or(is_of_host)
+            }
         };
+        let network = network && self.manager_address.is_none_or(|address| is_of_host(*address.ip()));
         let role = matches!(
             (self.identity.role(), &self.manager),
             (Role::SUnit, Some(manager)) if Manager::new(&manager.name, manager.id).is_ok()
@@ -87,4 +91,10 @@ impl Settings {
         let name = Identity::new(self.identity.name(), self.identity.id(), self.identity.role()).is_ok();
         network && role && name && self.wifi.as_ref().is_none_or(Wifi::is_sound)
     }
+}
+
+/// Whether one host can have it. The IP stack panics where an interface or a gateway has the address of a group.
+pub(crate) const fn is_of_host(address: Ipv4Addr) -> bool {
+    // From 224 on they are of groups, or reserved.
+    matches!(address.octets(), [1..=126 | 128..=223, ..])
 }

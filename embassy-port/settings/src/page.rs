@@ -47,8 +47,8 @@ pub enum PageError {
     /// The checksum does not fit: a bit has changed, or power was cut while it was written.
     #[error("the page's checksum does not fit: write the settings again")]
     Damaged,
-    /// No unit can be made of what stands there.
-    #[error("the page's settings are of no unit: write them again")]
+    /// No unit can be made of what stands there, or no host can have an address in it.
+    #[error("the page's settings are of no unit, or of an address that no host can have: write them again")]
     Unsound,
 }
 
@@ -230,12 +230,27 @@ mod tests {
         assert_eq!(decode(&page(&written, 5)), Ok((written, 5)));
     }
 
+    /// The IP stack would panic at each start.
+    #[test]
+    fn addresses_that_no_host_can_have_are_refused() {
+        let host = Ipv4Addr::new(10, 0, 0, 7);
+        for none in [Ipv4Addr::new(239, 0, 0, 7), Ipv4Addr::BROADCAST, Ipv4Addr::UNSPECIFIED, Ipv4Addr::LOCALHOST] {
+            for [address, gateway, manager] in [[none, host, host], [host, none, host], [host, host, none]] {
+                let mut settings = settings("agv-07", 7);
+                settings.network = Network::Static { address, prefix: 24, gateway: Some(gateway) };
+                settings.manager_address = Some(SocketAddrV4::new(manager, 2_000));
+                assert_eq!(decode(&page(&settings, 1)), Err(PageError::Unsound), "{settings}");
+            }
+        }
+    }
+
     #[test]
     fn the_longest_settings_fit() {
         let longest = String::from_utf8([b'n'; 32].to_vec()).unwrap();
         let mut settings = settings(&longest, u32::MAX);
         settings.manager = Some(Manager::new(&longest, u32::MAX).unwrap());
-        let network = Network::Static { address: Ipv4Addr::BROADCAST, prefix: 32, gateway: Some(Ipv4Addr::BROADCAST) };
+        let highest = Ipv4Addr::new(223, 255, 255, 255);
+        let network = Network::Static { address: highest, prefix: 32, gateway: Some(highest) };
         settings.network = network;
         settings.wifi = Some(Wifi::new(&longest, &"p".repeat(63)).unwrap());
         assert!(encode(&settings, u32::MAX, &mut [0; BYTES]).is_some());

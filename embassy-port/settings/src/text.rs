@@ -14,13 +14,13 @@
 //! part of it, because its password is secret.
 
 use core::fmt;
-use core::net::Ipv4Addr;
+use core::net::SocketAddrV4;
 use core::str::FromStr;
 
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity, Role};
 
-use crate::{Network, Settings};
+use crate::{Network, Settings, is_of_host};
 
 /// A word of the text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -77,9 +77,9 @@ impl Field {
             Self::Name => "1 to 32 bytes without control characters",
             Self::Id | Self::Fleet => "a number of 32 bits",
             Self::Manager => "the manager's NAME/ID",
-            Self::ManagerAddress => "ADDRESS:PORT",
-            Self::Address => "dhcp, or ADDRESS/BITS as in 10.0.0.17/24",
-            Self::Gateway => "an IPv4 address; with address=ADDRESS/BITS only",
+            Self::ManagerAddress => "the ADDRESS:PORT of a host",
+            Self::Address => "dhcp, or a host's ADDRESS/BITS as in 10.0.0.17/24",
+            Self::Gateway => "a host's IPv4 address; with address=ADDRESS/BITS only",
             Self::Insecure => "yes; leave it away for a board with keys",
             Self::Keys => "hexadecimal digits, as `cara provision` writes them",
         }
@@ -122,7 +122,8 @@ impl FromStr for Settings {
         let role = if manager.is_some() { Role::SUnit } else { Role::MUnit };
         let identity = Identity::new(name, id, role).map_err(|_| TextError::Value(Field::Name))?;
         let fleet = words.of_field(Field::Fleet).map_or(Ok(0), |word| number(Field::Fleet, word))?;
-        let manager_address = words.parsed(Field::ManagerAddress)?;
+        let manager_address =
+            words.parsed(Field::ManagerAddress, |address: &SocketAddrV4| is_of_host(*address.ip()))?;
         let insecure = match words.of_field(Field::Insecure) {
             None => false,
             Some("yes") => true,
@@ -165,8 +166,9 @@ impl<'t> Words<'t> {
         self.of_field(field).ok_or(TextError::Missing(field))
     }
 
-    fn parsed<T: FromStr>(&self, field: Field) -> Result<Option<T>, TextError> {
-        self.of_field(field).map(|value| value.parse().map_err(|_| TextError::Value(field))).transpose()
+    fn parsed<T: FromStr>(&self, field: Field, is_sound: impl Fn(&T) -> bool) -> Result<Option<T>, TextError> {
+        let parsed = |value: &str| value.parse().ok().filter(&is_sound).ok_or(TextError::Value(field));
+        self.of_field(field).map(parsed).transpose()
     }
 }
 
@@ -182,13 +184,13 @@ fn manager(value: &str) -> Result<Manager, TextError> {
 
 fn network(words: &Words<'_>) -> Result<Network, TextError> {
     let wrong = TextError::Value(Field::Address);
-    let gateway = words.parsed(Field::Gateway)?;
+    let gateway = words.parsed(Field::Gateway, |address| is_of_host(*address))?;
     match words.of_field(Field::Address) {
         None | Some("dhcp") if gateway.is_some() => Err(TextError::Value(Field::Gateway)),
         None | Some("dhcp") => Ok(Network::Dhcp),
         Some(value) => {
             let (address, prefix) = value.split_once('/').ok_or(wrong)?;
-            let address: Ipv4Addr = address.parse().map_err(|_| wrong)?;
+            let address = address.parse().ok().filter(|address| is_of_host(*address)).ok_or(wrong)?;
             let prefix = prefix.parse().ok().filter(|&prefix| prefix <= 32).ok_or(wrong)?;
             Ok(Network::Static { address, prefix, gateway })
         }
@@ -219,11 +221,16 @@ impl fmt::Display for Settings {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use core::net::Ipv4Addr;
     use proptest::prelude::*;
     use std::string::ToString;
 
     fn error(text: &str) -> TextError {
         text.parse::<Settings>().unwrap_err()
+    }
+
+    fn host() -> impl Strategy<Value = Ipv4Addr> {
+        any::<u32>().prop_map(Ipv4Addr::from_bits).prop_filter("of a host", |address| is_of_host(*address))
     }
 
     #[test]
@@ -247,12 +254,18 @@ mod tests {
         for manager in ["depot", "depot/x", "/1", "depot/"] {
             assert_eq!(error(&std::format!("name=a id=1 manager={manager}")), TextError::Value(Field::Manager));
         }
-        for address in ["10.0.0.1", "10.0.0/24", "10.0.0.1/33", "DHCP"] {
+        let none = ["239.0.0.7/24", "255.255.255.255/32", "0.0.0.0/24", "127.0.0.1/8"];
+        for address in none.into_iter().chain(["10.0.0.1", "10.0.0/24", "10.0.0.1/33", "DHCP"]) {
             assert_eq!(error(&std::format!("name=a id=1 address={address}")), TextError::Value(Field::Address));
         }
         assert_eq!(error("name=a id=1 insecure=no"), TextError::Value(Field::Insecure));
         assert_eq!(error("name=a id=1 gateway=10.0.0.1"), TextError::Value(Field::Gateway));
-        assert_eq!(error("name=a id=1 manager_address=depot:1"), TextError::Value(Field::ManagerAddress));
+        let group = error("name=a id=1 address=10.0.0.1/24 gateway=224.0.0.1");
+        assert_eq!(group, TextError::Value(Field::Gateway));
+        for address in ["depot:1", "224.0.0.1:1"] {
+            let text = std::format!("name=a id=1 manager_address={address}");
+            assert_eq!(error(&text), TextError::Value(Field::ManagerAddress));
+        }
         let text = error("name=a id=1 fleet=x").to_string();
         assert_eq!(text, "fleet is not a number of 32 bits");
     }
@@ -266,17 +279,17 @@ mod tests {
         #[test]
         fn what_is_shown_is_read(
             id: u32, fleet: u32, manager in prop::option::of(("[a-z0-9./_-]{1,32}", any::<u32>())),
-            name in "[a-zA-Z0-9_/-]{1,32}", network in prop::option::of((any::<u32>(), 0_u8..=32, any::<Option<u32>>())),
-            at in prop::option::of((any::<u32>(), any::<u16>())), insecure: bool,
+            name in "[a-zA-Z0-9_/-]{1,32}", network in prop::option::of((host(), 0_u8..=32, prop::option::of(host()))),
+            at in prop::option::of((host(), any::<u16>())), insecure: bool,
         ) {
             let role = if manager.is_some() { Role::SUnit } else { Role::MUnit };
             let settings = Settings {
                 identity: Identity::new(&name, id, role).unwrap(),
                 manager: manager.map(|(name, id)| Manager::new(&name, id).unwrap()),
-                manager_address: at.map(|(address, port)| core::net::SocketAddrV4::new(Ipv4Addr::from_bits(address), port)),
+                manager_address: at.map(|(address, port)| SocketAddrV4::new(address, port)),
                 fleet: Fleet(fleet),
                 network: network.map_or(Network::Dhcp, |(address, prefix, gateway)| Network::Static {
-                    address: Ipv4Addr::from_bits(address), prefix, gateway: gateway.map(Ipv4Addr::from_bits),
+                    address, prefix, gateway,
                 }),
                 wifi: None,
                 insecure,

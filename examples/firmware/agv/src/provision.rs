@@ -150,7 +150,9 @@ pub fn provisioned(read: Result<Settings, PageError>) -> Option<Settings> {
             info!("the settings are damaged: write them again with cara provision")
         }
         Err(PageError::Unsound) => {
-            info!("the settings are of no unit: write them again with cara provision")
+            info!(
+                "the settings are of no unit, or of an address that no host can have: write them again with cara provision"
+            )
         }
     }
     None
