@@ -24,10 +24,12 @@ mod driver;
 mod gate;
 mod security;
 mod tasks;
+mod values;
 mod wire;
 
 pub use bench::{Bench, Board, SOCKETS};
 pub use cara_ethernet::{Fault, FaultCounts, Faults};
 pub use clock::now;
 pub use security::{keys, security};
+pub use values::number;
 pub use wire::{Wire, WireCounts};

@@ -13,7 +13,7 @@ use cara_core::services::lease::{Lease, Stage};
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_embassy::{Config, Handle, Handler, Limits, Resources, Security, ServiceOptions, TakenCall, resources};
-use cara_embassy_host::{Bench, Board, keys};
+use cara_embassy_host::{Bench, Board, keys, number};
 use embassy_time::{Duration as Span, with_timeout};
 
 const SHORT: Duration = Duration::from_secs(5);
@@ -55,13 +55,6 @@ fn manager(bench: &Bench) -> (Board, Unit) {
     let board = bench.board();
     let unit = start!(board, MANAGER, manager_config(bench));
     (board, unit)
-}
-
-fn number(value: i64) -> Parameters {
-    let mut parameters = Parameters::new();
-    parameters.add_int("n", 1).unwrap();
-    parameters.set_value("n", value).unwrap();
-    parameters
 }
 
 fn knows(unit: Unit, function: &str) -> bool {

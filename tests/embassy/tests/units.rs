@@ -23,7 +23,7 @@ use cara_core::time::{Duration, Instant};
 use cara_embassy::{
     Config, Handle, Handler, Held, Hold, Hook, LeaseWatch, Limits, Security, ServiceOptions, UnitEvent, resources,
 };
-use cara_embassy_host::{Bench, Board, keys};
+use cara_embassy_host::{Bench, Board, keys, number};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
 
@@ -77,13 +77,6 @@ fn agv(bench: &Bench) -> (Board, Unit) {
     let unit = start(&board, agv_config(bench));
     unit.on_manager_lost(&|state| state.losses += 1);
     (board, unit)
-}
-
-fn number(value: i64) -> Parameters {
-    let mut parameters = Parameters::new();
-    parameters.add_int("n", 1).unwrap();
-    parameters.set_value("n", value).unwrap();
-    parameters
 }
 
 fn doubling(unit: Unit) {
