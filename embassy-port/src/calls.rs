@@ -18,7 +18,7 @@ use embassy_time::Timer;
 use crate::details;
 use crate::handle::Handle;
 use crate::link::InFlight;
-use crate::machine::Machine;
+use crate::machine::{Dropped, Machine};
 use crate::peer::Peer;
 use crate::port::Board;
 use crate::time::{now, timer};
@@ -237,7 +237,14 @@ impl<T> Handle<T> {
     fn give_up(&self, call: InFlight) {
         match self.shared.machine.try_borrow_mut() {
             Ok(mut machine) => machine.give_up(&call),
-            Err(_) => self.shared.unwanted.add(call),
+            Err(_) => {
+                let give_up = |machine: &mut Machine<T>, dropped: &Dropped| {
+                    if let Dropped::Hold(call) = dropped {
+                        machine.give_up(call);
+                    }
+                };
+                self.shared.unwanted.add(give_up, Dropped::Hold(call));
+            }
         }
     }
 }

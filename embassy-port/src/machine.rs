@@ -28,7 +28,7 @@ use crate::mail::{Connection, Mail};
 use crate::port::{Board, LinkContext, LinkCounters, LinkSession};
 use crate::replies::ReplyBox;
 use crate::security::Proof;
-use crate::task_slots::TaskSlot;
+use crate::task_slots::{Running, TaskSlot};
 use crate::time::{now, timer};
 
 /// Tasks that are woken for the same thing. Each further one looks every [`LOOK`].
@@ -40,36 +40,56 @@ pub(crate) struct Shared<T: 'static> {
     pub(crate) machine: RefCell<Machine<T>>,
     /// The application's state, which has a cell of its own: a service that runs with it may use the unit.
     pub(crate) state: RefCell<T>,
-    /// Calls that were given up while the machine was in use.
+    /// What was dropped while the machine was in use.
     pub(crate) unwanted: Unwanted<T>,
 }
 
-type GiveUp<T> = fn(&mut Machine<T>, &InFlight);
+/// A call that was dropped.
+pub(crate) enum Dropped {
+    /// One of this unit's, which a hold had.
+    Hold(InFlight),
+    /// One of a peer's, which a task had taken.
+    Taken(Running),
+}
 
-/// Calls that the machine gives up when it is free: outside of its cell, for a hold that is dropped while it is in use. Executors on
-/// the heap drop a task with its last waker, which the machine may have.
+/// A pointer, so that the image of a unit that drops no such thing does not contain the function.
+type GiveUp<T> = fn(&mut Machine<T>, &Dropped);
+#[cfg(feature = "streams")]
+type EndReadings<T> = fn(&mut Machine<T>);
+
+/// What the machine gives up when it is free: outside of its cell, for what is dropped while it is in use. Executors on the heap
+/// drop a task with its last waker, which the machine may have.
 pub(crate) struct Unwanted<T: 'static> {
-    calls: Cell<heapless::Vec<InFlight, LEASES>>,
-    /// A pointer, so that the image of a unit that calls nothing does not contain the function.
-    give_up: Cell<Option<GiveUp<T>>>,
+    calls: Cell<heapless::Vec<(GiveUp<T>, Dropped), LEASES>>,
+    /// Ends the subscriptions whose cells say that they were dropped.
+    #[cfg(feature = "streams")]
+    pub(crate) end_readings: Cell<Option<EndReadings<T>>>,
 }
 
 impl<T> Unwanted<T> {
     pub(crate) const fn new() -> Self {
-        Self { calls: Cell::new(heapless::Vec::new()), give_up: Cell::new(None) }
+        Self {
+            calls: Cell::new(heapless::Vec::new()),
+            #[cfg(feature = "streams")]
+            end_readings: Cell::new(None),
+        }
     }
 
-    /// At most [`LEASES`] at a time are kept: what another one holds ends with its heart.
-    pub(crate) fn add(&self, call: InFlight) {
+    /// At most [`LEASES`] at a time are kept: what another hold has ends with its heart, and who made another call that was taken
+    /// waits until its deadline.
+    pub(crate) fn add(&self, give_up: GiveUp<T>, call: Dropped) {
         let mut calls = self.calls.take();
-        let _ = calls.push(call);
+        let _ = calls.push((give_up, call));
         self.calls.set(calls);
-        self.give_up.set(Some(Machine::give_up));
     }
 
     pub(crate) fn release(&self, machine: &mut Machine<T>) {
-        if let Some(give_up) = self.give_up.take() {
-            self.calls.take().iter().for_each(|call| give_up(machine, call));
+        for (give_up, call) in &self.calls.take() {
+            give_up(machine, call);
+        }
+        #[cfg(feature = "streams")]
+        if let Some(end) = self.end_readings.take() {
+            end(machine);
         }
     }
 }

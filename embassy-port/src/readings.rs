@@ -21,6 +21,8 @@ pub type SubscriptionCell<const BYTES: usize> = SubscriptionInner<[u8; BYTES]>;
 pub struct SubscriptionInner<B: ?Sized> {
     /// The unit's other subscriptions.
     next: Cell<Option<&'static Reading>>,
+    /// Its subscription was dropped while the machine was in use.
+    pub(crate) is_dropped: Cell<bool>,
     pub(crate) state: RefCell<State>,
     pub(crate) values: RefCell<ParametersInner<B>>,
 }
@@ -60,7 +62,12 @@ impl<const BYTES: usize> SubscriptionInner<[u8; BYTES]> {
             refused: None,
             task: WakerRegistration::new(),
         };
-        Self { next: Cell::new(None), state: RefCell::new(state), values: RefCell::new(ParametersInner::sized()) }
+        Self {
+            next: Cell::new(None),
+            is_dropped: Cell::new(false),
+            state: RefCell::new(state),
+            values: RefCell::new(ParametersInner::sized()),
+        }
     }
 }
 

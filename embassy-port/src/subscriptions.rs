@@ -69,6 +69,13 @@ impl<T> Machine<T> {
         self.indices().for_each(|index| self.notify_subscription(index, reading));
         reading.state.borrow_mut().wanted = None;
     }
+
+    /// Ends those that were dropped while the machine was in use.
+    fn end_dropped(&mut self) {
+        while let Some(reading) = self.readings.iter().find(|reading| reading.is_dropped.take()) {
+            self.end_reading(reading);
+        }
+    }
 }
 
 impl<T> Peer<T> {
@@ -100,6 +107,8 @@ impl<T> Peer<T> {
         cell: &'static SubscriptionCell<BYTES>,
     ) -> Result<Subscription<T>, Error> {
         let stream = Name::try_from(stream).map_err(|_| Error::BadName)?;
+        // A subscription that was dropped may have the cell still.
+        self.unit.act(|machine| self.unit.shared.unwanted.release(machine));
         {
             let () = Self::MAY_CALL;
             let state = &mut *cell.state.borrow_mut();
@@ -172,6 +181,15 @@ impl<T> Subscription<T> {
 
 impl<T> Drop for Subscription<T> {
     fn drop(&mut self) {
-        self.unit.act(|machine| machine.end_reading(self.reading));
+        match self.unit.shared.machine.try_borrow_mut() {
+            Ok(mut machine) => {
+                machine.end_reading(self.reading);
+                machine.wake_runner();
+            }
+            Err(_) => {
+                self.reading.is_dropped.set(true);
+                self.unit.shared.unwanted.end_readings.set(Some(Machine::end_dropped));
+            }
+        }
     }
 }

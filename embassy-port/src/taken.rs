@@ -12,7 +12,7 @@ use core::fmt;
 
 use crate::handle::Handle;
 use crate::lease::LeaseWatch;
-use crate::machine::Machine;
+use crate::machine::{Dropped, Machine};
 use crate::task_slots::{Holds, Running, TaskSlot, answer};
 use crate::time::{now, timer};
 
@@ -57,6 +57,15 @@ impl<T> Machine<T> {
     pub(crate) fn give_up_answer(&mut self, running: &Running) {
         if self.link(running.link).is_some_and(|link| link.serial == running.serial) {
             self.with(running.link, |session, _| session.drop_answer(running.ticket));
+        }
+    }
+
+    /// Answers a call whose task has dropped it.
+    fn drop_taken(&mut self, running: &Running) {
+        self.wake_runner();
+        let error = Err(Error::Service(ServiceError::NotReady));
+        if !self.answer(running, error) && !self.park(*running, error) {
+            self.give_up_answer(running);
         }
     }
 
@@ -239,11 +248,16 @@ impl<T> TakenCall<T> {
 impl<T> Drop for TakenCall<T> {
     fn drop(&mut self) {
         let Some(running) = self.running.take() else { return };
-        let Ok(mut machine) = self.unit.shared.machine.try_borrow_mut() else { return };
-        machine.wake_runner();
-        let error = Err(Error::Service(ServiceError::NotReady));
-        if !machine.answer(&running, error) && !machine.park(running, error) {
-            machine.give_up_answer(&running);
+        match self.unit.shared.machine.try_borrow_mut() {
+            Ok(mut machine) => machine.drop_taken(&running),
+            Err(_) => {
+                let drop_taken = |machine: &mut Machine<T>, dropped: &Dropped| {
+                    if let Dropped::Taken(running) = dropped {
+                        machine.drop_taken(running);
+                    }
+                };
+                self.unit.shared.unwanted.add(drop_taken, Dropped::Taken(running));
+            }
         }
     }
 }

@@ -21,6 +21,7 @@
 mod bench;
 mod clock;
 mod driver;
+mod dropping;
 mod gate;
 mod security;
 mod tasks;
@@ -30,6 +31,7 @@ mod wire;
 pub use bench::{Bench, Board, SOCKETS};
 pub use cara_ethernet::{Fault, FaultCounts, Faults};
 pub use clock::now;
+pub use dropping::{dropping, is_held};
 pub use security::{keys, security};
 pub use values::number;
 pub use wire::{Wire, WireCounts};

@@ -1,7 +1,9 @@
 //! Calls that wait for a task, answers that wait for room, claims that wait for standstill: what comes in between.
 
 use std::cell::{Cell, RefCell};
+use std::pin::pin;
 use std::rc::Rc;
+use std::task::Context;
 
 use cara_core::config::Priority;
 use cara_core::distribution::claim::{Claim, KEY_FINGERPRINT_BYTES, StoredClaim, TaggedClaim};
@@ -13,7 +15,7 @@ use cara_core::services::lease::{Lease, Stage};
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_embassy::{Config, Handle, Handler, Limits, Resources, Security, ServiceOptions, TakenCall, resources};
-use cara_embassy_host::{Bench, Board, keys, number};
+use cara_embassy_host::{Bench, Board, dropping, is_held, keys, number};
 use embassy_time::{Duration as Span, with_timeout};
 
 const SHORT: Duration = Duration::from_secs(5);
@@ -188,6 +190,29 @@ fn a_call_of_a_function_that_is_gone_reaches_no_other_one() {
     agv.my_function_list().remove("other").unwrap();
     assert!(bench.run_until(|| ended.borrow().is_some(), SHORT));
     assert_eq!(ended.take(), Some(Err(Error::UnknownFunction)));
+}
+
+#[test]
+fn a_call_that_is_dropped_while_the_machine_is_in_use_is_answered_behind_it() {
+    let bench = Bench::new(37);
+    let ((manager_board, manager), board) = (manager(&bench), bench.board());
+    let agv = start!(board, Limits::S_UNIT, agv_config(&bench));
+    agv.my_function_list().add_service("note(n: int) -> (n: int)", ServiceOptions::new(), Handler::task()).unwrap();
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "note"), SHORT));
+    let outcomes = Outcomes::default();
+    call(&manager_board, manager, "note", 1, &outcomes);
+    let (_, taken) = take(&bench, &board, agv, "note").expect("it waits");
+    let mut waits = pin!(agv.wait_until(|_| false));
+    let waker = dropping(taken);
+    assert!(waits.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+    drop(waker);
+    assert!(is_held() && outcomes.borrow().is_empty());
+    // The machine has the last waker, and drops it for this news.
+    manager.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| !is_held(), SHORT));
+    assert!(bench.run_until(|| !outcomes.borrow().is_empty(), SHORT), "it is answered");
+    assert_eq!(*outcomes.borrow(), [(1, Err(Error::Service(ServiceError::NotReady)))]);
 }
 
 thread_local! {

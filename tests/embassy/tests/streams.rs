@@ -1,7 +1,9 @@
 //! Streams between boards: one publishes, the other one reads into memory that it has from the start.
 
 use std::cell::{Cell, RefCell};
+use std::pin::pin;
 use std::rc::Rc;
+use std::task::Context;
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{Error, Limit};
@@ -10,7 +12,7 @@ use cara_core::time::Duration;
 use cara_embassy::{
     Config, Handle, Limits, Publisher, StreamCell, Subscription, SubscriptionCell, Variables, resources,
 };
-use cara_embassy_host::{Bench, Board, keys};
+use cara_embassy_host::{Bench, Board, dropping, is_held, keys};
 
 const LONG: Duration = Duration::from_secs(30);
 const EVERY: Duration = Duration::from_millis(20);
@@ -110,6 +112,25 @@ fn a_board_reads_the_newest_value_with_its_age() {
     pair.bench.run_for(Duration::from_secs(10));
     assert!(newest(&pose).unwrap().1 >= pair.bench.now().since(made));
     assert_eq!(sent, 2);
+}
+
+#[test]
+fn a_subscription_that_is_dropped_while_the_machine_is_in_use_ends_behind_it() {
+    let pair = Pair::met(8);
+    let (agv, cell) = (pair.manager.peer("agv").unwrap(), leaked(SubscriptionCell::<64>::new()));
+    let pose = agv.subscribe("pose", Duration::ZERO, cell).unwrap();
+    pair.bench.run_for(Duration::from_secs(1));
+    let mut waits = pin!(pair.manager.wait_until(|_| false));
+    let waker = dropping(pose);
+    assert!(waits.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+    drop(waker);
+    assert!(is_held());
+    // The machine has the last waker, and drops it for this news.
+    pair.agv.publish_my_function_list().unwrap();
+    assert!(pair.bench.run_until(|| !is_held(), LONG));
+    let _anew = agv.subscribe("pose", Duration::ZERO, cell).expect("the cell is free");
+    pair.publish(1);
+    assert!(pair.bench.run_until(|| pair.sent() == 1, LONG), "the stream goes on");
 }
 
 #[test]

@@ -5,8 +5,7 @@ use std::cell::{Cell, RefCell};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::pin::Pin;
 use std::rc::Rc;
-use std::sync::Arc;
-use std::task::{Context, Poll, Wake, Waker};
+use std::task::{Context, Poll, Waker};
 
 use cara_core::config::{Constraints, SECURED_PORT};
 use cara_core::distribution::claim::{Claim, KEY_FINGERPRINT_BYTES, StoredClaim, TaggedClaim};
@@ -20,10 +19,8 @@ use cara_core::services::heart::Renew;
 use cara_core::services::lease::Lease;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_embassy::{
-    Config, Handle, Handler, Held, Hold, Hook, LeaseWatch, Limits, Security, ServiceOptions, UnitEvent, resources,
-};
-use cara_embassy_host::{Bench, Board, keys, number};
+use cara_embassy::{Config, Handle, Handler, Hook, LeaseWatch, Limits, Security, ServiceOptions, UnitEvent, resources};
+use cara_embassy_host::{Bench, Board, dropping, is_held, keys, number};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
 
@@ -297,23 +294,6 @@ fn hauling(board: &Board, unit: Unit, length: Duration) -> (Ends, Rc<RefCell<Vec
 /// As much as a message needs from board to board, and the 2 ms by which the end of a lease is rounded down.
 const AT_ONCE: Duration = Duration::from_millis(20);
 
-thread_local! {
-    static HELD: RefCell<Option<Held<Hold<State>>>> = const { RefCell::new(None) };
-}
-
-/// The waker of a task that ends with it, as executors on the heap have them.
-struct LetsGo;
-
-impl Wake for LetsGo {
-    fn wake(self: Arc<Self>) {}
-}
-
-impl Drop for LetsGo {
-    fn drop(&mut self) {
-        HELD.take();
-    }
-}
-
 #[test]
 fn a_hold_that_is_dropped_while_the_machine_is_in_use_is_released_behind_it() {
     let bench = Bench::new(21);
@@ -324,18 +304,18 @@ fn a_hold_that_is_dropped_while_the_machine_is_in_use_is_released_behind_it() {
     manager.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(agv, "manager", "lift"), SHORT));
     let peer = agv.peer("manager").unwrap();
-    finish(&bench, &board, async move {
-        HELD.set(peer.call("lift", &mut number(1)).renewing(Renew::Process).hold().await.ok());
+    let held = finish(&bench, &board, async move {
+        peer.call("lift", &mut number(1)).renewing(Renew::Process).hold().await.unwrap()
     });
     let (peer, mut parameters) = (agv.peer("manager").unwrap(), number(1));
     let mut asks = peer.call("double", &mut parameters).into_future();
-    let waker = Waker::from(Arc::new(LetsGo));
+    let waker = dropping(held);
     assert!(Pin::new(&mut asks).poll(&mut Context::from_waker(&waker)).is_pending());
     drop(waker);
-    assert!(HELD.with_borrow(Option::is_some) && MADE_SAFE.get() == 0, "it is held");
+    assert!(is_held() && MADE_SAFE.get() == 0, "it is held");
     // The machine has the last waker, and drops it for this one.
     assert!(Pin::new(&mut asks).poll(&mut Context::from_waker(Waker::noop())).is_pending());
-    assert!(HELD.with_borrow(Option::is_none));
+    assert!(!is_held());
     assert!(bench.run_until(|| MADE_SAFE.get() == 1, SHORT), "it is released");
 }
 
