@@ -1,8 +1,9 @@
 //! What is told of calls beside their results: why they fail, how far they are, and that their callers have given them up.
 
 use core::convert::Infallible;
-use core::future::poll_fn;
+use core::future::{Future as _, poll_fn};
 use core::ops::ControlFlow;
+use core::pin::pin;
 use core::task::Poll;
 
 use cara_core::config::FAILURE_VALUES_BYTES;
@@ -10,6 +11,7 @@ use cara_core::distribution::failure::Failure;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::call::{Callee, Detail, Outgoing};
+use cara_core::time::Instant;
 
 use crate::calls::CallError;
 use crate::handle::Handle;
@@ -58,7 +60,13 @@ impl<T> TakenCall<T> {
 
     /// Whether the caller has given the call up, waits no longer, or is gone: no answer reaches it then.
     pub fn is_cancelled(&self) -> bool {
-        self.running.is_none_or(|running| self.unit.look(|machine| machine.is_given_up(&running)))
+        let given_up = |running| self.unit.look(|machine| machine.is_given_up(&running));
+        now() >= self.waited_until() || self.running.is_none_or(given_up)
+    }
+
+    /// A caller without this feature does not say that its time is over.
+    fn waited_until(&self) -> Instant {
+        if self.wants_reply { self.deadline } else { Instant::FAR_FUTURE }
     }
 
     /// Ends once [`is_cancelled`](Self::is_cancelled) says so. Cancelling loses nothing.
@@ -68,7 +76,7 @@ impl<T> TakenCall<T> {
                 return Poll::Ready(());
             }
             self.unit.shared.machine.borrow_mut().wakers.leases.register(cx);
-            Poll::Pending
+            pin!(timer(self.waited_until())).poll(cx)
         })
         .await;
     }
