@@ -66,6 +66,11 @@ impl<T> Machine<T> {
         self.links.iter().any(|link| link.session.as_ref().is_some_and(LinkSession::moves))
     }
 
+    /// Whether a call of this function moves something.
+    pub(crate) fn moves_by(&self, slot: Slot) -> bool {
+        self.links.iter().any(|link| link.session.as_ref().is_some_and(|session| session.moves_by(slot)))
+    }
+
     /// Whether all that is listed stands: nothing moves for a call, and nothing slows down any more.
     fn stands(&self) -> bool {
         let mut leases = self.functions.iter().filter_map(|function| function.handler.lease);

@@ -107,13 +107,14 @@ impl<T> MyFunctionList<T> {
                 stream: None,
             };
             let known = machine.functions.find(signature.name());
+            let moves = known.is_some_and(|slot| machine.moves_by(slot));
             let replaced = known.and_then(|slot| machine.functions.function(slot)).map(|function| *function.handler);
             put(&mut machine.functions, signature, attributes, listed)?;
             if let Some(slot) = known {
                 machine.refuse_calls_of(slot);
             }
             // What a call of the service before started would go on to the end of its lease.
-            let stop = replaced.and_then(Listed::clear);
+            let stop = replaced.filter(|_| moves).and_then(Listed::clear);
             // Another service that had this lease may have left it dead, and no call would begin.
             let shares =
                 |listed: &Listed<T>| listed.lease.zip(lease).is_some_and(|(one, other)| core::ptr::eq(one, other));
@@ -130,8 +131,8 @@ impl<T> MyFunctionList<T> {
     pub fn remove(&self, name: &str) -> Result<(), Error> {
         let stop = self.unit.act(|machine| {
             let (slot, removed) = machine.functions.remove(name)?;
-            // What a call of it started would go on to the lease's end.
-            let stop = removed.clear();
+            // What a call of it started would go on to the lease's end; what one of another service started may.
+            let stop = if machine.moves_by(slot) { removed.clear() } else { None };
             machine.wakers.leases.wake();
             machine.refuse_calls_of(slot);
             machine.hub.publications.withdraw(slot);

@@ -193,6 +193,31 @@ fn a_call_of_a_function_that_is_gone_reaches_no_other_one() {
 }
 
 #[test]
+fn a_service_that_goes_leaves_the_order_of_another_one_with_its_lease() {
+    let bench = Bench::new(38);
+    let ((manager_board, manager), board) = (manager(&bench), bench.board());
+    let agv = start!(board, Limits::S_UNIT, agv_config(&bench));
+    let drive: &'static Lease = leaked(Lease::new());
+    let made_safe = || MADE_SAFE.set(MADE_SAFE.get() + 1);
+    let options = || ServiceOptions::new().lease(Duration::from_millis(400), drive, leaked(made_safe));
+    let (functions, nothing) = (agv.my_function_list(), Handler::free(&|_, _| Ok(())));
+    for signature in ["go_to(n: int) -> (n: int)", "dock(n: int)", "park(n: int)"] {
+        functions.add_service(signature, options(), nothing).unwrap();
+    }
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "park"), SHORT));
+    let outcomes = Outcomes::default();
+    call(&manager_board, manager, "go_to", 1, &outcomes);
+    assert!(bench.run_until(|| outcomes.borrow().len() == 1, SHORT));
+    functions.remove("dock").unwrap();
+    functions.replace("park(n: int, fast: bool)", options(), nothing).unwrap();
+    bench.run_for(SHORT);
+    assert!(drive.is_live(cara_embassy::now()) && MADE_SAFE.get() == 0, "it is renewed");
+    functions.remove("go_to").unwrap();
+    assert!(!drive.is_live(cara_embassy::now()) && MADE_SAFE.get() == 1, "its own service is gone");
+}
+
+#[test]
 fn a_call_that_is_dropped_while_the_machine_is_in_use_is_answered_behind_it() {
     let bench = Bench::new(37);
     let ((manager_board, manager), board) = (manager(&bench), bench.board());

@@ -137,6 +137,7 @@ entry!(session_asked, {
         session.calls_in_flight(),
         session.calls_held(),
         session.moves(),
+        session.moves_by(*unknown()),
     ));
     keep((
         session.wants_to_write(),
