@@ -135,7 +135,7 @@ impl Config {
     }
 
     /// The claim of an m_unit: [raised](Claim::raised) above the last one, and stored, before this; and what stores a higher one, which
-    /// returns whether it is stored. Without this an m_unit begins with the first term in each life.
+    /// returns whether it is stored, and is called while no order of this unit lives. Without this an m_unit begins with the first term in each life.
     pub fn claim(mut self, claim: Claim, store: fn(Claim) -> bool) -> Self {
         (self.claim, self.store_own) = (claim, Some(store));
         self

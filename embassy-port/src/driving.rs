@@ -227,8 +227,18 @@ impl<T> Machine<T> {
     /// An m_unit's claim is stored, and counts from then on.
     fn raise_claim(&mut self, claim: Claim) {
         let identity = self.hub.node.identity().clone();
-        let is_stored = self.store_own.is_none_or(|store| store(claim));
-        let Some(tagged) = claim.tagged(&identity, self.proof.codes()).filter(|_| is_stored) else { return };
+        let Some(tagged) = claim.tagged(&identity, self.proof.codes()) else { return };
+        if let Some(store) = self.store_own {
+            // A write to flash may hold up the renewals of its orders with other vehicles for longer than they last.
+            let renews = self.links.iter().any(|link| link.session.as_ref().is_some_and(LinkSession::renews));
+            if renews || !self.stands() {
+                return self.hub.node.not_raised(now());
+            }
+            if !store(claim) {
+                self.hub.node.counters.count(NodeCounter::ClaimsNotKept);
+                return self.notify(UnitEvent::ClaimNotKept { peer: identity, claim });
+            }
+        }
         self.hub.node.set_claim(tagged);
         for index in self.indices() {
             self.with(index, |session, cx| session.announce_claim(cx));

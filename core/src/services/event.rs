@@ -68,7 +68,8 @@ pub enum UnitEvent<F, N, E> {
     /// This manager does not lead any more. Its links and orders go on; calls that are only for a leader fail.
     NotLeading,
     /// The claim of this manager is obeyed until this unit's next start only: it could not be stored, or not in time. Where the unit
-    /// was handed over to this manager, nothing moves until it is stored; if it could not be, the unit goes back.
+    /// was handed over to this manager, nothing moves until it is stored; if it could not be, the unit goes back. With its own identity,
+    /// on boards: an m_unit has not raised its claim, because the higher one could not be stored.
     ClaimNotKept {
         /// The manager.
         peer: Identity,

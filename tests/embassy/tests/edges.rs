@@ -7,6 +7,7 @@ use std::task::Context;
 
 use cara_core::config::Priority;
 use cara_core::distribution::claim::{Claim, KEY_FINGERPRINT_BYTES, StoredClaim, TaggedClaim};
+use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{Error, ServiceError};
@@ -14,12 +15,16 @@ use cara_core::services::heart::Renew;
 use cara_core::services::lease::{Lease, Stage};
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
-use cara_embassy::{Config, Handle, Handler, Limits, Resources, Security, ServiceOptions, TakenCall, resources};
+use cara_embassy::{
+    Config, Handle, Handler, Limits, Resources, Security, ServiceOptions, TakenCall, UnitEvent, resources,
+};
 use cara_embassy_host::{Bench, Board, dropping, is_held, keys, number};
 use embassy_time::{Duration as Span, with_timeout};
 
 const SHORT: Duration = Duration::from_secs(5);
 const LONG: Duration = Duration::from_secs(30);
+
+const NOTHING: StoredClaim = StoredClaim { tagged: TaggedClaim::NONE, key: [0; KEY_FINGERPRINT_BYTES] };
 
 type Unit = Handle<()>;
 type Outcomes = Rc<RefCell<Vec<(i64, Result<(), Error>)>>>;
@@ -65,7 +70,8 @@ fn knows(unit: Unit, function: &str) -> bool {
 
 /// Calls a function of the vehicle; when the call ends, its outcome is with the others.
 fn call(board: &Board, unit: Unit, function: &'static str, n: i64, outcomes: &Outcomes) {
-    let (peer, outcomes) = (unit.peer("agv").unwrap(), Rc::clone(outcomes));
+    let offering = unit.nodes_offering(function).next();
+    let (peer, outcomes) = (offering.expect("a node offers it"), Rc::clone(outcomes));
     board.spawn(async move {
         let mut parameters = number(n);
         if function == "list" {
@@ -297,7 +303,6 @@ fn a_claim_is_stored_when_the_vehicle_stands_and_not_while_it_slows_down() {
         STORED.with_borrow_mut(|stored| stored.push(stage));
         true
     };
-    const NOTHING: StoredClaim = StoredClaim { tagged: TaggedClaim::NONE, key: [0; KEY_FINGERPRINT_BYTES] };
     let manager_of = |term| {
         let board = bench.board();
         let claim = Claim { term, claimant: 1 };
@@ -325,4 +330,74 @@ fn a_claim_is_stored_when_the_vehicle_stands_and_not_while_it_slows_down() {
         bench.run_for(Duration::from_millis(500));
     }
     assert_eq!(STORED.take(), [Stage::Dead]);
+}
+
+thread_local! {
+    static OBEYED: Cell<StoredClaim> = const { Cell::new(NOTHING) };
+    static RAISED: RefCell<Vec<bool>> = const { RefCell::new(Vec::new()) };
+}
+
+/// It would not renew its orders with other vehicles meanwhile.
+#[test]
+fn a_manager_raises_its_claim_while_it_holds_no_order_and_says_when_it_cannot() {
+    let bench = Bench::new(39);
+    let lift: &'static Lease = leaked(Lease::new());
+    DRIVE.set(Some(lift));
+    let manager_of = |term| {
+        let board = bench.board();
+        let store = |_| {
+            let is_live = DRIVE.get().unwrap().is_live(cara_embassy::now());
+            RAISED.with_borrow_mut(|raised| raised.push(is_live));
+            // The first time it fails.
+            RAISED.with_borrow(|raised| raised.len() > 1)
+        };
+        let unit = start!(board, MANAGER, manager_config(&bench).claim(Claim { term, claimant: 1 }, store));
+        (board, unit)
+    };
+    let serve = |config, function, lease| {
+        let board = bench.board();
+        let unit = start!(board, Limits::S_UNIT, config);
+        let options = ServiceOptions::new().lease(Duration::from_millis(400), lease, &|| {});
+        unit.my_function_list().add_service(function, options, Handler::free(&|_, _| Ok(()))).unwrap();
+        unit.publish_my_function_list().unwrap();
+        (board, unit)
+    };
+    let agv = || {
+        let store = |claim: &StoredClaim| {
+            OBEYED.set(*claim);
+            true
+        };
+        serve(agv_config(&bench).obeyed_claim(OBEYED.get(), store), "go_to(n: int) -> (n: int)", leaked(Lease::new()))
+    };
+    let outcomes = Outcomes::default();
+    let ((first_board, first), (board, _)) = (manager_of(6), agv());
+    assert!(bench.run_until(|| knows(first, "go_to"), LONG));
+    call(&first_board, first, "go_to", 1, &outcomes);
+    assert!(bench.run_until(|| outcomes.borrow().len() == 1 && OBEYED.get() != NOTHING, SHORT));
+    [first_board, board].iter().for_each(Board::cut_power);
+
+    let (manager_board, manager) = manager_of(5);
+    let events = Rc::new(RefCell::new(Vec::new()));
+    let heard = Rc::clone(&events);
+    manager_board.spawn(async move {
+        loop {
+            let event = manager.next_event().await;
+            heard.borrow_mut().push(event);
+        }
+    });
+    let other = Config::s_unit("lift", 8, "manager", 1, proof(&bench, &Identity::s_unit("lift", 8).unwrap())).unwrap();
+    let _lift = serve(other, "raise(n: int) -> (n: int)", lift);
+    assert!(bench.run_until(|| knows(manager, "raise"), LONG));
+    call(&manager_board, manager, "raise", 2, &outcomes);
+    assert!(bench.run_until(|| outcomes.borrow().len() == 2, SHORT));
+    let _agv = agv();
+    bench.run_for(LONG);
+    assert!(lift.is_live(cara_embassy::now()) && RAISED.with_borrow(Vec::is_empty), "it holds an order");
+    manager.peer("lift").unwrap().release("raise").unwrap();
+    assert!(bench.run_until(|| !RAISED.with_borrow(Vec::is_empty), LONG));
+    assert!(!knows(manager, "go_to") && manager.node_counted(NodeCounter::ClaimsNotKept) == 1);
+    assert!(bench.run_until(|| knows(manager, "go_to"), LONG.times(4)), "it is stored the second time");
+    assert_eq!(RAISED.take(), [false, false]);
+    let is_of_itself = |event: &UnitEvent| matches!(event, UnitEvent::ClaimNotKept { peer, claim } if *peer == manager.identity() && claim.term > 6);
+    assert!(events.borrow().iter().any(is_of_itself), "{:?}", events.borrow());
 }

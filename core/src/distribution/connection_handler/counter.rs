@@ -79,7 +79,7 @@ crate::counters::counters! {
         Fenced,
         /// Questions for this unit's own identity, because another manager of it was obeyed.
         OwnIdentityAsked,
-        /// Claims that are obeyed until this unit's next start, because they were not stored, or not in time.
+        /// Claims that are obeyed until this unit's next start, or were not raised, because they were not stored, or not in time.
         ClaimsNotKept,
         /// Links that were challenged to prove liveness, because another one had the same identity.
         Challenged,

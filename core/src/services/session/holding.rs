@@ -82,6 +82,11 @@ impl<P: Port> Calling<P> {
         self.held.iter().any(|held| held.call == call && held.is_renewed())
     }
 
+    /// Whether it is renewing that of any.
+    pub(super) fn renews(&self) -> bool {
+        self.held.iter().any(Held::is_renewed)
+    }
+
     /// How much of a function's leases is left, counted from the last answer to a renewal; `None` if none is renewed.
     pub(super) fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
         let of_slot = self.held.iter().filter(|held| held.slot == slot && held.is_renewed());

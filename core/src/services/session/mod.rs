@@ -655,6 +655,11 @@ impl<P: Port> Session<P> {
         self.calling.holds(call)
     }
 
+    /// Whether this unit is renewing the lease of any call.
+    pub fn renews(&self) -> bool {
+        self.calling.renews()
+    }
+
     /// How much of a function's leases is left, counted from the last answer to a renewal; `None` if none is renewed. An answer
     /// names its call, not which renewal it answers: if an answer to an earlier renewal was delayed, the value is too high by
     /// that delay.
