@@ -147,7 +147,10 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         context: &mut TaskContext<'_>,
     ) -> Option<Option<(u16, Event)>> {
-        let Some((length, from)) = self.mail.receive(scratch, context)? else { return Some(None) };
+        let Some((length, from)) = self.mail.receive(scratch, context)? else {
+            self.hub.node.counters.count(NodeCounter::DatagramMalformed);
+            return Some(None);
+        };
         let bytes = scratch.get_mut(..length).unwrap_or_default();
         let (mode, fleet) = (self.proof.codes().mode(), self.hub.node.fleet());
         if let Some((LinkId(link), nonce, body)) = datagram::for_session(bytes, mode, fleet)

@@ -77,6 +77,11 @@ impl Wire {
         self.ways[end].is_pulled.set(is_pulled);
     }
 
+    /// Bytes that no unit has sent come to an end.
+    pub fn inject(&self, end: usize, bytes: &[u8]) {
+        bytes.iter().for_each(|byte| self.ways[end].carry(*byte));
+    }
+
     /// What became of the bytes in both directions.
     pub fn counts(&self) -> WireCounts {
         let [one, other] = [0, 1].map(|end| self.ways[end].counts.get());

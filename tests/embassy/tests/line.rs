@@ -3,6 +3,8 @@
 use std::cell::RefCell;
 use std::rc::Rc;
 
+use cara_core::config::LINE_FRAME_BYTES;
+use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
 use cara_core::services::heart::Renew;
@@ -147,6 +149,19 @@ fn datagrams_wait_until_the_unit_takes_them() {
     bench.run_for(Duration::from_millis(100));
     assert!(wire.counts().bytes - before > 100, "searches have come");
     assert_eq!(line.counters().dropped, 0);
+}
+
+#[test]
+fn a_datagram_to_another_port_is_counted() {
+    let (bench, wire) = (Bench::new(35), Wire::new(BAUD, 35));
+    let board = bench.board();
+    let manager = start_manager(&wire, &board, 1);
+    bench.run_for(Duration::from_secs(1));
+    let (mut other, mut frame) = (cara_core::host::line::Line::new(BAUD, 2), [0; LINE_FRAME_BYTES]);
+    assert!(other.send_datagram(9, 1, b"to nobody"));
+    wire.inject(0, other.transmit(bench.now(), &mut frame));
+    bench.run_for(Duration::from_secs(1));
+    assert_eq!(manager.node_counted(NodeCounter::DatagramMalformed), 1);
 }
 
 #[test]

@@ -9,7 +9,7 @@ crate::counters::counters! {
         DatagramVersion,
         /// Datagrams of another fleet.
         DatagramFleet,
-        /// Datagrams that could not be read.
+        /// Datagrams that could not be read; on boards also longer ones than there is room for, and on a line those to another port.
         DatagramMalformed,
         /// Searches and answers without the right code of the fleet.
         DatagramForged,
