@@ -12,6 +12,9 @@
 //!
 //! A board keeps two copies in pages that are erased separately. [`newest`] takes the sound one with the higher
 //! generation; [`replaced`] tells which one to write next, so that the newest sound copy is never the one being erased.
+//!
+//! A copy that cannot be used may be one whose writing was cut off, or the newest one with a bit that has changed. So the other
+//! one counts, which may be older, unless it is for plain mode: nobody takes a board's keys away by damaging them.
 
 use crc::{CRC_32_ISO_HDLC, Crc, NoTable};
 
@@ -120,7 +123,8 @@ fn found(page: &[u8]) -> Result<Found<'_>, PageError> {
     let [magic @ .., layout, _, low, high, first, second, third, fourth] = header else {
         return Err(PageError::Absent);
     };
-    if magic != MAGIC {
+    // A copy stays one when one byte of these has changed.
+    if magic.iter().zip(MAGIC).filter(|(byte, expected)| *byte != expected).count() > 1 {
         return Err(PageError::Absent);
     }
     let length = usize::from(u16::from_le_bytes([*low, *high]));
@@ -143,7 +147,8 @@ fn found(page: &[u8]) -> Result<Found<'_>, PageError> {
     }
 }
 
-/// The settings of the newest sound copy; why there are none, of the copy that came nearest.
+/// The settings of the newest sound copy, but none for plain mode beside a copy that cannot be used; why there are none, of the copy
+/// that came nearest.
 pub fn newest(first: &[u8], second: &[u8]) -> Result<Settings, PageError> {
     newest_found(first, second).map(|found| found.settings)
 }
@@ -152,7 +157,11 @@ pub fn newest(first: &[u8], second: &[u8]) -> Result<Settings, PageError> {
 pub(crate) fn newest_found<'p>(first: &'p [u8], second: &'p [u8]) -> Result<Found<'p>, PageError> {
     match (found(first), found(second)) {
         (Ok(one), Ok(two)) => Ok(if is_newer(two.generation, one.generation) { two } else { one }),
-        (Ok(found), Err(_)) | (Err(_), Ok(found)) => Ok(found),
+        (Ok(found), Err(error)) | (Err(error), Ok(found)) => match error {
+            PageError::Absent => Ok(found),
+            _ if !found.settings.insecure => Ok(found),
+            error => Err(error),
+        },
         (Err(PageError::Absent), Err(error)) | (Err(error), Err(_)) => Err(error),
     }
 }
@@ -272,6 +281,23 @@ mod tests {
             assert!(decode(&damaged).is_err(), "bit {bit}");
             assert_eq!(newest(&first, &damaged), Ok(old.clone()), "bit {bit}");
             assert_eq!(newest(&damaged, &first), Ok(old.clone()), "bit {bit}");
+        }
+    }
+
+    /// The copy that is left may be of the time before the board got its keys.
+    #[test]
+    fn no_flipped_bit_leads_to_plain_mode() {
+        let plain = Settings { insecure: true, ..settings("agv-07", 7) };
+        let (first, mut second) = (page(&plain, 1), [0xFF; BYTES]);
+        let used = encode_with(&settings("agv-07", 7), &[0xC7; 100], 2, &mut second).unwrap();
+        for bit in 0..used * 8 {
+            let mut damaged = second;
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(newest(&first, &damaged), Err(PageError::Damaged), "bit {bit}");
+            assert_eq!(newest(&damaged, &first), Err(PageError::Damaged), "bit {bit}");
+        }
+        for never_written in [[0xFF; BYTES], [0; BYTES]] {
+            assert_eq!(newest(&first, &never_written), Ok(plain.clone()));
         }
     }
 

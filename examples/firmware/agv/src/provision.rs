@@ -42,6 +42,11 @@ impl Provision {
     /// Reads the two pages of a board; where something is missing the log tells what.
     pub fn read(first: &[u8], second: &[u8]) -> Option<Self> {
         let settings = provisioned(page::newest(first, second))?;
+        if [first, second].into_iter().any(|copy| page::decode(copy).is_err_and(|error| error != PageError::Absent)) {
+            info!(
+                "a copy of the settings is damaged, and the other one counts, which may be older: write them again with cara provision"
+            );
+        }
         #[cfg(feature = "secure")]
         let found = Self::of(settings, || cara_settings::keys::newest(first, second).map(|(_, keys)| keys));
         #[cfg(not(feature = "secure"))]
