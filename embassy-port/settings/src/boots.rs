@@ -17,13 +17,15 @@
 //! A claim that is stored is a record with a count of its own; each later one repeats it, so that it is where the count is.
 //!
 //! A count is returned once its record has been read back, and counts only rise: wherever power is cut, no count is
-//! returned twice. Nothing else erases the pages; a full chip erase takes the keys with them.
+//! returned twice. Nothing else erases the pages; a full chip erase takes the keys with them. For each record behind the newest
+//! that cannot be read a number is passed over: its own may have been returned. If such a record was the only one with a claim, the
+//! claim before counts again.
 
 use cara_core::distribution::claim::{Claim, StoredClaim, TaggedClaim};
 use cara_secure::random::BootCounter;
 use embedded_storage::nor_flash::NorFlash;
 
-use crate::page::SUM;
+use crate::page::{SUM, is_marked};
 
 /// Bytes of a record, which are written at once: a multiple of what any of these chips writes at once.
 pub const RECORD_BYTES: usize = 64;
@@ -69,6 +71,8 @@ struct Seen {
     claim: StoredClaim,
     /// Where the page is erased from.
     free: u32,
+    /// Records behind the newest that cannot be read.
+    lost: u64,
 }
 
 impl<F: NorFlash> Boots<F> {
@@ -92,14 +96,18 @@ impl<F: NorFlash> Boots<F> {
     }
 
     fn look(&mut self, page: u32) -> Result<Seen, F::Error> {
-        let mut seen = Seen { newest: 0, claim: StoredClaim::default(), free: 0 };
+        let mut seen = Seen { newest: 0, claim: StoredClaim::default(), free: 0, lost: 0 };
         for offset in self.offsets() {
             let record = self.read(page + offset)?;
             if record != ERASED {
                 seen.free = offset + RECORD_BYTES as u32;
             }
-            if let Some((count, claim)) = count(&record).filter(|(count, _)| *count > seen.newest) {
-                (seen.newest, seen.claim) = (count, claim);
+            match count(&record) {
+                Some((count, claim)) if count > seen.newest => {
+                    (seen.newest, seen.claim, seen.lost) = (count, claim, 0);
+                }
+                None if is_marked(&record, MAGIC) => seen.lost = seen.lost.saturating_add(1),
+                _ => {}
             }
         }
         Ok(seen)
@@ -141,13 +149,19 @@ impl<F: NorFlash> Boots<F> {
     fn newest(&mut self) -> Result<(u32, Seen, u32), F::Error> {
         let [one, two] = self.pages;
         let (first, second) = (self.look(one)?, self.look(two)?);
-        Ok(if second.newest > first.newest { (two, second, one) } else { (one, first, two) })
+        let (page, mut seen, older, other) =
+            if second.newest > first.newest { (two, second, first, one) } else { (one, first, second, two) };
+        // All that has been written since it was erased.
+        if older.newest == 0 {
+            seen.lost = seen.lost.saturating_add(older.lost);
+        }
+        Ok((page, seen, other))
     }
 
     /// Writes the next count, with the claim that is stored or another one.
     fn append(&mut self, claim: Option<&StoredClaim>) -> Result<u64, BootError<F::Error>> {
         let (page, seen, other) = self.newest()?;
-        let next = seen.newest.checked_add(1).ok_or(BootError::Worn)?;
+        let next = seen.newest.checked_add(1).and_then(|next| next.checked_add(seen.lost)).ok_or(BootError::Worn)?;
         let record = record(next, claim.unwrap_or(&seen.claim));
         if self.put(page, seen.free, &record)? {
             return Ok(next);
@@ -348,6 +362,21 @@ mod tests {
         assert!(cuts > 100 && second_cuts > 1_000, "{cuts} {second_cuts}");
     }
 
+    #[test]
+    fn no_flipped_bit_of_the_newest_record_repeats_a_count() {
+        for lives in 1..12 {
+            for bit in 0..RECORD_BYTES * 8 {
+                let mut chip = Chip::new();
+                let last = (0..lives).map(|_| chip.boot().unwrap()).last().unwrap();
+                let newest =
+                    chip.bytes.chunks(RECORD_BYTES).position(|bytes| bytes == record(last, &StoredClaim::default()));
+                chip.bytes[newest.unwrap() * RECORD_BYTES + bit / 8] ^= 1 << (bit % 8);
+                let counts = [last, chip.boot().unwrap(), chip.boot().unwrap()];
+                assert!(counts.is_sorted_by(|one, next| one < next), "{lives} lives, bit {bit}: {counts:?}");
+            }
+        }
+    }
+
     fn claim(term: u64) -> StoredClaim {
         let claim = Claim { term, claimant: !term };
         StoredClaim { tagged: TaggedClaim { claim, tag: [term as u8; 16] }, key: [9; 6] }
@@ -427,7 +456,10 @@ mod tests {
             match chip.boot() {
                 Ok(count) => {
                     prop_assert!(count > high);
-                    prop_assert_eq!(chip.boot(), count.checked_add(1).ok_or(BootError::Worn));
+                    match chip.boot() {
+                        Ok(next) => prop_assert!(next > count),
+                        Err(error) => prop_assert_eq!((error, count), (BootError::Worn, u64::MAX)),
+                    }
                 }
                 Err(error) => prop_assert_eq!((error, high), (BootError::Worn, u64::MAX)),
             }

@@ -123,8 +123,7 @@ fn found(page: &[u8]) -> Result<Found<'_>, PageError> {
     let [magic @ .., layout, _, low, high, first, second, third, fourth] = header else {
         return Err(PageError::Absent);
     };
-    // A copy stays one when one byte of these has changed.
-    if magic.iter().zip(MAGIC).filter(|(byte, expected)| *byte != expected).count() > 1 {
+    if !is_marked(magic, MAGIC) {
         return Err(PageError::Absent);
     }
     let length = usize::from(u16::from_le_bytes([*low, *high]));
@@ -145,6 +144,11 @@ fn found(page: &[u8]) -> Result<Found<'_>, PageError> {
     } else {
         Err(PageError::Unsound)
     }
+}
+
+/// Whether something was written here, also if one byte of the mark has changed since.
+pub(crate) fn is_marked(bytes: &[u8], mark: [u8; 4]) -> bool {
+    bytes.iter().zip(mark).filter(|(byte, expected)| *byte != expected).count() <= 1
 }
 
 /// The settings of the newest sound copy, but none for plain mode beside a copy that cannot be used; why there are none, of the copy
