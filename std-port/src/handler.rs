@@ -6,7 +6,7 @@ use std::future::Future;
 #[cfg(feature = "async")]
 use std::pin::Pin;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use cara_core::config::Priority;
 use cara_core::distribution::failure::Failure;
@@ -175,6 +175,8 @@ impl<T> Run<T> {
 
 /// A service as the list of functions holds it.
 pub(crate) struct Handler<T> {
+    /// Its own, in the whole process.
+    pub(crate) number: u64,
     pub(crate) run: Run<T>,
     /// What it moves, or what it alone stops or resets.
     pub(crate) actuator: Option<Actuator>,
@@ -191,6 +193,14 @@ pub(crate) struct Handler<T> {
     pub(crate) stream: Option<Arc<OwnStream>>,
 }
 
+impl<T> Handler<T> {
+    /// For the next one.
+    pub(crate) fn next_number() -> u64 {
+        static NUMBERS: AtomicU64 = AtomicU64::new(1);
+        NUMBERS.fetch_add(1, Ordering::Relaxed)
+    }
+}
+
 impl<T: 'static> Service for Handler<T> {
     fn lease(&self) -> Option<&Lease> {
         self.actuator.as_ref().map(Actuator::word)
@@ -201,7 +211,7 @@ impl<T: 'static> Service for Handler<T> {
     }
 
     fn begin_lease(&self, _: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {
-        self.actuator.as_ref().map(|actuator| actuator.safe.begin(end, claim)).transpose()
+        self.actuator.as_ref().map(|actuator| actuator.safe.begin(end, claim, self.number)).transpose()
     }
 
     fn inhibit(&self, now: Instant, latch: Latch) {
@@ -242,7 +252,7 @@ impl<T: 'static> Service for Handler<T> {
 impl<T> Drop for Handler<T> {
     fn drop(&mut self) {
         if let Some(actuator) = self.actuator.as_ref().filter(|_| self.moves) {
-            actuator.safe.clear();
+            actuator.safe.clear(self.number);
             actuator.lease.wake();
         }
     }

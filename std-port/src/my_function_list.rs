@@ -131,6 +131,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         };
         let watch = actuator.as_ref().map_or_else(|| self.never(), Actuator::watch);
         let handler = Handler {
+            number: Handler::<T>::next_number(),
             run,
             actuator,
             moves: attributes.lease.is_some(),

@@ -59,6 +59,8 @@ struct State {
     due: bool,
     /// The thread has seen the end of the lease and started the hook; the unit has yet to report that end.
     started_early: bool,
+    /// The number of the service whose order was the last to begin.
+    service: u64,
     running_since: Option<Instant>,
     /// This run has been counted as a long one.
     counted: bool,
@@ -76,9 +78,9 @@ impl SafeHook {
     }
 
     /// Begins an order: the thread looks when its lease ends.
-    pub(crate) fn begin(&self, end: Instant, claim: &Claim) -> Result<Order, Error> {
+    pub(crate) fn begin(&self, end: Instant, claim: &Claim, service: u64) -> Result<Order, Error> {
         // The order before this one is safe first: until then what reads the lease would act for this one by the wish of that.
-        let (_writing, is_safe) = self.shared.await_hook(lock(&self.shared.state));
+        let (mut state, is_safe) = self.shared.await_hook(lock(&self.shared.state));
         if !is_safe {
             return Err(ServiceError::NotReady.into());
         }
@@ -88,6 +90,7 @@ impl SafeHook {
             return Err(Error::Expired);
         }
         let order = self.shared.lease().claim(now, end, claim)?;
+        state.service = service;
         self.shared.changed.notify_all();
         Ok(order)
     }
@@ -146,10 +149,11 @@ impl SafeHook {
         self.shared.lease().state()
     }
 
-    /// The service is removed: an order that has not ended does so, and the hook starts.
-    pub(crate) fn clear(&self) {
+    /// A service is removed: an order of it that has not ended does so, and the hook starts. One of another service that moves the
+    /// same goes on.
+    pub(crate) fn clear(&self, service: u64) {
         let mut state = lock(&self.shared.state);
-        if self.shared.lease().clear(self.shared.parts.clock.now()) {
+        if state.service == service && self.shared.lease().clear(self.shared.parts.clock.now()) {
             self.shared.start(&mut state);
         }
     }
@@ -290,7 +294,7 @@ mod tests {
     };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
-        safe.begin(clock.now() + length, &CLAIM).expect("the order before has ended")
+        safe.begin(clock.now() + length, &CLAIM, 0).expect("the order before has ended")
     }
 
     /// The unit does nothing here: the thread sees the end of a lease that a suspension has outlasted, and what the unit
@@ -360,7 +364,7 @@ mod tests {
             until(|| runs.load(Ordering::SeqCst) == before + 1);
             let end = clock.now() + Duration::from_millis(millis);
             std::thread::scope(|scope| {
-                let waits = scope.spawn(|| safe.begin(end, &CLAIM));
+                let waits = scope.spawn(|| safe.begin(end, &CLAIM, 0));
                 // Less than a hook may take.
                 AHEAD.fetch_add(50_000, Ordering::SeqCst);
                 continues.send(()).unwrap();
@@ -384,7 +388,7 @@ mod tests {
         const LONG: Duration = Duration::from_secs(3_600);
         type Write = fn(&SafeHook, Order, Instant) -> bool;
         let writes: [Write; 6] = [
-            |safe, _, now| safe.begin(now + LONG, &CLAIM).is_ok(),
+            |safe, _, now| safe.begin(now + LONG, &CLAIM, 0).is_ok(),
             |safe, order, now| safe.renew(order, now + LONG + LONG),
             |safe, order, now| {
                 safe.cut(order);
@@ -393,7 +397,7 @@ mod tests {
             |safe, order, now| safe.finish(now, order),
             |safe, order, now| safe.expire(now, order, LeaseEnd::Expired),
             |safe, order, now| {
-                safe.clear();
+                safe.clear(0);
                 !safe.shared.lease().is_live_for(order, now)
             },
         ];
@@ -440,10 +444,10 @@ mod tests {
         let order = begin(&safe, clock, LONG);
         assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
         comes.recv().unwrap();
-        assert_eq!(safe.begin(clock.now() + LONG, &CLAIM), Err(ServiceError::NotReady.into()));
+        assert_eq!(safe.begin(clock.now() + LONG, &CLAIM, 0), Err(ServiceError::NotReady.into()));
         assert!(!safe.shared.lease().is_live(clock.now()));
         continues.send(()).unwrap();
-        until(|| safe.begin(clock.now() + LONG, &CLAIM).is_ok());
+        until(|| safe.begin(clock.now() + LONG, &CLAIM, 0).is_ok());
         safe.end();
     }
 
@@ -463,7 +467,7 @@ mod tests {
         let serve = || {
             for call in 0..CALLS {
                 let now = clock.now();
-                let Ok(order) = safe.begin(now + LONG, &CLAIM) else { panic!("call {call}: busy for ever") };
+                let Ok(order) = safe.begin(now + LONG, &CLAIM, 0) else { panic!("call {call}: busy for ever") };
                 if safe.has_run() {
                     let before = runs.load(Ordering::SeqCst);
                     let renewed = safe.renew(order, now + LONG);

@@ -120,6 +120,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         // Never run: a call of a stream is refused before.
         let run = Run::Free(Arc::new(|_, _| Err(ServiceError::NotReady)));
         let handler = Handler {
+            number: Handler::<T>::next_number(),
             run,
             actuator: None,
             moves: false,

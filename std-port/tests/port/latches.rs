@@ -1,7 +1,7 @@
 //! A stop lasts until a reset, through every change of a unit's services and through its restart.
 
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Barrier};
 
 use cara_std::{
@@ -150,4 +150,33 @@ fn a_stop_of_all_reaches_all_behind_a_handler_that_hangs_in_a_commit() {
     until("both are dead", || !drive.is_live() && !lift.is_live());
     continues.wait();
     until("it is stopped for its caller", || ask(&peer, "lift") == Err(Error::Inhibited { by: 1, reason: 0 }));
+}
+
+/// Two services move one thing: the end of the one that has started nothing ends no order of the other.
+#[test]
+fn a_service_that_goes_ends_its_own_order_only() {
+    let fleet = fleet();
+    let (manager, agv) = (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap());
+    let functions = agv.my_function_list();
+    let stops = Arc::new(AtomicUsize::new(0));
+    let counted = stops.clone();
+    let drive = functions
+        .actuator(move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+        })
+        .unwrap();
+    let moves = || ServiceOptions::new().moves(&drive, LEASE);
+    for name in ["creep()", "go()"] {
+        functions.add_service(&define(name), moves(), nothing).unwrap();
+    }
+    let (peer, _) = meet(&manager, &agv);
+    assert!(peer.wait_for_function("go", PATIENCE));
+    ask(&peer, "go").unwrap();
+    functions.replace(&define("creep()"), moves(), nothing).unwrap();
+    functions.remove("creep").unwrap();
+    std::thread::sleep(std::time::Duration::from_millis(50));
+    assert!(drive.watch().is_live() && stops.load(Ordering::SeqCst) == 0);
+    functions.remove("go").unwrap();
+    until("it is safe", || stops.load(Ordering::SeqCst) == 1);
+    assert!(!drive.watch().is_live());
 }
