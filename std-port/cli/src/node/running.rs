@@ -6,6 +6,7 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use anyhow::Context;
+use cara_std::control::{RunningUnit, running};
 use cara_std::{BuildError, Error};
 use serde_json::json;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -19,7 +20,7 @@ use super::program::Programs;
 use super::settings::{Overrides, Placed, Settings};
 use super::unit::{Node, NotBuilt};
 use super::{events, http, service, wrong};
-use cara_tools::exit::Ended;
+use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output;
 
@@ -118,6 +119,9 @@ fn not_made(error: Error, settings: &Settings) -> anyhow::Error {
     let tcp = settings.tcp_port.as_ref().filter(|port| in_use && port.value != 0 && !is_free(port));
     let port = tcp.or(settings.discovery_port.as_ref()).filter(|_| in_use);
     if let Some(Placed { value, span: Some(span) }) = port {
+        if let Some(error) = runs_already(settings, *value) {
+            return error;
+        }
         let what = format!("port {value} is in use by another program");
         let help = format!("choose another one; `ss -lntup | grep :{value}` shows who has it");
         return Ended::failed("PortInUse", settings.mistake(span.clone(), &what, &help).to_string());
@@ -146,8 +150,28 @@ fn not_served(kind: ErrorKind) -> &'static str {
     }
 }
 
+/// A port is taken: by the manager that this one is meant to be, which runs here. Another port would not help.
+fn runs_already(settings: &Settings, port: u16) -> Option<anyhow::Error> {
+    let Settings { name, id, fleet, manager, takes_over, stands_by, .. } = settings;
+    let is_refused = manager.is_none() && !takes_over && !stands_by;
+    let own = format!("{name}/{id}");
+    let is_own = |unit: &RunningUnit| unit.unit == own && unit.fleet == *fleet;
+    let runs = is_refused && running().is_ok_and(|units| units.iter().any(is_own));
+    runs.then(|| {
+        let text = format!(
+            "the m_unit {own} of fleet {fleet} is running already on this host, and port {port} is in use: stop it first, or give \
+             this one its own name or id"
+        );
+        Ended { exit: Exit::AlreadyRunning, text, name: "AlreadyRunning".into() }.into()
+    })
+}
+
 fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<TcpListener> {
     http::listen(place.value).map_err(|error| {
+        let in_use = error.kind() == ErrorKind::AddrInUse;
+        if let Some(error) = runs_already(settings, place.value.port()).filter(|_| in_use) {
+            return error;
+        }
         let what = format!("metrics cannot be served at {}: {error}", place.value);
         let help = not_served(error.kind());
         match &place.span {

@@ -33,6 +33,23 @@ fn a_second_manager_of_one_identity_does_not_start_and_the_first_goes_on() {
     until("the vehicle is back", || stage.ready() == 1);
 }
 
+/// A port of its file is taken by the running one: no other port helps, and no restart.
+#[test]
+fn a_second_manager_with_fixed_ports_ends_as_one_without() {
+    let folder = tempfile::tempdir().unwrap();
+    let stage = Stage::empty();
+    let free = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    for ports in [format!("tcp_port = {}", free()), format!("[metrics]\nlisten = \"127.0.0.1:{}\"", free())] {
+        let file = folder.path().join("node.toml");
+        std::fs::write(&file, format!("name = \"manager\"\nid = 1\n{ports}\n")).unwrap();
+        let arguments = ["node", file.to_str().unwrap()];
+        let mut first = Running::start(stage.command(&arguments));
+        first.expect(" is up: ");
+        stage.ends(5, &arguments).says("manager/1 of fleet").says(" is running already on this host, and port");
+        assert_eq!(first.interrupted(), 0);
+    }
+}
+
 /// The running one ends with a code of its own, also when it has been frozen meanwhile, and the vehicle changes over.
 #[test]
 fn a_manager_takes_over_and_the_other_one_ends_with_its_own_code() {
