@@ -221,7 +221,9 @@ impl Granting {
         if head.deadline <= cx.now || head.cancelled != Cancelled::No {
             return Err(Error::Expired);
         }
-        let charge = service_of(cx, head.slot, head.generation).and_then(Service::lease);
+        // Without its function nobody knows what it was to reset: without an actuator that would be all.
+        let service = service_of(cx, head.slot, head.generation).ok_or(Error::StaleFunction)?;
+        let charge = service.lease();
         let (mut latched, mut any) = (None, false);
         wire.publishing.actuators_due = true;
         Self::each_moved_by(cx, charge, &mut |service| {

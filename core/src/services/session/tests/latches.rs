@@ -124,6 +124,29 @@ fn a_stopped_service_that_is_removed_and_added_again_is_stopped() {
 }
 
 #[test]
+fn a_reset_whose_function_is_gone_when_it_is_answered_resets_nothing() {
+    for is_removed in [true, false] {
+        let (mut pair, go) = vehicle();
+        pair.agv.offer_leased("lift()", LEASE);
+        pair.publish();
+        assert_eq!(call(&mut pair, "halt"), Ok(()));
+        pair.run(MOMENT);
+        let id = pair.manager.call("free_drive", &none()).unwrap();
+        pair.settle();
+        assert!(!pair.agv.held.is_empty());
+        pair.agv.functions.remove("free_drive").unwrap();
+        if !is_removed {
+            pair.agv.offer_control("free_drive()", RESET, Some(go));
+        }
+        pair.agv.answer_held(Ok(&none()));
+        pair.settle();
+        assert_eq!(pair.manager.outcome(id).unwrap().map(drop), Err(Error::StaleFunction));
+        assert_eq!((call(&mut pair, "go"), call(&mut pair, "lift")), (stopped(1), stopped(1)));
+        assert_eq!((call(&mut pair, "free"), call(&mut pair, "go"), call(&mut pair, "lift")), (Ok(()), Ok(()), Ok(())));
+    }
+}
+
+#[test]
 fn a_drive_that_was_reset_by_itself_is_not_stopped_again_by_what_comes_to_move_it() {
     let (mut pair, go) = vehicle();
     assert_eq!((call(&mut pair, "halt"), call(&mut pair, "free_drive")), (Ok(()), Ok(())));
