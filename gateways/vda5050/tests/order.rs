@@ -5,9 +5,9 @@ mod fake;
 use std::time::Duration;
 
 use cara_vda5050::errors::Kind;
-use cara_vda5050::machine::Machine;
 use cara_vda5050::message::{
-    ActionScope, BlockingType, Corridor, Deviation, EStop, Edge, NodePosition, OperatingMode, Order, Trajectory,
+    ActionParameter, ActionScope, BlockingType, Corridor, Deviation, EStop, Edge, NodePosition, OperatingMode, Order,
+    Trajectory,
 };
 use cara_vda5050::state::{Command, Failure, OnBrokerLoss, Policy};
 use cara_vda5050::version::Version;
@@ -391,22 +391,6 @@ fn an_edges_action_ends_with_the_edge() {
 }
 
 #[test]
-fn a_pause_stops_the_vehicle_and_keeps_the_order() {
-    let mut pair = Pair::new("a");
-    pair.machine.order(order("o1", 0, 0, "a! b! c!"));
-    pair.turn();
-    pair.machine.instant_actions(instant("startPause", "p1"));
-    assert_eq!(pair.actions(), ["p1 RUNNING"], "it still drives");
-    pair.turns(5);
-    assert_eq!(pair.actions(), ["p1 FINISHED"]);
-    let report = pair.machine.report().unwrap();
-    assert_eq!((report.paused, report.driving, pair.left().as_str()), (Some(true), false, "ab! b! bc! c!"));
-    pair.machine.instant_actions(instant("stopPause", "p2"));
-    pair.turns(10);
-    assert_eq!((pair.left().as_str(), pair.vehicle.reached.len()), ("", 2));
-}
-
-#[test]
 fn a_cancelled_order_ends_when_the_vehicle_stands_and_its_actions_have_ended() {
     let mut pair = Pair::new("a");
     pair.machine.order(order("o1", 0, 0, "a!:beep b! c!:pick"));
@@ -541,21 +525,6 @@ fn a_drive_without_an_answer_is_given_up_before_it_is_asked_again() {
     assert_eq!(pair.machine.next(pair.now + Duration::from_secs(1)), Some(drive));
 }
 
-/// Started again, the gateway waits for its broker, and needs no stopPause.
-#[test]
-fn before_the_first_connection_nothing_was_stopped() {
-    let mut pair = Pair::new("a");
-    pair.machine.order(order("o1", 0, 0, "a! b!"));
-    let policy = Policy { on_broker_loss: OnBrokerLoss::Stop, ..policy() };
-    pair.machine = Machine::new(pair.machine.record().clone(), policy, pair.now);
-    pair.machine.status(pair.vehicle.status.clone());
-    pair.turns(5);
-    assert_eq!((pair.vehicle.reached.len(), pair.machine.record().is_paused), (0, false));
-    pair.machine.broker(true, pair.now);
-    pair.turns(5);
-    assert_eq!(pair.left(), "");
-}
-
 #[test]
 fn nothing_is_done_late() {
     let mut pair = Pair::new("a");
@@ -578,6 +547,28 @@ fn init_position_waits_for_no_order() {
     half_way(&mut pair);
     pair.machine.instant_actions(instant("initPosition", "i1"));
     assert_eq!(pair.actions(), ["i1 FAILED"]);
+}
+
+#[test]
+fn an_order_does_not_go_on_from_where_init_position_says() {
+    let mut pair = Pair::new("a");
+    done(&mut pair);
+    let mut message = instant("initPosition", "i1");
+    let parameter = ActionParameter { key: "lastNodeId".into(), value: "a".into() };
+    message.actions[0].action_parameters = Some(vec![parameter]);
+    pair.machine.instant_actions(message);
+    pair.turn();
+    assert_eq!(
+        (pair.actions().last().unwrap().as_str(), pair.machine.record().last_node_sequence_id),
+        ("i1 FINISHED", 0)
+    );
+    pair.machine.order(order("o1", 4, 0, "a! c!"));
+    assert_eq!((pair.left(), pair.errors()), (String::new(), vec!["orderUpdateError"]));
+    pair.vehicle.status.position.as_mut().unwrap().x = fake::place("a");
+    pair.turn();
+    pair.machine.order(order("o2", 0, 0, "a! c!"));
+    pair.turns(5);
+    assert_eq!((pair.left(), pair.vehicle.reached.last().unwrap().0.as_str()), (String::new(), "c"));
 }
 
 #[test]

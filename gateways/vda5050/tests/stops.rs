@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use cara_vda5050::machine::Machine;
 use cara_vda5050::message::{ActionStatus, InstantActions};
-use cara_vda5050::state::{Command, Failure, Record};
+use cara_vda5050::state::{Command, Failure, OnBrokerLoss, Policy, Record};
 use fake::{Pair, instant, order, policy};
 
 /// Drives an order's first edge; the vehicle has not said yet that it moves.
@@ -45,6 +45,37 @@ fn a_stop_right_behind_a_drive_ends_when_the_vehicle_stands() {
         assert!(pair.actions().contains(&"i1 FINISHED".into()), "{kind}: {:?}", pair.actions());
         assert_eq!(pair.left().is_empty(), kind == "cancelOrder");
     }
+}
+
+#[test]
+fn a_pause_stops_the_vehicle_and_keeps_the_order() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+    pair.turn();
+    pair.machine.instant_actions(instant("startPause", "p1"));
+    assert_eq!(pair.actions(), ["p1 RUNNING"], "it still drives");
+    pair.turns(5);
+    assert_eq!(pair.actions(), ["p1 FINISHED"]);
+    let report = pair.machine.report().unwrap();
+    assert_eq!((report.paused, report.driving, pair.left().as_str()), (Some(true), false, "ab! b! bc! c!"));
+    pair.machine.instant_actions(instant("stopPause", "p2"));
+    pair.turns(10);
+    assert_eq!((pair.left().as_str(), pair.vehicle.reached.len()), ("", 2));
+}
+
+/// Started again, the gateway waits for its broker, and needs no stopPause.
+#[test]
+fn before_the_first_connection_nothing_was_stopped() {
+    let mut pair = Pair::new("a");
+    pair.machine.order(order("o1", 0, 0, "a! b!"));
+    let policy = Policy { on_broker_loss: OnBrokerLoss::Stop, ..policy() };
+    pair.machine = Machine::new(pair.machine.record().clone(), policy, pair.now);
+    pair.machine.status(pair.vehicle.status.clone());
+    pair.turns(5);
+    assert_eq!((pair.vehicle.reached.len(), pair.machine.record().is_paused), (0, false));
+    pair.machine.broker(true, pair.now);
+    pair.turns(5);
+    assert_eq!(pair.left(), "");
 }
 
 /// A pause after a refusal is for what is tried again.

@@ -223,6 +223,8 @@ impl Machine {
                 let named = action.action_parameters.iter().flatten().find(|parameter| parameter.key == "lastNodeId");
                 if let Some(node) = named.and_then(|parameter| parameter.value.as_str()) {
                     (self.record.last_node_id, self.record.last_node_sequence_id) = (node.to_owned(), 0);
+                    // The order that has ended elsewhere does not go on from here, with sequence ids that it had before.
+                    self.record.is_cancelled = true;
                 }
                 self.end(index, ActionStatus::Finished, "", true);
             }
