@@ -42,7 +42,7 @@ pub(crate) struct Found {
 pub(crate) fn run(Arguments { node, state }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let state = state.or_else(state_folder);
     let state = state.ok_or_else(|| Ended::usage("say which folder of state the nodes have: --state FOLDER"))?;
-    let mut found = all(&state)?;
+    let All { mut found, .. } = all(&state)?;
     if let Some(node) = &node {
         found.retain(|found| found.node == *node || found.node.rsplit_once('/').is_some_and(|(name, _)| name == node));
     }
@@ -60,32 +60,52 @@ pub(crate) fn run(Arguments { node, state }: Arguments, global: &Global) -> anyh
     Ok(Exit::Done.into())
 }
 
-/// Those in a folder of state, the oldest first.
-pub(crate) fn all(state: &Path) -> anyhow::Result<Vec<Found>> {
-    let folder = state.join(FOLDER);
-    let failed = |error: std::io::Error| Ended::failed("Failed", format!("{}: {error}", folder.display()));
-    let entries = match fs::read_dir(&folder) {
-        Ok(entries) => entries,
-        Err(error) if error.kind() == ErrorKind::NotFound && state.is_dir() => return Ok(Vec::new()),
-        Err(error) => return Err(failed(error)),
-    };
-    let mut found = Vec::new();
-    for entry in entries {
-        found.extend(of(entry.map_err(failed)?.path()));
-    }
-    found.sort_by_key(|found| found.unix_ms);
-    Ok(found)
+/// The black boxes in a folder of state.
+#[derive(Default)]
+pub(crate) struct All {
+    /// The oldest first.
+    pub(crate) found: Vec<Found>,
+    /// Files that cannot be read as such, and why.
+    pub(crate) unread: Vec<(PathBuf, String)>,
 }
 
-/// `None` for anything but a black box.
-fn of(file: PathBuf) -> Option<Found> {
-    let bytes = fs::metadata(&file)
-        .ok()
-        .filter(|found| found.is_file() && file.extension().is_some_and(|own| own == "mcap"))?;
-    let mut reading = Reading::open(&file).ok()?;
+/// Those in a folder of state.
+pub(crate) fn all(state: &Path) -> anyhow::Result<All> {
+    let folder = state.join(FOLDER);
+    let failed = |error: std::io::Error| Ended::failed("Failed", format!("{}: {error}", folder.display()));
+    let mut all = All::default();
+    let entries = match fs::read_dir(&folder) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == ErrorKind::NotFound && state.is_dir() => return Ok(all),
+        Err(error) => return Err(failed(error)),
+    };
+    for entry in entries {
+        let file = entry.map_err(failed)?.path();
+        if file.extension().is_none_or(|own| own != "mcap") {
+            continue;
+        }
+        match of(&file) {
+            Ok(found) => all.found.push(found),
+            Err(why) => all.unread.push((file, why)),
+        }
+    }
+    all.found.sort_by_key(|found| found.unix_ms);
+    Ok(all)
+}
+
+fn of(file: &Path) -> Result<Found, String> {
+    let told = |error: std::io::Error| error.to_string();
+    let is = fs::metadata(file).map_err(told)?;
+    if !is.is_file() {
+        return Err("it is no file".into());
+    }
+    let mut reading = Reading::open(file).map_err(told)?;
     // What it says of itself comes before its messages.
     let _ = reading.next();
     let about = |key: &str| reading.about().get(key).cloned();
-    let (node, cause, unix_ms) = (about("unit")?, about("cause")?, about("unix_ms")?.parse().ok()?);
-    Some(Found { unix_ms, node, cause, bytes: bytes.len(), file })
+    let found = || {
+        let (node, cause, unix_ms) = (about("unit")?, about("cause")?, about("unix_ms")?.parse().ok()?);
+        Some(Found { unix_ms, node, cause, bytes: is.len(), file: file.to_owned() })
+    };
+    found().ok_or_else(|| "it does not say what it is, as a black box does".into())
 }

@@ -3,7 +3,8 @@
 mod archive;
 mod secrets;
 
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File, OpenOptions};
+use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -14,6 +15,8 @@ use cara_std::control::protocol::{Answer, Question};
 use cara_std::control::state_folder;
 use serde_json::{Map, Value, json};
 
+use super::black_box::All;
+use crate::node::black_box::FOLDER;
 use crate::operator::{Need, Operator};
 use archive::Archive;
 use cara_tools::exit::{Ended, Exit};
@@ -75,47 +78,17 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let Arguments { file, config, log, audit, state, listen } = arguments;
-    let failed = |error: std::io::Error| Ended::failed("Failed", format!("{}: {error}", file.display()));
-    let to = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&file).map_err(failed)?;
-    let state = state.or_else(state_folder);
-    let mut archive = Archive::new(to, Secrets::of_host(state.as_deref()));
-    let mut missing = Map::new();
-    let mut about = about();
-    if let Some(config) = &config {
-        match configuration(config) {
-            Ok((text, hash)) => {
-                about.insert("configuration_hash".into(), hash.into());
-                archive.text("configuration.toml", &text).map_err(failed)?;
-            }
-            Err(why) => drop(missing.insert("configuration".into(), why.into())),
-        }
-    }
-    match cara_doctor::examine(listen, global) {
-        Ok(report) => archive.object("doctor.json", &report).map_err(failed)?,
-        Err(error) => drop(missing.insert("doctor".into(), error.to_string().into())),
-    }
-    match known(global) {
-        Ok(Some(known)) => known.iter().try_for_each(|(name, value)| archive.object(name, value)).map_err(failed)?,
-        Ok(None) => drop(missing.insert("unit".into(), "no m_unit runs on this host".into())),
-        Err(error) => drop(missing.insert("unit".into(), error.to_string().into())),
-    }
-    let audit = audit.or_else(|| state.as_ref().map(|state| state.join("audit.log")));
-    for (name, path, take) in [("log.txt", log, end_of as fn(&Path) -> _), ("audit.jsonl", audit, audited)] {
-        let Some(path) = path else { continue };
-        match take(&path) {
-            Ok(text) => archive.text(name, &text).map_err(failed)?,
-            Err(why) => drop(missing.insert(name.into(), why.into())),
-        }
-    }
-    if let Some(state) = &state {
-        about.insert("recordings".into(), recordings(state).into());
-        let boxes = black_boxes(state, &mut archive).map_err(|error| Ended::failed("Failed", error.to_string()))?;
-        about.insert("black_boxes".into(), boxes);
-    }
-    about.insert("missing".into(), missing.into());
-    archive.object("about.json", &about.into()).map_err(failed)?;
-    let members = archive.end().map_err(failed)?;
+    let file = arguments.file.clone();
+    let failed = |why: String| Ended::failed("Failed", format!("{}: {why}", file.display()));
+    let to = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&file);
+    let to = to.map_err(|error| failed(error.to_string()))?;
+    let members = write(to, arguments, global).map_err(|error| {
+        // A fragment looks like a bundle, and stands in the way of the next one.
+        failed(match fs::remove_file(&file) {
+            Ok(()) => format!("{error}; what was written of it is removed"),
+            Err(why) => format!("{error}; what was written of it could not be removed: {why}"),
+        })
+    })?;
     match global.json {
         true => output::object(&json!({ "bundle": file, "members": members }))?,
         false => output::line(format_args!(
@@ -125,6 +98,48 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         ))?,
     }
     Ok(Exit::Done.into())
+}
+
+/// The names of the members. Fails only where the archive cannot be written: what cannot be read is missing in it.
+fn write(to: File, arguments: Arguments, global: &Global) -> io::Result<Vec<String>> {
+    let Arguments { config, log, audit, state, listen, .. } = arguments;
+    let state = state.or_else(state_folder);
+    let mut archive = Archive::new(to, Secrets::of_host(state.as_deref()));
+    let mut missing = Map::new();
+    let mut about = about();
+    if let Some(config) = &config {
+        match configuration(config) {
+            Ok((text, hash)) => {
+                about.insert("configuration_hash".into(), hash.into());
+                archive.text("configuration.toml", &text)?;
+            }
+            Err(why) => drop(missing.insert("configuration".into(), why.into())),
+        }
+    }
+    match cara_doctor::examine(listen, global) {
+        Ok(report) => archive.object("doctor.json", &report)?,
+        Err(error) => drop(missing.insert("doctor".into(), error.to_string().into())),
+    }
+    match known(global) {
+        Ok(Some(known)) => known.iter().try_for_each(|(name, value)| archive.object(name, value))?,
+        Ok(None) => drop(missing.insert("unit".into(), "no m_unit runs on this host".into())),
+        Err(error) => drop(missing.insert("unit".into(), error.to_string().into())),
+    }
+    let audit = audit.or_else(|| state.as_ref().map(|state| state.join("audit.log")));
+    for (name, path, take) in [("log.txt", log, end_of as fn(&Path) -> _), ("audit.jsonl", audit, audited)] {
+        let Some(path) = path else { continue };
+        match take(&path) {
+            Ok(text) => archive.text(name, &text)?,
+            Err(why) => drop(missing.insert(name.into(), why.into())),
+        }
+    }
+    if let Some(state) = &state {
+        about.insert("recordings".into(), recordings(state, &mut missing).into());
+        about.insert("black_boxes".into(), black_boxes(state, &mut archive, &mut missing)?);
+    }
+    about.insert("missing".into(), missing.into());
+    archive.object("about.json", &about.into())?;
+    archive.end()
 }
 
 /// This program and this host.
@@ -202,23 +217,46 @@ fn audited(path: &Path) -> Result<String, String> {
 }
 
 /// Names of recordings in the folder of state and in the current one.
-fn recordings(state: &Path) -> Vec<String> {
-    let entries = [state, Path::new(".")].into_iter().filter_map(|folder| fs::read_dir(folder).ok()).flatten();
-    let names = entries.filter_map(|entry| Some(entry.ok()?.file_name().to_string_lossy().into_owned()));
-    names.filter(|name| name.contains(".mcap")).collect()
+fn recordings(state: &Path, missing: &mut Map<String, Value>) -> Vec<String> {
+    let mut found = Vec::new();
+    for folder in [state, Path::new(".")] {
+        match fs::read_dir(folder) {
+            Ok(entries) => {
+                found.extend(entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()))
+            }
+            Err(error) => drop(missing.insert(format!("recordings in {}", folder.display()), error.to_string().into())),
+        }
+    }
+    found.retain(|name| name.contains(".mcap"));
+    found
 }
 
 /// Takes the newest, and says what each is.
-fn black_boxes(state: &Path, archive: &mut Archive) -> anyhow::Result<Value> {
+fn black_boxes(state: &Path, archive: &mut Archive, missing: &mut Map<String, Value>) -> io::Result<Value> {
+    let All { found, unread } = match super::black_box::all(state) {
+        Ok(all) => all,
+        Err(error) => {
+            missing.insert("black_boxes".into(), error.to_string().into());
+            return Ok(Value::Array(Vec::new()));
+        }
+    };
+    let mut miss = |file: &Path, why: String| {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        missing.insert(format!("{FOLDER}/{name}"), why.into());
+    };
+    unread.into_iter().for_each(|(file, why)| miss(&file, why));
     let (mut taken, mut bytes) = (Vec::new(), 0);
-    for (number, found) in super::black_box::all(state)?.into_iter().rev().take(BOXES).enumerate() {
+    for (number, found) in found.into_iter().rev().take(BOXES).enumerate() {
         bytes += found.bytes;
         if bytes > BOX_BYTES {
+            miss(&found.file, format!("with the newer ones it has more than {BOX_BYTES} bytes"));
             break;
         }
         let member = format!("black-box-{}.mcap", number + 1);
-        if archive.bytes(&member, &fs::read(&found.file)?)? {
-            taken.push(json!({ "member": member, "is": found }));
+        match fs::read(&found.file) {
+            Ok(read) if archive.bytes(&member, &read)? => taken.push(json!({ "member": member, "is": found })),
+            Ok(_) => miss(&found.file, "it holds a secret".into()),
+            Err(error) => miss(&found.file, error.to_string()),
         }
     }
     Ok(taken.into())

@@ -2,6 +2,7 @@
 
 mod access;
 mod alone;
+mod bundle;
 mod calls;
 mod constraints;
 mod documents;
