@@ -17,6 +17,7 @@ use serde_json::{Map, Value, json};
 
 use super::black_box::All;
 use crate::node::black_box::FOLDER;
+use crate::node::shown::take_out;
 use crate::operator::{Need, Operator};
 use archive::Archive;
 use cara_tools::exit::{Ended, Exit};
@@ -60,7 +61,7 @@ const AUDITED: [&str; 14] = [
 pub(crate) struct Arguments {
     /// The archive, which must not be there yet.
     file: PathBuf,
-    /// The node's configuration.
+    /// The node's configuration, of which the members that a node reads are taken, and of programs no arguments.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// A log of the node, of which the end is taken.
@@ -104,17 +105,26 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
 fn write(to: File, arguments: Arguments, global: &Global) -> io::Result<Vec<String>> {
     let Arguments { config, log, audit, state, listen, .. } = arguments;
     let state = state.or_else(state_folder);
-    let mut archive = Archive::new(to, Secrets::of_host(state.as_deref()));
+    let configuration = config.as_deref().map(configuration).transpose();
+    let named = configuration.as_ref().ok().and_then(|read| read.as_ref()?.keys.clone());
+    let secrets = Secrets::of_host(state.as_deref(), named.iter().chain(&global.key_file));
     let mut missing = Map::new();
+    for (path, why) in &secrets.unread {
+        missing.insert(format!("secrets of {}", path.display()), format!("{why}: they are not looked for").into());
+    }
+    let mut archive = Archive::new(to, secrets);
     let mut about = about();
-    if let Some(config) = &config {
-        match configuration(config) {
-            Ok((text, hash)) => {
-                about.insert("configuration_hash".into(), hash.into());
-                archive.text("configuration.toml", &text)?;
+    match configuration {
+        Ok(Some(Configuration { text, hash, left_out, .. })) => {
+            about.insert("configuration_hash".into(), hash.into());
+            archive.text("configuration.toml", &text)?;
+            if !left_out.is_empty() {
+                let why = format!("left out, as no node reads it: {}", left_out.join(", "));
+                missing.insert("configuration".into(), why.into());
             }
-            Err(why) => drop(missing.insert("configuration".into(), why.into())),
         }
+        Ok(None) => {}
+        Err(why) => drop(missing.insert("configuration".into(), why.into())),
     }
     match cara_doctor::examine(listen, global) {
         Ok(report) => archive.object("doctor.json", &report)?,
@@ -158,22 +168,34 @@ fn hash(bytes: &[u8]) -> String {
     Blake2s256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The file without comments, and without arguments of programs, in which a token may be; and the hash of the whole.
-fn configuration(path: &Path) -> Result<(String, String), String> {
-    let (bytes, _) = files::read(path, LONGEST_FILE).map_err(|error| error.to_string())?;
+/// What is taken of a configuration.
+struct Configuration {
+    /// Without comments, members that no node reads, and arguments of programs: a token may be in any of them.
+    text: String,
+    /// Of the whole file.
+    hash: String,
+    /// Members that are not in the text.
+    left_out: Vec<String>,
+    /// The file with the node's keys.
+    keys: Option<PathBuf>,
+}
+
+fn configuration(path: &Path) -> Result<Configuration, String> {
+    let (bytes, is_longer) = files::read(path, LONGEST_FILE).map_err(|error| error.to_string())?;
+    if is_longer {
+        return Err(format!("it has more than {LONGEST_FILE} bytes"));
+    }
     let text = std::str::from_utf8(&bytes).map_err(|error| error.to_string())?;
     // The text of the error shows the line.
     let mut table: toml::Table = toml::from_str(text).map_err(|_| "it is no TOML".to_owned())?;
-    let functions = table.get_mut("functions").and_then(toml::Value::as_array_mut);
-    for function in functions.into_iter().flatten().filter_map(toml::Value::as_table_mut) {
-        for key in ["run", "at_lease_end"] {
-            if let Some(words) = function.get_mut(key).and_then(toml::Value::as_array_mut) {
-                words.iter_mut().skip(1).for_each(|word| *word = "…".into());
-            }
-        }
-    }
+    let keys = table.get("keys").and_then(toml::Value::as_str).map(|keys| match Path::new(keys) {
+        // The node was perhaps started beside its file.
+        keys if !keys.exists() => path.with_file_name(keys),
+        keys => keys.to_owned(),
+    });
+    let left_out = take_out(&mut table);
     let text = toml::to_string(&table).map_err(|error| error.to_string())?;
-    Ok((text, hash(&bytes)))
+    Ok(Configuration { text, hash: hash(&bytes), left_out, keys })
 }
 
 /// What a unit of this host knows, by the name of its member; `None` if there is no unit.

@@ -15,6 +15,7 @@ mod program;
 mod running;
 mod service;
 mod settings;
+pub(crate) mod shown;
 mod unit;
 mod values;
 

@@ -2,9 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use cara_recording::Ring;
+use cara_std::control::protocol::Answer;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -115,4 +117,120 @@ fn a_bundle_that_the_disk_does_not_take_is_removed_and_the_error_says_why() {
     host.put("bundle.tar", "mine");
     assert_eq!(Ran::of(host.command(&[]).output().unwrap()).code, 1);
     assert_eq!(fs::read(host.path("bundle.tar")).unwrap(), b"mine");
+}
+
+/// A black box that is intact, and has this text.
+fn write_box(file: &Path, text: &str) {
+    let event =
+        |text: &str| Answer::Event { at_ms: 1, unix_ms: 1, event: "log".to_owned(), node: None, text: text.to_owned() };
+    fs::create_dir_all(file.parent().unwrap()).unwrap();
+    let about = [("unit", "agv/7"), ("cause", "stop"), ("unix_ms", "1")];
+    let about = about.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
+    cara_recording::write(file, about, &[Ring::line(&event(text)).unwrap()]).unwrap();
+}
+
+#[test]
+fn a_secret_gets_into_no_bundle_in_another_form() {
+    let host = Host::new();
+    let token = "pass\"w\\ord \u{7f}of mine";
+    let key = "0a1b2c3d4e5f60718293a4b5c6d7e8f90a1b2c3d4e5f60718293a4b5c6d7e8f9";
+    let as_base64 = ["ChssPU5fYHGCk6S1xtfo+QobLD1OX2BxgpOktcbX6Pk=", "ChssPU5fYHGCk6S1xtfo-QobLD1OX2BxgpOktcbX6Pk"];
+    // With a byte before the key.
+    let later = "/wobLD1OX2BxgpOktcbX6PkKGyw9Tl9gcYKTpLXG1+j5";
+    host.put("state/a.keys", format!("pair {key}\n"));
+    host.put("state/page.token", "see lobby NoHexOfAPageToken99\n");
+    let quoted = serde_json::to_string(token).unwrap();
+    let upper = key.to_ascii_uppercase();
+    let forms = [token, &quoted, &upper, as_base64[0], as_base64[1], later, "NoHexOfAPageToken99", "second-line"];
+    let lines: Vec<_> = forms.iter().map(|form| format!("a: {form}\n")).collect();
+    host.put("log", lines.concat());
+    // A box has the text of an event as JSON, in which JSON may be.
+    let arguments = format!("called {}", serde_json::json!({ "text": token }));
+    for (number, text) in [token, &arguments, &upper, as_base64[0], "harmless"].iter().enumerate() {
+        write_box(&host.path(&format!("state/black-box/{number}.mcap")), text);
+    }
+    let mut command = host.command(&["--state", "state", "--log", "log"]);
+    command.env("SMTP_PASSWORD", token).env("MY_SECRET", "first-line\nsecond-line\n");
+    let members = host.members(command);
+    assert_eq!(members["log.txt"], "(left out: it holds a secret)\n".repeat(forms.len()));
+    let boxes: Vec<_> = members.iter().filter(|(name, _)| name.starts_with("black-box-")).collect();
+    assert!(boxes.len() == 1 && boxes[0].1.contains("harmless"), "{boxes:?}");
+    let missing = about(&members, "missing");
+    assert_eq!(missing["black-box/0.mcap"], "it holds a secret", "{missing}");
+}
+
+#[test]
+fn of_a_configuration_known_members_alone_get_into_a_bundle() {
+    let host = Host::new();
+    let config = r#"
+name = "plant"
+id = "7"
+token = "secret-1"
+interfaces = { token = "secret-2" }
+metrics = "harmless"
+[broker]
+password = "secret-3"
+[control]
+operators = { daemon = "see" }
+password = "secret-4"
+[log]
+level = { of = "secret-5" }
+[[functions]]
+signature = "f()"
+secret = "secret-6"
+run = "curl -H secret-7"
+at_lease_end = ["sh -c secret-8", "secret-9"]
+[[functions]]
+run = [["curl", "secret-10"]]
+answer = "echo"
+at_lease_end = ["true"]
+"#;
+    host.put("plant.toml", config);
+    let members = host.bundle(&["--config", "plant.toml"]);
+    let text = &members["configuration.toml"];
+    assert!(!members.values().any(|text| text.contains("secret-")), "{members:?}");
+    let missing = about(&members, "missing");
+    let missing = missing["configuration"].as_str().unwrap();
+    for name in ["token", "interfaces", "broker", "control.password", "log.level", "functions.secret"] {
+        assert!(missing.contains(name), "{name}: {missing}");
+    }
+    let kept = [
+        "name = \"plant\"",
+        "id = \"7\"",
+        "metrics = \"harmless\"",
+        "daemon = \"see\"",
+        "signature = \"f()\"",
+        "at_lease_end = [\"sh\", \"…\"]",
+        "run = [\"…\"]",
+        "answer = \"echo\"",
+        "at_lease_end = [\"true\"]",
+    ];
+    for part in kept {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+    assert_eq!(text.matches("run = [\"…\"]").count(), 2, "{text}");
+    // Of the file with every key nothing is left out.
+    host.put("example.toml", host.stage.ends(0, &["node", "--example"]).out);
+    let members = host.bundle(&["--config", "example.toml"]);
+    assert!(about(&members, "missing")["configuration"].is_null(), "{members:?}");
+    assert!(members["configuration.toml"].contains("[black_box]"), "{members:?}");
+}
+
+#[test]
+fn the_keys_that_a_configuration_or_an_option_names_get_into_no_bundle() {
+    let host = Host::new();
+    let keys = [1, 2, 3].map(|number| format!("{number:02x}5ec7e7").repeat(8));
+    host.put("elsewhere/own", format!("pair {}\n", keys[0]));
+    host.put("option", format!("pair {}\n", keys[1]));
+    host.put("variable", format!("pair {}\n", keys[2]));
+    host.put("elsewhere/plant.toml", "keys = \"own\"\n");
+    host.put("log", keys.join("\n"));
+    let mut command = host.command(&["--config", "elsewhere/plant.toml", "--log", "log", "--key-file", "option"]);
+    command.env("CARA_KEYS", host.path("variable"));
+    let members = host.members(command);
+    assert_eq!(members["log.txt"], "(left out: it holds a secret)\n".repeat(3));
+    // Keys that cannot be read cannot be looked for.
+    host.put("elsewhere/plant.toml", "keys = \"/nonexist/keys\"\n");
+    let missing = about(&host.bundle(&["--config", "elsewhere/plant.toml"]), "missing");
+    assert!(missing["secrets of /nonexist/keys"].as_str().unwrap().contains("not looked for"), "{missing}");
 }
