@@ -31,6 +31,8 @@ use secrets::Secrets;
 const LONGEST_FILE: u64 = 1024 * 1024;
 /// What is taken of the end of a log.
 const LOG_BYTES: usize = 256 * 1024;
+/// Where the service's recordings are (docs/node.md).
+const OF_SERVICE: &str = "/var/log/cara";
 /// Black boxes, and their bytes together.
 const BOXES: usize = 8;
 const BOX_BYTES: u64 = 64 << 20;
@@ -53,7 +55,8 @@ const AUDITED: [&str; 14] = [
 ];
 
 /// Writes one archive (tar) for whoever is to help: releases, this host, the doctor's report, what the unit knows, its
-/// configuration, the ends of logs, black boxes.
+/// configuration, the ends of logs, black boxes; and the names of recordings that are in the folder of state, in
+/// /var/log/cara and in the current one.
 ///
 /// Keys and tokens are not in it: of files only known members are taken, and what holds a known secret all the same is left out.
 /// Names, addresses, arguments of calls and log lines are in it.
@@ -143,8 +146,8 @@ fn write(to: File, arguments: Arguments, global: &Global) -> io::Result<Vec<Stri
             Err(why) => drop(missing.insert(name.into(), why.into())),
         }
     }
+    about.insert("recordings".into(), recordings(state.as_deref(), &mut missing).into());
     if let Some(state) = &state {
-        about.insert("recordings".into(), recordings(state, &mut missing).into());
         about.insert("black_boxes".into(), black_boxes(state, &mut archive, &mut missing)?);
     }
     about.insert("missing".into(), missing.into());
@@ -238,18 +241,18 @@ fn audited(path: &Path) -> Result<String, String> {
     Ok(kept)
 }
 
-/// Names of recordings in the folder of state and in the current one.
-fn recordings(state: &Path, missing: &mut Map<String, Value>) -> Vec<String> {
+/// The recordings in the folders in which they are looked for.
+fn recordings(state: Option<&Path>, missing: &mut Map<String, Value>) -> Vec<String> {
     let mut found = Vec::new();
-    for folder in [state, Path::new(".")] {
+    for folder in state.into_iter().chain([OF_SERVICE, "."].map(Path::new)) {
         match fs::read_dir(folder) {
-            Ok(entries) => {
-                found.extend(entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()))
-            }
+            Ok(entries) => found.extend(entries.flatten().map(|entry| entry.path().to_string_lossy().into_owned())),
+            // A host without the service.
+            Err(error) if error.kind() == io::ErrorKind::NotFound && folder == Path::new(OF_SERVICE) => {}
             Err(error) => drop(missing.insert(format!("recordings in {}", folder.display()), error.to_string().into())),
         }
     }
-    found.retain(|name| name.contains(".mcap"));
+    found.retain(|path| path.rsplit('/').next().is_some_and(|name| name.contains(".mcap")));
     found
 }
 

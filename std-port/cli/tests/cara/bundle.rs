@@ -234,3 +234,39 @@ fn the_keys_that_a_configuration_or_an_option_names_get_into_no_bundle() {
     let missing = about(&host.bundle(&["--config", "elsewhere/plant.toml"]), "missing");
     assert!(missing["secrets of /nonexist/keys"].as_str().unwrap().contains("not looked for"), "{missing}");
 }
+
+#[test]
+fn recordings_are_found_in_every_folder_that_help_names() {
+    let host = Host::new();
+    host.stage
+        .ends(0, &["support-bundle", "--help"])
+        .says("in the folder of state, in /var/log/cara and in the current one");
+    host.put("here.mcap", "");
+    host.put("state/there.mcap.1", "");
+    let all = |members| {
+        let named = about(&members, "recordings");
+        let named: Vec<_> = named.as_array().unwrap().iter().map(|name| name.as_str().unwrap().to_owned()).collect();
+        let (of_service, others): (Vec<_>, Vec<_>) = named.into_iter().partition(|name| name.starts_with("/var/"));
+        (others, of_service)
+    };
+    assert_eq!(all(host.bundle(&[])).0, ["./here.mcap"]);
+    assert_eq!(all(host.bundle(&["--state", "state"])).0, ["state/there.mcap.1", "./here.mcap"]);
+    // In a /var/log of its own.
+    let unshare = |script: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["-rm", "sh", "-c", &format!("mount -t tmpfs none /var/log && {script}")]);
+        command
+    };
+    if !unshare("true").output().is_ok_and(|ran| ran.status.success()) {
+        return println!("not looked for in /var/log/cara: no namespace for mounts here");
+    }
+    let inner = host.command(&[]);
+    let mut command = unshare(
+        "mkdir /var/log/cara && touch /var/log/cara/plant.mcap /var/log/cara/plant.mcap.1 && exec \"$0\" \"$@\"",
+    );
+    command.arg(inner.get_program()).args(inner.get_args()).current_dir(host.folder.path());
+    command.envs(inner.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    let (_, mut of_service) = all(host.members(command));
+    of_service.sort();
+    assert_eq!(of_service, ["/var/log/cara/plant.mcap", "/var/log/cara/plant.mcap.1"]);
+}
