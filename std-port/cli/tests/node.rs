@@ -557,7 +557,6 @@ fn what_led_to_a_stop_is_in_a_black_box() {
     for part in ["joined", "halt {\"n\":17}", "signal=\"SIGTERM\""] {
         assert!(replayed.contains(part), "`{part}` is not in {replayed}");
     }
-    assert!(cara(&["black-box", "other/1", "--state", "state"]).contains("no black box"));
 }
 
 #[test]

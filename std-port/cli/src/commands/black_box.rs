@@ -1,5 +1,6 @@
 //! `cara black-box`: what the nodes of this host have written about incidents.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -44,7 +45,13 @@ pub(crate) fn run(Arguments { node, state }: Arguments, global: &Global) -> anyh
     let state = state.ok_or_else(|| Ended::usage("say which folder of state the nodes have: --state FOLDER"))?;
     let All { mut found, .. } = all(&state)?;
     if let Some(node) = &node {
+        let nodes: BTreeSet<_> = found.iter().map(|found| found.node.clone()).collect();
         found.retain(|found| found.node == *node || found.node.rsplit_once('/').is_some_and(|(name, _)| name == node));
+        if found.is_empty() && !nodes.is_empty() {
+            let nodes = Vec::from_iter(nodes).join(", ");
+            let text = format!("{} has no black box of {node}, but of {nodes}", state.display());
+            return Err(Ended::failed("NoBlackBox", text));
+        }
     }
     if global.json {
         output::object(&json!({ "black_boxes": found }))?;

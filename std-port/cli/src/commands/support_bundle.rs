@@ -4,7 +4,7 @@ mod archive;
 mod secrets;
 
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -30,7 +30,7 @@ use secrets::Secrets;
 /// Longest configuration, as `cara node` reads it.
 const LONGEST_FILE: u64 = 1024 * 1024;
 /// What is taken of the end of a log.
-const LOG_BYTES: usize = 256 * 1024;
+const LOG_BYTES: u64 = 256 * 1024;
 /// Where the service's recordings are (docs/node.md).
 const OF_SERVICE: &str = "/var/log/cara";
 /// Black boxes, and their bytes together.
@@ -220,13 +220,28 @@ fn known(global: &Global) -> anyhow::Result<Option<Vec<(&'static str, Value)>>> 
     ]))
 }
 
-/// The last whole lines of a file.
+/// The last whole lines of a file. A part of a line might have a part of a secret, which would not be found.
 fn end_of(path: &Path) -> Result<String, String> {
-    let bytes = fs::read(path).map_err(|error| error.to_string())?;
-    let end = bytes.get(bytes.len().saturating_sub(LOG_BYTES)..).unwrap_or_default();
-    let text = String::from_utf8_lossy(end).into_owned();
-    let is_whole = bytes.len() <= LOG_BYTES;
-    Ok(if is_whole { text } else { text.split_once('\n').map(|(_, rest)| rest.to_owned()).unwrap_or_default() })
+    let (bytes, is_whole) = last_bytes(path).map_err(|error| error.to_string())?;
+    let text = String::from_utf8_lossy(&bytes);
+    match text.split_once('\n') {
+        _ if is_whole => Ok(text.into_owned()),
+        Some((_, lines)) if !lines.is_empty() => Ok(lines.to_owned()),
+        _ => Err(format!("its last {LOG_BYTES} bytes are of one line")),
+    }
+}
+
+/// The end of a file, and whether that is all of it. Anything but a regular file is refused: a pipe would be waited for.
+fn last_bytes(path: &Path) -> io::Result<(Vec<u8>, bool)> {
+    if !path.metadata()?.is_file() {
+        return Err(io::Error::other("it is no file"));
+    }
+    let mut file = File::open(path)?;
+    let from = file.metadata()?.len().saturating_sub(LOG_BYTES);
+    file.seek(SeekFrom::Start(from))?;
+    let mut bytes = Vec::new();
+    file.take(LOG_BYTES).read_to_end(&mut bytes)?;
+    Ok((bytes, from == 0))
 }
 
 /// The last lines of an audit log, with the members that it writes alone.

@@ -256,7 +256,9 @@ impl Writer {
         let mut about = self.about.clone();
         about.extend([("cause", cause.word().to_owned()), ("unix_ms", unix_ms.to_string())].map(owned));
         self.of_unit("part")?.iter().for_each(|left| drop(fs::remove_file(left)));
-        recording::write(&path, about, lines).map_err(io::Error::other)?;
+        // With its cause: the error itself does not say that the disk is full.
+        let told = |error| io::Error::other(format!("{:#}", anyhow::Error::from(error)));
+        recording::write(&path, about, lines).map_err(told)?;
         let mut boxes = self.of_unit("mcap")?;
         boxes.sort();
         let too_many = boxes.len().saturating_sub(self.keep);
@@ -326,6 +328,9 @@ mod tests {
         fs::write(folder.path().join("file"), "").unwrap();
         let nowhere = Writer { folder: folder.path().join("file"), ..writer };
         assert!(nowhere.write(Cause::Stop, &lines).is_err());
+        let too_long = Writer { folder: folder.path().to_owned(), prefix: "x".repeat(300), ..nowhere };
+        let error = too_long.write(Cause::Stop, &lines).unwrap_err().to_string();
+        assert!(error.contains("File name too long"), "{error}");
     }
 
     #[test]

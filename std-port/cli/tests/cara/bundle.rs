@@ -10,7 +10,7 @@ use cara_std::control::protocol::Answer;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::support::{Ran, Stage};
+use crate::support::{PATIENCE, Ran, Stage};
 
 /// A folder with files, and a stage without nodes.
 struct Host {
@@ -269,4 +269,42 @@ fn recordings_are_found_in_every_folder_that_help_names() {
     let (_, mut of_service) = all(host.members(command));
     of_service.sort();
     assert_eq!(of_service, ["/var/log/cara/plant.mcap", "/var/log/cara/plant.mcap.1"]);
+}
+
+#[test]
+fn a_node_without_black_boxes_is_told_which_nodes_have_some() {
+    let host = Host::new();
+    write_box(&host.path("state/black-box/1.mcap"), "harmless");
+
+    let state = host.path("state").to_str().unwrap().to_owned();
+    host.stage.ends(1, &["black-box", "--state", &state, "nobody"]).says("nobody").says("agv/7");
+    host.stage.ends(1, &["black-box", "--state", &state, "agv/8", "--json"]).says("agv/7");
+    host.stage.ends(0, &["black-box", "--state", &state, "agv"]).says("agv/7");
+    fs::remove_file(host.path("state/black-box/1.mcap")).unwrap();
+    host.stage.ends(0, &["black-box", "--state", &state, "nobody"]).says("has no black box");
+}
+
+#[test]
+fn a_log_that_has_no_lines_to_take_is_missing_in_a_bundle() {
+    let host = Host::new();
+    host.put("log", format!("first\n{}\n", "x".repeat(300 << 10)));
+    let members = host.bundle(&["--log", "log"]);
+    assert!(!members.contains_key("log.txt"));
+    assert!(about(&members, "missing")["log.txt"].as_str().unwrap().contains("one line"), "{members:?}");
+    host.put("log", format!("{}\nlast\n", "x".repeat(300 << 10)));
+    assert_eq!(host.bundle(&["--log", "log"])["log.txt"], "last\n");
+    host.put("log", "");
+    assert_eq!(host.bundle(&["--log", "log"])["log.txt"], "");
+    rustix::fs::mkfifoat(rustix::fs::CWD, host.path("fifo"), rustix::fs::Mode::RWXU).unwrap();
+    let mut waits = host.command(&["--log", "fifo"]).spawn().unwrap();
+    let start = std::time::Instant::now();
+    while waits.try_wait().unwrap().is_none() {
+        if start.elapsed() > PATIENCE {
+            waits.kill().unwrap();
+            panic!("it waits for a pipe");
+        }
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    let members = self::members(&fs::read(host.path("bundle.tar")).unwrap());
+    assert!(about(&members, "missing")["log.txt"].as_str().unwrap().contains("no file"), "{members:?}");
 }
