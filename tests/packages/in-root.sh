@@ -9,6 +9,8 @@ dpkg --install /cara.deb
 cara --version
 cara-vda5050 --version
 man --where cara cara-node cara-vda5050 > /dev/null
+dpkg --verify cara
+[ -f /usr/share/cara/prometheus/cara.rules.yml ] && [ -f /usr/share/cara/grafana/cara.json ] && [ -f /usr/share/doc/cara/copyright ]
 [ -f /usr/share/doc/cara/book/index.html ] && [ -f /usr/share/doc/cara/book/searchindex.js ]
 [ "$(stat --format=%U:%G:%a /etc/cara)" = root:cara:750 ]
 systemd-analyze verify --man=no cara@plant.service cara-standby@plant.service cara-vda5050.service

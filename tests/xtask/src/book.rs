@@ -22,15 +22,32 @@ pub(crate) fn make() -> Result<PathBuf> {
         let text = fs::read_to_string(page)?;
         ensure!(!loads_from_elsewhere(&text), "{} takes something from the network", page.display());
         let directory = page.parent().context("a page lies in a folder")?;
+        let text = with_plots(&text, &folder)?;
         let (text, kept) = without_links_outwards(&text, |target| directory.join(target).is_file());
         fs::write(page, text)?;
         (pages, links) = (pages + 1, links + kept);
     }
-    for needed in ["index.html", "searchindex.js", "safety.html"] {
+    for needed in ["index.html", "searchindex.js", "safety.html", "plots/figure-6.svg"] {
         ensure!(folder.join(needed).is_file(), "the book has no {needed}");
     }
     println!("{}: {pages} pages, {links} links between them", folder.display());
     Ok(folder)
+}
+
+/// Where the documents' figures lie, as they name it.
+const PLOTS: &str = "../tests/experiments/plots/";
+
+/// The page with its figures, which are copied into the book.
+fn with_plots(page: &str, book: &Path) -> Result<String> {
+    for rest in page.split(&format!("<img src=\"{PLOTS}")).skip(1) {
+        let name = rest.split('"').next().unwrap_or_default();
+        let figure = workspace::root().join("docs").join(PLOTS).join(name);
+        fs::create_dir_all(book.join("plots"))?;
+        fs::copy(&figure, book.join("plots").join(name)).with_context(|| figure.display().to_string())?;
+    }
+    let page = page.replace(&format!("<img src=\"{PLOTS}"), "<img src=\"plots/");
+    ensure!(!page.contains("<img src=\"../"), "a figure is not in the book");
+    Ok(page)
 }
 
 /// Whether a browser that opens the page asks another host for anything.

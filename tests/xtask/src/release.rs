@@ -113,9 +113,20 @@ fn stage(usr: &Path, programs: &Path, native: &Path, book: &Path) -> Result<()> 
         place(Run::new(&native).args(["completions", shell]).text()?.as_bytes(), &usr.join(path), 0o644)?;
     }
     let documents = usr.join("share/doc/cara");
-    for file in ["README.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"] {
+    copy("packaging/README.md", &documents.join("README.md"))?;
+    for file in ["CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"] {
         copy(file, &documents.join(file))?;
     }
+    copy("packaging/debian/copyright", &documents.join("copyright"))?;
+    copy("packaging/prometheus/cara.rules.yml", &usr.join("share/cara/prometheus/cara.rules.yml"))?;
+    copy("packaging/grafana/cara.json", &usr.join("share/cara/grafana/cara.json"))?;
+    let units = usr.join("lib/systemd/system");
+    copy("packaging/systemd/cara@.service", &units.join("cara@.service"))?;
+    // A standby is the same node, started otherwise.
+    copy("packaging/systemd/cara@.service", &units.join("cara-standby@.service"))?;
+    copy("packaging/systemd/standby.conf", &units.join("cara-standby@.service.d/standby.conf"))?;
+    copy("gateways/vda5050/cara-vda5050.service", &units.join("cara-vda5050.service"))?;
+    copy("packaging/systemd/sysusers.conf", &usr.join("lib/sysusers.d/cara.conf"))?;
     Run::new("cp").args(["--recursive"]).args([book, &documents.join("book")]).stream()?;
     copy("gateways/vda5050/example.toml", &documents.join("vda5050.toml"))?;
     copy("gateways/vda5050/example-factsheet.json", &documents.join("example-factsheet.json"))?;
@@ -142,18 +153,11 @@ fn archive(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
         .args([&folder.join(name)])
         .args(["--directory"])
         .args([&tree.join("usr")])
-        .args(["bin", "share"])
+        .args(["bin", "lib", "share"])
         .stream()
 }
 
 fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
-    let units = tree.join("usr/lib/systemd/system");
-    copy("packaging/systemd/cara@.service", &units.join("cara@.service"))?;
-    // A standby is the same node, started otherwise.
-    copy("packaging/systemd/cara@.service", &units.join("cara-standby@.service"))?;
-    copy("packaging/systemd/standby.conf", &units.join("cara-standby@.service.d/standby.conf"))?;
-    copy("gateways/vda5050/cara-vda5050.service", &units.join("cara-vda5050.service"))?;
-    copy("packaging/systemd/sysusers.conf", &tree.join("usr/lib/sysusers.d/cara.conf"))?;
     fs::create_dir_all(tree.join("etc/cara"))?;
     let size = Run::new("du").args(["--summarize", "--block-size=1024"]).args([tree]).text()?;
     let size = size.split_whitespace().next().unwrap_or_default().to_owned();
@@ -170,6 +174,9 @@ fn package(folder: &Path, tree: &Path, processor: Processor) -> Result<()> {
         let text = workspace::read(&Path::new("packaging/debian").join(script))?;
         place(text.as_bytes(), &tree.join("DEBIAN").join(script), 0o755)?;
     }
+    // For `dpkg --verify`.
+    let sums = Run::new("find").args(["usr", "-type", "f", "-exec", "md5sum", "{}", "+"]).within(tree).text()?;
+    place(sums.as_bytes(), &tree.join("DEBIAN/md5sums"), 0o644)?;
     let file = folder.join(format!("cara_{VERSION}_{}.deb", processor.debian));
     Run::new("dpkg-deb").args(["--root-owner-group", "--build"]).args([tree, &file]).stream()
 }
