@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use mcap::records::MessageHeader;
 use mcap::write::{Metadata, NoSeek};
-use mcap::{McapResult, WriteOptions};
+use mcap::{McapError, McapResult, WriteOptions};
 
 use super::layout::{self, Message};
 use super::recorder::State;
@@ -41,6 +41,14 @@ pub enum StartError {
         /// The file.
         path: PathBuf,
         /// Its reason.
+        error: io::Error,
+    },
+    /// The file is there, and its first bytes could not be written: a disk that is full from the start.
+    #[error("{}: nothing can be written there ({error}): make room, or record to another disk", path.display())]
+    TakesNothing {
+        /// The file.
+        path: PathBuf,
+        /// What the disk says.
         error: io::Error,
     },
 }
@@ -85,7 +93,13 @@ impl Files {
             shift(path, limits).map_err(failed)?;
         }
         let file = create(path).map_err(failed)?;
-        files.begin(file).map_err(|error| failed(io::Error::other(error)))?;
+        if let Err(error) = files.begin(file) {
+            // Not left empty: the next try would put it aside as a recording.
+            let _ = fs::remove_file(path);
+            let error = if let McapError::Io(error) = error { error } else { io::Error::other(error) };
+            return Err(StartError::TakesNothing { path: path.to_owned(), error });
+        }
+        files.state.has_begun();
         Ok(files)
     }
 
@@ -123,7 +137,7 @@ impl Files {
         if self.open.is_none() || self.state.bytes() >= self.limits.size {
             self.next()?;
         }
-        let Some(open) = &mut self.open else { return Err(mcap::McapError::AttemptedWriteAfterFailure) };
+        let Some(open) = &mut self.open else { return Err(McapError::AttemptedWriteAfterFailure) };
         open.write(message, came)
     }
 
@@ -140,7 +154,7 @@ impl Files {
     fn next(&mut self) -> McapResult<()> {
         self.finish()?;
         if self.state.is_given_up() {
-            return Err(mcap::McapError::AttemptedWriteAfterFailure);
+            return Err(McapError::AttemptedWriteAfterFailure);
         }
         loop {
             match shift(&self.path, self.limits).and_then(|()| create(&self.path)) {
@@ -171,7 +185,7 @@ impl<W: Write> Open<W> {
         let key = (message.topic.to_string(), message.form.clone());
         if !self.channels.contains_key(&key) {
             if self.channels.len() >= MOST_CHANNELS {
-                return Err(mcap::McapError::TooManyChannels);
+                return Err(McapError::TooManyChannels);
             }
             let (name, schema) = layout::schema(message);
             let schema = self.mcap.add_schema(&name, "jsonschema", schema.to_string().as_bytes())?;
@@ -215,7 +229,8 @@ fn shift(path: &Path, Limits { size, keep }: Limits) -> io::Result<()> {
     (0..free).rev().try_for_each(|number| fs::rename(numbered(number), numbered(number + 1)))
 }
 
-/// A file on a disk that may be full: a write waits until it takes the bytes, or the recording is given up.
+/// A file on a disk that may be full: once the recording has begun, a write waits until it takes the bytes, or the recording is given
+/// up.
 struct Patient {
     file: File,
     state: Arc<State>,

@@ -42,7 +42,7 @@ pub struct Outcome {
 }
 
 impl Recorder {
-    /// Begins a file with `about` as its metadata.
+    /// Begins a file with `about` as its metadata. Waits for a disk that hangs, and for none that is full.
     pub fn start(path: &Path, limits: Limits, about: BTreeMap<String, String>) -> Result<Self, StartError> {
         let state = Arc::<State>::default();
         let files = Files::open(path, limits, about, state.clone())?;
@@ -133,6 +133,8 @@ pub(super) struct State {
     /// Messages of a chunk that the disk did not take.
     unwritten: AtomicU64,
     held_up: Mutex<Option<String>>,
+    /// Before it nobody can give up, and so nothing waits for the disk.
+    begun: AtomicBool,
     given_up: AtomicBool,
     is_whole: AtomicBool,
 }
@@ -141,6 +143,10 @@ impl State {
     pub(super) fn begins(&self) {
         self.bytes.store(0, Ordering::Relaxed);
         self.file.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(super) fn has_begun(&self) {
+        self.begun.store(true, Ordering::Relaxed);
     }
 
     pub(super) fn bytes(&self) -> u64 {
@@ -156,10 +162,10 @@ impl State {
         self.given_up.load(Ordering::Relaxed)
     }
 
-    /// The system refuses to write: waits before the next try. An error once the recording is given up.
+    /// The system refuses to write: waits before the next try. An error before the recording has begun, and once it is given up.
     pub(super) fn is_held_up(&self, error: io::Error, pause: Duration) -> io::Result<()> {
         *self.held_up.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
-        if self.is_given_up() {
+        if !self.begun.load(Ordering::Relaxed) || self.is_given_up() {
             return Err(error);
         }
         std::thread::sleep(pause);

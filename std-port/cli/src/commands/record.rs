@@ -1,8 +1,9 @@
 //! `cara record`: what a manager reports, into a file.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Builder, sleep};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -59,7 +60,7 @@ const CHUNK: Duration = Duration::from_secs(1);
 const PAUSE: Duration = Duration::from_millis(20);
 /// Between two warnings about losses.
 const WARN: Duration = Duration::from_secs(10);
-/// How long a disk that takes nothing is waited for at the end.
+/// How long a disk that takes nothing is waited for at the end, and before it is said at the start.
 const LAST: Duration = Duration::from_secs(2);
 /// Every file begins with the state of everything.
 const LEAST: u64 = 64 * 1024;
@@ -75,11 +76,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let decoding = Arc::new(Decoding::of(&firmware, Decoding::OfLinux)?);
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let unit = operator.unit()?;
-    let recorder = Recorder::start(&file, Limits { size: max_size, keep: keep.into() }, about(&unit));
-    let recorder = recorder.map_err(|error| match &error {
-        StartError::Refused { .. } => Ended::usage(error.to_string()),
-        StartError::Failed { .. } => Ended::failed("Failed", error.to_string()),
-    })?;
+    let start = Instant::now();
+    let is_over = || asked.came() || span.is_some_and(|span| start.elapsed() >= span);
+    let (path, limits, about) = (file.clone(), Limits { size: max_size, keep: keep.into() }, about(&unit));
+    let recorder = begin(&file, move || Recorder::start(&path, limits, about), is_over)?;
     let way = operator.way();
     let mut questions = vec![Question::Commands];
     if !stream.is_empty() {
@@ -104,7 +104,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
             file.display()
         ))?,
     }
-    await_end(&recorder, &asked, span);
+    await_end(&recorder, is_over);
     way.end();
     let outcome = recorder.end(LAST);
     match global.json {
@@ -119,10 +119,37 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     Ok(Exit::Done.into())
 }
 
-fn await_end(recorder: &Recorder, asked: &Asked, span: Option<Duration>) {
-    let start = Instant::now();
-    let (mut flushed, mut warned, mut lost) = (start, None::<Instant>, 0);
-    while !asked.came() && span.is_none_or(|span| start.elapsed() < span) {
+/// Opens the file in a thread of its own, as its disk may hang. Fails if it has not opened when the recording is over.
+fn begin<T: Send + 'static>(
+    file: &Path,
+    start: impl FnOnce() -> Result<T, StartError> + Send + 'static,
+    is_over: impl Fn() -> bool,
+) -> anyhow::Result<T> {
+    let (to, started) = channel();
+    Builder::new().name("open".into()).spawn(move || drop(to.send(start())))?;
+    let (begun, mut is_warned) = (Instant::now(), false);
+    loop {
+        match started.recv_timeout(PAUSE) {
+            Ok(Ok(recorder)) => return Ok(recorder),
+            Ok(Err(error)) if matches!(error, StartError::Refused { .. }) => return Err(Ended::usage(error.to_string())),
+            Ok(Err(error)) => return Err(Ended::failed("Failed", error.to_string())),
+            Err(RecvTimeoutError::Disconnected) => anyhow::bail!("{}: the thread that opens it ended", file.display()),
+            Err(RecvTimeoutError::Timeout) if is_over() => {
+                let text = format!("{}: the disk does not answer: nothing is recorded", file.display());
+                return Err(Ended::failed("Failed", text));
+            }
+            Err(RecvTimeoutError::Timeout) if !is_warned && begun.elapsed() >= LAST => {
+                is_warned = true;
+                output::warning(format_args!("{}: the disk does not answer, nothing is recorded yet", file.display()));
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+        }
+    }
+}
+
+fn await_end(recorder: &Recorder, is_over: impl Fn() -> bool) {
+    let (mut flushed, mut warned, mut lost) = (Instant::now(), None::<Instant>, 0);
+    while !is_over() {
         sleep(PAUSE);
         if flushed.elapsed() >= CHUNK {
             flushed = Instant::now();
@@ -292,4 +319,28 @@ fn record_changed(
         known.insert(key, lasting);
     }
     offers.filter(|_| has_changed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_disk_that_hangs_at_the_start_does_not_hold_up_the_end() {
+        let (go_on, hangs) = channel::<()>();
+        let looks = std::cell::Cell::new(0);
+        let is_over = || {
+            looks.set(looks.get() + 1);
+            looks.get() == 3
+        };
+        let start = move || {
+            let _ = hangs.recv();
+            Ok(())
+        };
+        let ended = begin(Path::new("a.mcap"), start, is_over).unwrap_err();
+        let ended = ended.downcast::<Ended>().unwrap();
+        assert!(ended.exit == Exit::Failed && ended.text.contains("does not answer"), "{}", ended.text);
+        drop(go_on);
+        assert_eq!(begin(Path::new("a.mcap"), || Ok(7), || false).unwrap(), 7);
+    }
 }

@@ -249,6 +249,27 @@ fn a_full_disk_costs_messages_that_are_counted_and_the_recording_goes_on() {
     assert!(mcap::Summary::read(&std::fs::read(&file).unwrap()).unwrap().is_some(), "the file is whole");
 }
 
+/// As above, but the disk is full from the start.
+#[test]
+fn a_disk_that_is_full_at_the_start_is_said_and_no_file_is_left() {
+    let stage = Stage::with(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a.mcap");
+    let inner = stage.command(&["record", file.to_str().unwrap()]);
+    let mut command = Command::new("sh");
+    command
+        .args(["-c", "trap '' XFSZ; ulimit -S -f 0; exec \"$0\" \"$@\" 2>&1"])
+        .arg(inner.get_program())
+        .args(inner.get_args());
+    inner.get_envs().for_each(|(name, value)| {
+        value.map(|value| command.env(name, value));
+    });
+    let mut recording = Running::start(command);
+    recording.expect("make room, or record to another disk");
+    assert_eq!(recording.end(), 1);
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
+}
+
 /// With Python's `mcap` and `jsonschema`: `cargo xtask test recordings` installs them.
 #[test]
 #[ignore = "needs packages of PyPI"]
