@@ -81,17 +81,9 @@ impl Recording {
 
     /// Ends a chunk if that is due, and warns of losses. To be called several times a second.
     pub fn turn(&self) {
-        let Some((shared, recorder)) = self.opened() else { return };
-        let mut turned = shared.turned.lock().unwrap_or_else(PoisonError::into_inner);
-        let (flushed, lost, warned) = &mut *turned;
-        if flushed.elapsed() >= CHUNK {
-            *flushed = Instant::now();
-            recorder.flush();
-        }
-        if recorder.lost() > *lost && warned.is_none_or(|warned| warned.elapsed() >= WARN) {
-            (*lost, *warned) = (recorder.lost(), Some(Instant::now()));
-            let why = recorder.held_up().map(|why| format!(": {why}")).unwrap_or_default();
-            log::line(format_args!("{}: {lost} messages are not recorded until now{why}", shared.file.display()));
+        let Some(shared) = self.0.as_deref() else { return };
+        if let Some(losses) = shared.turn() {
+            log::line(format_args!("{}: {losses}", shared.file.display()));
         }
     }
 
@@ -103,10 +95,26 @@ impl Recording {
         let lost = lost + shared.missed.load(Ordering::Relaxed);
         log::line(format_args!("{}: {messages} messages recorded, {lost} lost", shared.file.display()));
     }
+}
 
-    fn opened(&self) -> Option<(&Shared, &Recorder)> {
-        let shared = self.0.as_deref()?;
-        Some((shared, shared.recorder.get()?))
+impl Shared {
+    /// Returns what is to be said of losses, those before the file was open included: its disk may hang.
+    fn turn(&self) -> Option<String> {
+        let recorder = self.recorder.get();
+        let mut turned = self.turned.lock().unwrap_or_else(PoisonError::into_inner);
+        let (flushed, lost, warned) = &mut *turned;
+        if let Some(recorder) = recorder.filter(|_| flushed.elapsed() >= CHUNK) {
+            *flushed = Instant::now();
+            recorder.flush();
+        }
+        let now = self.missed.load(Ordering::Relaxed) + recorder.map_or(0, Recorder::lost);
+        if now <= *lost || warned.is_some_and(|warned| warned.elapsed() < WARN) {
+            return None;
+        }
+        (*lost, *warned) = (now, Some(Instant::now()));
+        let why = recorder.map_or_else(|| Some("the file is not open yet".to_owned()), Recorder::held_up);
+        let why = why.map(|why| format!(": {why}")).unwrap_or_default();
+        Some(format!("{now} messages are not recorded until now{why}"))
     }
 }
 
@@ -141,6 +149,29 @@ mod tests {
     use std::cell::Cell;
 
     use super::*;
+
+    #[test]
+    fn what_is_missed_before_the_file_is_open_is_said() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.mcap");
+        let recording = Recording(Some(Arc::new(Shared {
+            file: file.clone(),
+            recorder: OnceLock::new(),
+            missed: AtomicU64::new(0),
+            turned: Mutex::new((Instant::now(), 0, None)),
+        })));
+        let shared = recording.0.as_deref().unwrap();
+        assert_eq!(shared.turn(), None);
+        (0..3).for_each(|_| recording.take(true, "uagv/state", false, b"{}"));
+        assert_eq!(shared.turn().unwrap(), "3 messages are not recorded until now: the file is not open yet");
+        recording.take(true, "uagv/state", false, b"{}");
+        assert_eq!(shared.turn(), None, "not so soon again");
+        shared.turned.lock().unwrap().2 = None;
+        let recorder = Recorder::start(&file, Limits { size: 1 << 20, keep: 1 }, BTreeMap::new()).unwrap();
+        assert!(shared.recorder.set(recorder).is_ok());
+        assert_eq!(shared.turn().unwrap(), "4 messages are not recorded until now");
+        recording.end();
+    }
 
     #[test]
     fn a_file_that_cannot_be_opened_is_tried_again_while_somebody_waits() {
