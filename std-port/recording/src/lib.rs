@@ -13,7 +13,7 @@ mod tests;
 
 pub use file::{Limits, StartError};
 pub use layout::{event_of, values};
-pub use reading::{End as ReadingEnd, Message, Reading};
+pub use reading::{Damage, End as ReadingEnd, Message, Reading};
 pub use recorder::{Outcome, Recorder};
 pub use ring::{Line, Ring, write};
 pub use stage::Stage;

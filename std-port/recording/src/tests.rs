@@ -6,10 +6,11 @@ use std::path::Path;
 use std::time::Duration;
 
 use cara_std::control::protocol::{Answer, Argument, ArgumentValue, KeysInfo, Number};
+use mcap::records::op;
 use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader};
 use serde_json::Value;
 
-use super::reading::End;
+use super::reading::{Damage, End};
 use super::{Limits, Reading, Recorder, event_of};
 
 const LONG: Duration = Duration::from_secs(20);
@@ -203,7 +204,83 @@ fn what_ends_anywhere_is_read_up_to_there_and_no_damage_panics() {
         texts(&damaged);
         damaged[index] ^= 0xff;
     }
+    // What comes after a loss of power.
+    let ended = texts(&[&file[..file.len() / 2], &[0; 5_000]].concat());
+    assert_eq!(ended.1, End::CutOff);
     assert!(matches!(texts(b"a text").1, End::Damaged(_)));
+}
+
+/// The opcodes of a file's records, and where each begins.
+fn places(file: &[u8]) -> Vec<(u8, usize)> {
+    let (mut places, mut at) = (Vec::new(), mcap::MAGIC.len());
+    while at + 9 < file.len() {
+        places.push((file[at], at));
+        at += 9 + u64::from_le_bytes(file[at + 1..at + 9].try_into().unwrap()) as usize;
+    }
+    places
+}
+
+/// As `texts`, with the damage.
+fn damaged(file: &[u8]) -> (Vec<String>, Damage, End) {
+    let mut reading = Reading::of(file);
+    reading.by_ref().for_each(drop);
+    let (texts, end) = texts(file);
+    (texts, reading.damage(), end)
+}
+
+#[test]
+fn damage_is_seen_and_costs_no_other_chunk() {
+    const NONE: Damage = Damage { parts: 0, messages: 0 };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, ALL);
+    for text in ["one", "two", "three"] {
+        recorder.take(&event(text));
+        recorder.flush();
+    }
+    whole(recorder);
+    let file = fs::read(&path).unwrap();
+    let places = places(&file);
+    let chunks: Vec<_> = places.iter().filter(|(opcode, _)| *opcode == op::CHUNK).map(|(_, at)| *at).collect();
+    let data_end = places.iter().find(|(opcode, _)| *opcode == op::DATA_END).unwrap().1;
+    // A byte anywhere before the end of the messages.
+    let mut changed = file.clone();
+    for index in 0..data_end + 13 {
+        changed[index] ^= 0x10;
+        let (texts, damage, end) = damaged(&changed);
+        assert!(damage != NONE || matches!(end, End::Damaged(_)), "{index}");
+        // Neither its beginning, nor the first chunk, which has the channel.
+        if index >= chunks[1] {
+            assert!(
+                texts.len() >= 2 && texts[0] == "one" && (damage.parts, end) == (1, End::Whole),
+                "{index}: {texts:?}"
+            );
+        }
+        changed[index] ^= 0x10;
+    }
+    let changed = |from: usize, bytes: &[u8]| {
+        let mut file = file.clone();
+        file[from..from + bytes.len()].copy_from_slice(bytes);
+        file
+    };
+    let of = |texts: &[&str], parts, messages| {
+        let texts: Vec<_> = texts.iter().map(|text| (*text).to_owned()).collect();
+        (texts, Damage { parts, messages }, End::Whole)
+    };
+    // A message is not shown with what it did not say; the channel of the first chunk is known.
+    for (chunk, left) in [(0, ["two", "three"]), (1, ["one", "three"]), (2, ["one", "two"])] {
+        let said = file[chunks[chunk]..].windows(6).position(|part| part == b"\"text\"").unwrap();
+        assert_eq!(damaged(&changed(chunks[chunk] + said + 9, b"x")), of(&left, 1, 0));
+    }
+    // A length, and a page.
+    assert_eq!(damaged(&changed(chunks[1] + 1, &[0xff, 0xff])), of(&["one", "three"], 1, 0));
+    assert_eq!(damaged(&changed(chunks[1] + 1, &[0xff; 8])), of(&["one", "three"], 1, 0));
+    assert_eq!(damaged(&changed(chunks[1], &vec![0; chunks[2] - chunks[1]])), of(&["one", "three"], 1, 0));
+    assert_eq!(damaged(&changed(chunks[0], &vec![0; chunks[1] - chunks[0]])), of(&[], 1, 2));
+    // What is also cut off.
+    let cut = &changed(chunks[1] + 1, &[0xff; 8])[..data_end - 3];
+    let (read, damage, end) = damaged(cut);
+    assert_eq!((read.len(), damage.parts, end), (2, 1, End::CutOff));
 }
 
 #[test]

@@ -131,7 +131,9 @@ fn begin<T: Send + 'static>(
     loop {
         match started.recv_timeout(PAUSE) {
             Ok(Ok(recorder)) => return Ok(recorder),
-            Ok(Err(error)) if matches!(error, StartError::Refused { .. }) => return Err(Ended::usage(error.to_string())),
+            Ok(Err(error)) if matches!(error, StartError::Refused { .. }) => {
+                return Err(Ended::usage(error.to_string()));
+            }
             Ok(Err(error)) => return Err(Ended::failed("Failed", error.to_string())),
             Err(RecvTimeoutError::Disconnected) => anyhow::bail!("{}: the thread that opens it ended", file.display()),
             Err(RecvTimeoutError::Timeout) if is_over() => {

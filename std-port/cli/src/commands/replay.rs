@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cara_recording::{Reading, ReadingEnd, Stage, event_of};
+use cara_recording::{Damage, Reading, ReadingEnd, Stage, event_of};
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output;
@@ -32,7 +32,7 @@ fn speed(text: &str) -> Result<f64, String> {
 pub(crate) fn run(Arguments { file, speed, serve }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let stage = serve.as_ref().map(|_| Stage::default());
     let speed = if stage.is_some() { speed.or(Some(1.0)) } else { speed };
-    let (mut last, mut is_open) = (None, false);
+    let (mut last, mut is_open, mut damaged) = (None, false, Vec::new());
     for path in &file {
         let failed = |text: String| Ended::failed("Failed", format!("{}: {text}", path.display()));
         let mut reading = Reading::open(path).map_err(|error| failed(error.to_string()))?;
@@ -56,10 +56,23 @@ pub(crate) fn run(Arguments { file, speed, serve }: Arguments, global: &Global) 
             let Some(event) = event else { continue };
             super::watch::print(event, global)?;
         }
+        let Damage { parts, messages } = reading.damage();
+        if parts + messages > 0 {
+            let without = if messages > 0 {
+                format!(", and {messages} messages whose channel is in them")
+            } else {
+                String::new()
+            };
+            let path = path.display();
+            output::warning(format_args!("{path} is damaged: parts that are left out: {parts}{without}"));
+        }
         match reading.end() {
-            Some(ReadingEnd::Damaged(why)) => return Err(failed(why.clone())),
+            Some(ReadingEnd::Damaged(why)) => output::warning(format_args!("{}: {why}", path.display())),
             Some(ReadingEnd::CutOff) => output::warning(format_args!("{} was cut off here", path.display())),
             Some(ReadingEnd::Whole) | None => {}
+        }
+        if parts + messages > 0 || matches!(reading.end(), Some(ReadingEnd::Damaged(_))) {
+            damaged.push(path.display().to_string());
         }
     }
     if is_open {
@@ -67,6 +80,9 @@ pub(crate) fn run(Arguments { file, speed, serve }: Arguments, global: &Global) 
         loop {
             std::thread::park();
         }
+    }
+    if !damaged.is_empty() {
+        return Err(Ended::failed("Failed", format!("not all could be read of {}", damaged.join(", "))));
     }
     Ok(Exit::Done.into())
 }

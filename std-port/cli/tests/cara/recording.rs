@@ -93,6 +93,17 @@ fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_fil
         .ends(0, &["replay", killed.to_str().unwrap()])
         .says("Z  joined            late-1/12")
         .says("was cut off here");
+    let mut bytes = std::fs::read(&file).unwrap();
+    let joined = bytes.windows(9).position(|part| part == b"late-1/12").unwrap();
+    bytes[joined] ^= 1;
+    let damaged = folder.path().join("damaged.mcap");
+    std::fs::write(&damaged, bytes).unwrap();
+    stage
+        .ends(1, &["replay", damaged.to_str().unwrap(), killed.to_str().unwrap()])
+        .says("Z  watching")
+        .says("damaged.mcap is damaged: parts that are left out: 1")
+        .says("Z  joined            late-1/12")
+        .says("not all could be read of");
     stage.ends(2, &["record", killed.to_str().unwrap(), "--max-size", "1kB"]);
     assert!(whole.out.contains("request_timeout") && whole.out.contains(": ok"), "{}", whole.out);
     let socket = folder.path().join("replay.sock");
