@@ -19,10 +19,10 @@ use super::recorder::State;
 const RETRY: Duration = Duration::from_millis(100);
 /// Channels of a file: what comes beyond is lost.
 const MOST_CHANNELS: usize = 10_000;
-/// Bytes after which a chunk ends although its second has not passed.
-const CHUNK: u64 = 1 << 20;
-/// A file is short if it has less than this part of its greatest size, and less than a chunk.
-const SHORT: u64 = 16;
+/// Most bytes after which a chunk ends although its second has not passed.
+pub(super) const CHUNK: u64 = 1 << 20;
+/// A chunk is this part of a file's greatest size, as what waits in it comes on top; a file that has less is short.
+const PART: u64 = 16;
 
 /// Why a recording does not begin.
 #[derive(Debug, thiserror::Error)]
@@ -128,7 +128,8 @@ impl Files {
 
     fn begin(&mut self, file: File) -> McapResult<()> {
         self.state.begins();
-        self.open = Some(Open::begin(Patient { file, state: self.state.clone() }, &self.about)?);
+        let to = Patient { file, state: self.state.clone() };
+        self.open = Some(Open::begin(to, &self.about, chunk(self.limits.size))?);
         Ok(())
     }
 
@@ -166,8 +167,9 @@ impl Files {
 }
 
 impl<W: Write> Open<W> {
-    pub(super) fn begin(to: W, about: &Metadata) -> McapResult<Self> {
-        let options = WriteOptions::new().compression(None).chunk_size(Some(CHUNK)).disable_seeking(true);
+    /// Chunks end after so many bytes.
+    pub(super) fn begin(to: W, about: &Metadata, chunk: u64) -> McapResult<Self> {
+        let options = WriteOptions::new().compression(None).chunk_size(Some(chunk)).disable_seeking(true);
         let mut mcap = options.profile("cara").library(super::LIBRARY).create(NoSeek::new(BufWriter::new(to)))?;
         mcap.write_metadata(about)?;
         mcap.flush()?;
@@ -204,6 +206,11 @@ impl<W: Write> Open<W> {
     }
 }
 
+/// Bytes of a chunk in files of so many.
+fn chunk(size: u64) -> u64 {
+    (size / PART).min(CHUNK)
+}
+
 /// A new file that only its owner can read, and that this process alone records into.
 pub(super) fn create(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
@@ -221,7 +228,7 @@ fn shift(path: &Path, Limits { size, keep }: Limits) -> io::Result<()> {
     };
     let keep = keep.max(1);
     let is_short = |number: &usize| {
-        fs::metadata(numbered(*number)).is_ok_and(|found| found.is_file() && found.len() < (size / SHORT).min(CHUNK))
+        fs::metadata(numbered(*number)).is_ok_and(|found| found.is_file() && found.len() < chunk(size))
     };
     let missing = (0..=keep).find(|number| !numbered(*number).exists());
     // Not FILE itself: it may be what a program that has crashed for the first time had just begun.

@@ -10,7 +10,7 @@ use cara_std::control::protocol::Answer;
 use mcap::McapResult;
 use mcap::write::Metadata;
 
-use super::file::{Open, create};
+use super::file::{CHUNK, Open, create};
 use super::recorder::{came, line_of, message_of};
 
 /// An answer, as the recorder's queue has it.
@@ -73,7 +73,7 @@ pub fn write(path: &Path, about: BTreeMap<String, String>, lines: &[Line]) -> Mc
 }
 
 fn write_part(part: &Path, about: BTreeMap<String, String>, lines: &[Line]) -> McapResult<()> {
-    let mut open = Open::begin(create(part)?, &Metadata { name: "cara".to_owned(), metadata: about })?;
+    let mut open = Open::begin(create(part)?, &Metadata { name: "cara".to_owned(), metadata: about }, CHUNK)?;
     for line in lines {
         if let Some((message, came)) = message_of(line)? {
             open.write(&message, came)?;

@@ -123,6 +123,19 @@ fn a_file_that_is_long_enough_is_put_aside_and_the_oldest_goes() {
 }
 
 #[test]
+fn a_small_file_is_not_as_long_as_a_large_chunk() {
+    const SIZE: u64 = 64 * 1024;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = start(&path, Limits { size: SIZE, keep: 9 });
+    // Nothing ends a chunk but its size.
+    (0..400).for_each(|_| recorder.take(&event(&"x".repeat(1_000))));
+    whole(recorder);
+    let sizes: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().metadata().unwrap().len()).collect();
+    assert!(sizes.len() > 4 && sizes.iter().all(|size| *size < SIZE * 3 / 2), "{sizes:?}");
+}
+
+#[test]
 fn a_recording_that_is_there_is_kept_and_nothing_else_is_touched() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.mcap");
