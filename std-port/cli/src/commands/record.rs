@@ -20,7 +20,7 @@ use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::interrupt::Asked;
 use cara_tools::output;
-use cara_tools::units::{parse_bytes, parse_time, show_bytes};
+use cara_tools::units::{parse_bytes, parse_time, show_bytes, show_micros};
 
 /// Records what the manager reports into an MCAP file, which `cara replay`, Foxglove and other MCAP tools read: events, what
 /// operators and the manager's program ask for and what comes of it, orders, nodes, counters, and the streams that are named.
@@ -38,8 +38,8 @@ pub(crate) struct Arguments {
     rate: Option<f64>,
     #[command(flatten)]
     firmware: FirmwareArguments,
-    /// How often counters and the state of links are recorded.
-    #[arg(long, value_name = "TIME", default_value = "10s", value_parser = parse_time)]
+    /// How often counters and the state of links are recorded; 10 ms at least.
+    #[arg(long, value_name = "TIME", default_value = "10s", value_parser = every)]
     every: Duration,
     /// Begin the next file after so many bytes; the one before becomes FILE.1.
     #[arg(long, value_name = "SIZE", default_value = "256MiB", value_parser = size)]
@@ -64,6 +64,14 @@ const WARN: Duration = Duration::from_secs(10);
 const LAST: Duration = Duration::from_secs(2);
 /// Every file begins with the state of everything.
 const LEAST: u64 = 64 * 1024;
+
+/// More often, nodes and orders would be asked for without a pause.
+const OFTEN: Duration = Duration::from_millis(10);
+
+fn every(text: &str) -> Result<Duration, String> {
+    let every = parse_time(text)?;
+    if every >= OFTEN { Ok(every) } else { Err(format!("at least {}", show_micros(OFTEN.as_micros() as f64))) }
+}
 
 fn size(text: &str) -> Result<u64, String> {
     let size = parse_bytes(text)?;

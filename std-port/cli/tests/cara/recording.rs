@@ -105,6 +105,9 @@ fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_fil
         .says("Z  joined            late-1/12")
         .says("not all could be read of");
     stage.ends(2, &["record", killed.to_str().unwrap(), "--max-size", "1kB"]);
+    for often in ["0s", "1us"] {
+        stage.ends(2, &["record", killed.to_str().unwrap(), "--every", often]).says("at least 10 ms");
+    }
     assert!(whole.out.contains("request_timeout") && whole.out.contains(": ok"), "{}", whole.out);
     let socket = folder.path().join("replay.sock");
     let (file, socket) = (file.to_str().unwrap(), socket.to_str().unwrap());
@@ -232,7 +235,7 @@ fn a_full_disk_costs_messages_that_are_counted_and_the_recording_goes_on() {
     let stage = Stage::with(&[]);
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a.mcap");
-    let inner = stage.command(&["record", file.to_str().unwrap(), "--every", "1ms"]);
+    let inner = stage.command(&["record", file.to_str().unwrap(), "--every", "10ms"]);
     let mut command = Command::new("sh");
     // A process that does not ignore the signal ends with it.
     command
