@@ -89,6 +89,13 @@ impl Files {
         let about = Metadata { name: "cara".to_owned(), metadata: about };
         let mut files = Self { path: path.to_owned(), limits, about, state, open: None };
         let failed = |error| StartError::Failed { path: path.to_owned(), error };
+        // The longest name that it will have.
+        if let Err(error) = fs::symlink_metadata(numbered(path, limits.keep.max(1)))
+            && error.kind() == io::ErrorKind::InvalidFilename
+        {
+            let why = "has too long a name for the files that are kept, FILE.1 and so on";
+            return Err(StartError::Refused { path: path.to_owned(), why });
+        }
         if files.is_there()? {
             shift(path, limits).map_err(failed)?;
         }
@@ -219,13 +226,18 @@ pub(super) fn create(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
+/// FILE, or FILE.`number`.
+fn numbered(path: &Path, number: usize) -> PathBuf {
+    match number {
+        0 => path.to_owned(),
+        number => path.with_added_extension(number.to_string()),
+    }
+}
+
 /// FILE becomes FILE.1, which becomes FILE.2, up to FILE.`keep`. If all are there, the oldest short one is removed, so that a program
 /// that crashes in a loop pushes out one long one at most; without a short one the oldest is.
 fn shift(path: &Path, Limits { size, keep }: Limits) -> io::Result<()> {
-    let numbered = |number: usize| match number {
-        0 => path.to_owned(),
-        number => path.with_added_extension(number.to_string()),
-    };
+    let numbered = |number| numbered(path, number);
     let keep = keep.max(1);
     let is_short = |number: &usize| {
         fs::metadata(numbered(*number)).is_ok_and(|found| found.is_file() && found.len() < chunk(size))

@@ -11,7 +11,7 @@ use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader};
 use serde_json::Value;
 
 use super::reading::{Damage, End};
-use super::{Limits, Reading, Recorder, event_of};
+use super::{Limits, Reading, Recorder, StartError, event_of};
 
 const LONG: Duration = Duration::from_secs(20);
 const ALL: Limits = Limits { size: u64::MAX, keep: 2 };
@@ -150,6 +150,19 @@ fn a_recording_that_is_there_is_kept_and_nothing_else_is_touched() {
     fs::write(&other, "mine").unwrap();
     assert!(refused(&other).contains("no recording") && refused(folder.path()).contains("no file"));
     assert_eq!(fs::read(&other).unwrap(), b"mine");
+}
+
+#[test]
+fn a_name_that_leaves_no_place_for_a_number_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let long = folder.path().join("x".repeat(253));
+    let limits = Limits { size: 4096, keep: 10 };
+    let refused = Recorder::start(&long, limits, BTreeMap::new()).err().unwrap();
+    assert!(matches!(&refused, StartError::Refused { why, .. } if why.contains("too long")), "{refused}");
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+    whole(start(&long, Limits { keep: 9, ..limits }));
+    whole(start(&long, Limits { keep: 9, ..limits }));
+    assert!(long.with_added_extension("1").exists());
 }
 
 #[test]
