@@ -70,6 +70,7 @@ pub fn run(
             false => None,
         };
         if is_shared && lock.is_none() {
+            seen.turns.fetch_add(1, Ordering::Relaxed);
             std::thread::sleep(TURN);
             continue;
         }
@@ -212,6 +213,7 @@ impl Gateway {
     }
 
     fn turn(&mut self) {
+        self.seen.turns.fetch_add(1, Ordering::Relaxed);
         self.driver.vehicle_mut().turn();
         // However many come, the vehicle has its turn.
         for _ in 0..HEARD {

@@ -17,6 +17,7 @@ use cara_vda5050::metrics::{self, Seen};
 use cara_vda5050::recording::Recording;
 use cara_vda5050::{log, tls};
 use clap::Parser;
+use sd_notify::NotifyState;
 
 /// Vehicles of CARA under VDA 5050 2.0, 2.1 and, as a preview, 3.0, over an MQTT broker.
 #[derive(Parser)]
@@ -94,6 +95,7 @@ fn main() -> Result<ExitCode> {
             std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
                 // What ends one vehicle's loop is no reason to stop the others: it stops by its lease, and is begun anew.
                 while !END.is_due.load(Ordering::SeqCst) {
+                    seen.turns.fetch_add(1, Ordering::Relaxed);
                     match catch_unwind(AssertUnwindSafe(|| {
                         gateway::run(config, vehicle, system, seen, recording, &END)
                     })) {
@@ -105,10 +107,17 @@ fn main() -> Result<ExitCode> {
                 }
             })?;
         }
+        tell(NotifyState::Ready);
         // Whether anybody reads it or not.
         let _ = writeln!(stdout(), "up with {} vehicles", config.vehicle.len());
+        let mut turns = 0;
         while !END.is_due.load(Ordering::SeqCst) {
             recording.turn();
+            // A vehicle's loop may wait for its own disk. When all of them stand the program hangs, and is to be restarted.
+            let sum = seen.iter().map(|seen| seen.turns.load(Ordering::Relaxed)).sum();
+            if std::mem::replace(&mut turns, sum) != sum || seen.is_empty() {
+                tell(NotifyState::Watchdog);
+            }
             let event = events.recv_timeout(Duration::from_millis(200));
             // Another gateway speaks for these vehicles now: this one says nothing more.
             if matches!(event, Ok(UnitEvent::Fenced { .. })) {
@@ -119,10 +128,18 @@ fn main() -> Result<ExitCode> {
         }
         Ok(false)
     })?;
+    tell(NotifyState::Stopping);
     system.stop();
     recording.end();
     log::end();
     Ok(if is_fenced { ExitCode::from(StartError::FENCED_EXIT) } else { ExitCode::SUCCESS })
+}
+
+/// To the service manager, if there is one.
+fn tell(state: NotifyState<'_>) {
+    if let Err(error) = sd_notify::notify(&[state]) {
+        log::line(format_args!("the service manager (NOTIFY_SOCKET) does not hear this program: {error}"));
+    }
 }
 
 /// The unit, not started yet, and that all is there that its start needs.

@@ -36,6 +36,8 @@ pub struct Seen {
     pub refused: AtomicU64,
     /// How often the broker went away.
     pub broker_losses: AtomicU64,
+    /// Turns of its loop.
+    pub turns: AtomicU64,
     /// Certificates of its connection.
     pub expiry: Arc<Expiry>,
 }

@@ -5,6 +5,7 @@ mod plant;
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::os::unix::net::UnixDatagram;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
@@ -81,12 +82,37 @@ fn a_message_that_is_too_long_is_refused_and_nothing_else() {
     plant.wait_for_end("o2", "a");
 }
 
+#[test]
+fn a_service_manager_hears_that_it_is_up_and_lives() {
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    let path = plant.folder.path().join("notify");
+    let socket = UnixDatagram::bind(&path).unwrap();
+    socket.set_read_timeout(Some(PATIENCE)).unwrap();
+    restart(&mut plant, |command| {
+        command.env("NOTIFY_SOCKET", &path);
+    });
+    let heard = || {
+        let mut text = [0; 64];
+        let length = socket.recv(&mut text).unwrap();
+        String::from_utf8_lossy(&text[..length]).trim().to_owned()
+    };
+    assert_eq!(heard(), "READY=1");
+    (0..20).for_each(|_| assert_eq!(heard(), "WATCHDOG=1"));
+}
+
 /// Starts the gateway with this for its log.
 fn logs_to(plant: &mut Plant, stderr: Stdio) {
+    restart(plant, |command| {
+        command.stderr(stderr);
+    });
+}
+
+fn restart(plant: &mut Plant, change: impl FnOnce(&mut Command)) {
     plant.kill_gateway();
     let mut command = Command::new(env!("CARGO_BIN_EXE_cara-vda5050"));
     command.arg(plant.file()).env("CARA_KEYS", plant.folder.path().join("keys"));
-    command.env("XDG_RUNTIME_DIR", plant.folder.path()).stderr(stderr);
+    command.env("XDG_RUNTIME_DIR", plant.folder.path());
+    change(&mut command);
     plant.heard.lock().unwrap().clear();
     plant.gateway = Some(Process::start(&mut command));
     plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE");

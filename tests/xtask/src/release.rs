@@ -12,9 +12,9 @@ use crate::install;
 use crate::workspace;
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// What is installed in `bin`, and of which manifest it is.
-const PROGRAMS: [(&str, &str); 2] =
-    [("cara", "std-port/cli/Cargo.toml"), ("cara-vda5050", "gateways/vda5050/Cargo.toml")];
+/// What is installed in `bin`, of which manifest it is, and with which features.
+const PROGRAMS: [(&str, &str, &str); 2] =
+    [("cara", "std-port/cli/Cargo.toml", "defmt"), ("cara-vda5050", "gateways/vda5050/Cargo.toml", "")];
 /// Where it is put together.
 const FOLDER: &str = "release-files";
 const SHELLS: [(&str, &str); 3] = [
@@ -84,9 +84,10 @@ fn build(processor: Processor) -> Result<PathBuf> {
     install::rust_target(target).and_then(|()| install::program(compiler, package)).map_err(anyhow::Error::msg)?;
     let folder = workspace::target().join("packages");
     let name = target.replace('-', "_");
-    for (program, manifest) in PROGRAMS {
+    for (program, manifest, features) in PROGRAMS {
         Run::cargo()
             .args(["build", "--release", "--locked", "--manifest-path", manifest, "--bin", program])
+            .args(["--features", features])
             .args(["--target", target, "--target-dir"])
             .args([&folder])
             .env("CARGO_PROFILE_RELEASE_STRIP", "symbols")
@@ -99,7 +100,7 @@ fn build(processor: Processor) -> Result<PathBuf> {
 
 /// Puts what is installed under `usr`. The program of this host prints the texts.
 fn stage(usr: &Path, programs: &Path, native: &Path, book: &Path) -> Result<()> {
-    for (program, _) in PROGRAMS {
+    for (program, ..) in PROGRAMS {
         place(&fs::read(programs.join(program))?, &usr.join("bin").join(program), 0o755)?;
     }
     let native = native.to_string_lossy();
@@ -187,7 +188,7 @@ fn components(folder: &Path) -> Result<()> {
     let images = fs::read_dir(workspace::root().join("examples/firmware"))?.collect::<Result<Vec<_>, _>>()?;
     let images = images.into_iter().map(|image| image.path().join("Cargo.toml")).filter(|path| path.is_file());
     let images = images.filter(|path| path.with_file_name("Cargo.lock").is_file());
-    let programs = PROGRAMS.map(|(_, manifest)| workspace::root().join(manifest));
+    let programs = PROGRAMS.map(|(_, manifest, _)| workspace::root().join(manifest));
     for manifest in images.chain(programs) {
         let name = format!("cara-components-{}", folder_name(&manifest));
         Run::new(&tool.to_string_lossy())

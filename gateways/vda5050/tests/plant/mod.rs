@@ -375,7 +375,7 @@ pub fn keys(folder: &Path, fleet: u32, vehicles: u32) {
 /// In turn that of this version and that of another one, which `CARA_TEST_OTHER_GATEWAY` names, if it does.
 fn gateway_program() -> OsString {
     static STARTED: AtomicU32 = AtomicU32::new(0);
-    let is_other = STARTED.fetch_add(1, Ordering::SeqCst) % 2 == 0;
+    let is_other = STARTED.fetch_add(1, Ordering::SeqCst).is_multiple_of(2);
     let other = std::env::var_os("CARA_TEST_OTHER_GATEWAY").filter(|_| is_other);
     other.unwrap_or(env!("CARGO_BIN_EXE_cara-vda5050").into())
 }
