@@ -18,6 +18,16 @@ use crate::services::calls::{CallHead, Cancelled, RunningCall, Ticket};
 use crate::services::{Context, Port};
 
 impl<P: Port> Session<P> {
+    /// Whether the peer holds a lease on any function of this unit.
+    pub fn moves(&self) -> bool {
+        !self.granting.granted.is_empty()
+    }
+
+    /// Whether the peer's order of a lease is one of this function, and not of another one that shares the lease.
+    pub fn moves_by(&self, slot: Slot) -> bool {
+        self.granting.granted.iter().any(|granted| granted.slot == slot)
+    }
+
     /// Begins the next waiting call, with its arguments in `arguments`. Call [`poll`](Self::poll) first, since a safe hook that
     /// is due precedes any handler. Then call this after [`receive`](Self::receive) and after each [`answer`](Self::answer) until
     /// it returns `None`.

@@ -353,16 +353,6 @@ impl<P: Port> Session<P> {
         self.calling.requests.in_flight()
     }
 
-    /// Whether the peer holds a lease on any function of this unit.
-    pub fn moves(&self) -> bool {
-        !self.granting.granted.is_empty()
-    }
-
-    /// Whether the peer's order of a lease is one of this function, and not of another one that shares the lease.
-    pub fn moves_by(&self, slot: Slot) -> bool {
-        self.granting.granted.iter().any(|granted| granted.slot == slot)
-    }
-
     /// How many calls of the peer run or wait here.
     pub const fn calls_held(&self) -> u16 {
         self.calls.held()
