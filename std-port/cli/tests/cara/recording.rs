@@ -106,7 +106,7 @@ fn what_a_manager_reports_is_recorded_and_a_recorder_that_is_killed_leaves_a_fil
         .says("not all could be read of");
     stage.ends(2, &["record", killed.to_str().unwrap(), "--max-size", "1kB"]);
     for often in ["0s", "1us"] {
-        stage.ends(2, &["record", killed.to_str().unwrap(), "--every", often]).says("at least 10 ms");
+        stage.ends(2, &["record", killed.to_str().unwrap(), "--for", "1ms", "--every", often]).says("at least 10 ms");
     }
     assert!(whole.out.contains("request_timeout") && whole.out.contains(": ok"), "{}", whole.out);
     let socket = folder.path().join("replay.sock");
