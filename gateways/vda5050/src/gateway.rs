@@ -162,11 +162,12 @@ impl Gateway {
             write(shared.version(), &Connection { header, connection_state: ConnectionState::Broken })
         };
         let client_id = format!("{}-{}", config.vda5050.manufacturer, vehicle.serial_number);
+        let probes: &[_] = if config.broker.probe > 0 { &["cara-probe"] } else { &[] };
         let link = Link::start(Place {
             broker: config.broker.clone(),
             client_id,
             prefix: prefix.clone(),
-            topics: [config.version().rules().topics, &["connection", "cara-probe"]].concat(),
+            topics: [config.version().rules().topics, &["connection"], probes].concat(),
             will: Box::new(last_words),
             recording: recording.clone(),
             expiry: seen.expiry.clone(),

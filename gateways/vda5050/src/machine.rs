@@ -201,6 +201,7 @@ impl Machine {
             order_update_id: record.order_update_id,
             zone_set_id: record.zone_set_id.as_deref(),
             is_cancelled: record.is_cancelled,
+            is_placed: record.is_placed,
             is_executing: self.is_executing(),
             decision_point: Some(base.map_or(last_node, |node| (&node.node_id, node.sequence_id))),
             last_node,
@@ -208,6 +209,12 @@ impl Machine {
             position: status.position.as_ref().map(|at| (at.x, at.y, at.map_id.as_str())),
         };
         let verdict = judge(order, &held, &self.policy.can, self.policy.version)?;
+        let is_placing = |entry: &Entry| !entry.is_of_order() && entry.action.action_type == "initPosition";
+        if verdict == Verdict::Update
+            && record.actions.iter().any(|entry| is_placing(entry) && !entry.status.has_ended())
+        {
+            return refused(Kind::NotAvailable, "initPosition is under way");
+        }
         if verdict == Verdict::New && record.spent.contains(&order.order_id) {
             return refused(Kind::Replaced, "the order was replaced by a later one");
         }
@@ -741,8 +748,8 @@ impl Machine {
         let since = self.driven_at_node.map(|driven| status.driven - driven);
         report.distance_since_last_node = since.filter(|metres| metres.is_finite() && *metres >= 0.0);
         let out_of_service = self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why));
-        let is_to_drive = self.record.is_order_open() && !self.record.is_cancelled;
-        let drive = self.drive_refused.as_ref().filter(|_| is_to_drive);
+        // Under a pause it is not told.
+        let drive = self.drive_refused.as_ref().filter(|_| self.record.is_order_open() && self.may_drive());
         let drive = drive.map(|why| Refusal::new(Kind::DriveRefused, why).about("orderId", &self.record.order_id));
         let lasting = out_of_service.iter().chain(&drive).chain(&self.alarms);
         report.errors.extend(lasting.map(|refusal| refusal.error(self.policy.version)));

@@ -36,6 +36,9 @@ const WRONG_FILE: u8 = 2;
 /// A vehicle's loop that has failed is begun anew after so long.
 const BEGUN_ANEW: Duration = Duration::from_secs(2);
 
+/// A service manager hears no sooner again.
+const TOLD: Duration = Duration::from_millis(10);
+
 static END: End = End { is_due: AtomicBool::new(false), is_silent: AtomicBool::new(false) };
 
 /// Ends all vehicles' loops when the main thread leaves for any reason: it waits for them, and nobody else would end them.
@@ -83,7 +86,7 @@ fn main() -> Result<ExitCode> {
         std::thread::Builder::new().name("metrics".into()).spawn(move || metrics::serve(&listener, text))?;
     }
     // No line of the log holds a vehicle up from here on.
-    log::start()?;
+    let _log = log::start()?;
     let clients = config.vehicle.iter().zip(&seen);
     let clients = clients.map(|(vehicle, seen)| (config.broker.of(vehicle), seen.expiry.clone())).collect();
     tls::watch(clients)?;
@@ -107,17 +110,11 @@ fn main() -> Result<ExitCode> {
                 }
             })?;
         }
-        tell(NotifyState::Ready);
+        tell(seen.clone())?;
         // Whether anybody reads it or not.
         let _ = writeln!(stdout(), "up with {} vehicles", config.vehicle.len());
-        let mut turns = 0;
         while !END.is_due.load(Ordering::SeqCst) {
             recording.turn();
-            // A vehicle's loop may wait for its own disk. When all of them stand the program hangs, and is to be restarted.
-            let sum = seen.iter().map(|seen| seen.turns.load(Ordering::Relaxed)).sum();
-            if std::mem::replace(&mut turns, sum) != sum || seen.is_empty() {
-                tell(NotifyState::Watchdog);
-            }
             let event = events.recv_timeout(Duration::from_millis(200));
             // Another gateway speaks for these vehicles now: this one says nothing more.
             if matches!(event, Ok(UnitEvent::Fenced { .. })) {
@@ -128,18 +125,33 @@ fn main() -> Result<ExitCode> {
         }
         Ok(false)
     })?;
-    tell(NotifyState::Stopping);
     system.stop();
     recording.end();
-    log::end();
     Ok(if is_fenced { ExitCode::from(StartError::FENCED_EXIT) } else { ExitCode::SUCCESS })
 }
 
-/// To the service manager, if there is one.
-fn tell(state: NotifyState<'_>) {
-    if let Err(error) = sd_notify::notify(&[state]) {
-        log::line(format_args!("the service manager (NOTIFY_SOCKET) does not hear this program: {error}"));
-    }
+/// Tells the service manager, if there is one, that the program is up; and where it has a watchdog, while the loop of any vehicle
+/// comes round: one may wait for its own disk, and when all of them stand the program hangs. A thread of its own does that, as a
+/// manager that does not read holds it up.
+fn tell(seen: Vec<Arc<Seen>>) -> std::io::Result<()> {
+    let tell = move || -> std::io::Result<()> {
+        sd_notify::notify(&[NotifyState::Ready])?;
+        let Some(limit) = sd_notify::watchdog_enabled() else { return Ok(()) };
+        let mut turns = 0;
+        loop {
+            std::thread::sleep((limit / 4).max(TOLD));
+            let sum = seen.iter().map(|seen| seen.turns.load(Ordering::Relaxed)).sum();
+            if std::mem::replace(&mut turns, sum) != sum || seen.is_empty() {
+                sd_notify::notify(&[NotifyState::Watchdog])?;
+            }
+        }
+    };
+    let told = move || {
+        if let Err(error) = tell() {
+            log::line(format_args!("the service manager (NOTIFY_SOCKET) does not hear this program: {error}"));
+        }
+    };
+    std::thread::Builder::new().name("watchdog".into()).spawn(told).map(drop)
 }
 
 /// The unit, not started yet, and that all is there that its start needs.

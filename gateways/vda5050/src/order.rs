@@ -64,6 +64,8 @@ pub struct Held<'a> {
     pub zone_set_id: Option<&'a str>,
     /// The order was cancelled, or is being.
     pub is_cancelled: bool,
+    /// Since it ended, `initPosition` has said at which node the vehicle is.
+    pub is_placed: bool,
     /// Nodes are left, or actions have not ended (box 3).
     pub is_executing: bool,
     /// The last node of the base and its sequence id (box 7).
@@ -125,7 +127,7 @@ fn is_reachable(node: &Node, held: &Held<'_>, can: &Capabilities) -> bool {
     let is_last = !held.last_node.0.is_empty() && node.node_id == held.last_node.0;
     let (Some(at), Some((x, y, map))) = (&node.node_position, held.position) else {
         // A cancelled order may have ended between two nodes.
-        return is_last && !held.is_cancelled;
+        return is_last && (held.is_placed || !held.is_cancelled);
     };
     let (x, y) = (x - at.x, y - at.y);
     let deviation = at.allowed_deviation_xy.filter(|deviation| deviation.is_some());
@@ -152,6 +154,9 @@ fn update(order: &Order, held: &Held<'_>, rules: &Rules) -> Result<Verdict, Refu
     }
     if order.zone_set_id.as_deref() != held.zone_set_id {
         return wrong("an update does not change the zone set".into());
+    }
+    if held.is_placed {
+        return wrong("initPosition has said since where the vehicle is: a new order begins there".into());
     }
     let first = (order.nodes[0].node_id.as_str(), order.nodes[0].sequence_id);
     let expected = if held.is_executing { held.decision_point } else { Some(held.last_node) };

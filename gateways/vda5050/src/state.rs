@@ -25,6 +25,8 @@ pub struct Record {
     pub zone_set_id: Option<String>,
     /// It was cancelled, or is being.
     pub is_cancelled: bool,
+    /// Since the order ended, `initPosition` has said at which node the vehicle is.
+    pub is_placed: bool,
     /// The last node that was traversed; empty before the first.
     pub last_node_id: String,
     /// Its sequence id.

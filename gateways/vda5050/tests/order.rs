@@ -6,8 +6,7 @@ use std::time::Duration;
 
 use cara_vda5050::errors::Kind;
 use cara_vda5050::message::{
-    ActionParameter, ActionScope, BlockingType, Corridor, Deviation, EStop, Edge, NodePosition, OperatingMode, Order,
-    Trajectory,
+    ActionScope, BlockingType, Corridor, Deviation, EStop, Edge, NodePosition, OperatingMode, Order, Trajectory,
 };
 use cara_vda5050::state::{Command, Failure, OnBrokerLoss, Policy};
 use cara_vda5050::version::Version;
@@ -539,36 +538,6 @@ fn nothing_is_done_late() {
     pair.vehicle.status.mode = OperatingMode::Automatic;
     pair.turns(5);
     assert_eq!((pair.actions()[2].as_str(), pair.vehicle.began.len()), ("i3 FAILED", 0));
-}
-
-#[test]
-fn init_position_waits_for_no_order() {
-    let mut pair = Pair::new("a");
-    half_way(&mut pair);
-    pair.machine.instant_actions(instant("initPosition", "i1"));
-    assert_eq!(pair.actions(), ["i1 FAILED"]);
-}
-
-#[test]
-fn an_order_does_not_go_on_from_where_init_position_says() {
-    let mut pair = Pair::new("a");
-    done(&mut pair);
-    let mut message = instant("initPosition", "i1");
-    let parameter = ActionParameter { key: "lastNodeId".into(), value: "a".into() };
-    message.actions[0].action_parameters = Some(vec![parameter]);
-    pair.machine.instant_actions(message);
-    pair.turn();
-    assert_eq!(
-        (pair.actions().last().unwrap().as_str(), pair.machine.record().last_node_sequence_id),
-        ("i1 FINISHED", 0)
-    );
-    pair.machine.order(order("o1", 4, 0, "a! c!"));
-    assert_eq!((pair.left(), pair.errors()), (String::new(), vec!["orderUpdateError"]));
-    pair.vehicle.status.position.as_mut().unwrap().x = fake::place("a");
-    pair.turn();
-    pair.machine.order(order("o2", 0, 0, "a! c!"));
-    pair.turns(5);
-    assert_eq!((pair.left(), pair.vehicle.reached.last().unwrap().0.as_str()), (String::new(), "c"));
 }
 
 #[test]

@@ -154,14 +154,18 @@ impl<R: Read> Reading<R> {
                     // Its messages may be others than those that were recorded. Sound chunks need its channels.
                     Some((records_of, false)) => {
                         damage.parts += 1;
-                        let channels = records(records_of).filter(|(opcode, _)| *opcode == op::CHANNEL);
-                        channels.for_each(|(opcode, record)| {
-                            take(opcode, record, topics, found);
-                        });
+                        for (opcode, record) in records(records_of).filter(|(opcode, _)| *opcode == op::CHANNEL) {
+                            if let Ok(Record::Channel(channel)) = parse_record(opcode, record) {
+                                topics.entry(channel.id).or_insert(channel.topic);
+                            }
+                        }
                         true
                     }
                     None => false,
                 },
+                op::MESSAGE_INDEX => record.get(2..6).is_some_and(|inner| inner == ((length - 6) as u32).to_le_bytes()),
+                // Nobody writes one here, and passed over it could be a chunk.
+                PRIVATE.. => false,
                 opcode => {
                     damage.messages += take(opcode, record, topics, found);
                     true
@@ -179,7 +183,7 @@ impl<R: Read> Reading<R> {
     /// Goes on to the next sound chunk from a place where no record is, or one that ends behind the end of the file. Without such a
     /// chunk the file ends here: if it has no end of its own, it was cut off.
     fn find_chunk(&mut self, is_short: bool) -> Result<(), End> {
-        // As file systems have it after a loss of power.
+        // A tail of zeros behind a whole record, as file systems may have it after a loss of power.
         let mut is_zero = true;
         loop {
             match self.input.peek(MAGIC.len() + 1)? {
@@ -305,8 +309,12 @@ impl<R: Read> Input<R> {
 /// The records of a chunk and whether they are as they were written; `None` if its lengths do not fit, and it may be none.
 fn chunk(chunk: &[u8]) -> Result<Option<(&[u8], bool)>, End> {
     let Ok(Record::Chunk { header, .. }) = parse_record(op::CHUNK, chunk) else { return Ok(None) };
-    if !header.compression.is_empty() {
-        return Err(End::Damaged(format!("it is compressed ({}), which cara does not read", header.compression)));
+    match header.compression.as_str() {
+        "" => {}
+        known @ ("lz4" | "zstd") => {
+            return Err(End::Damaged(format!("it is compressed ({known}), which cara does not read")));
+        }
+        _ => return Ok(None),
     }
     let records = chunk.get(CHUNK_HEAD..).unwrap_or_default();
     if [header.compressed_size, header.uncompressed_size] != [records.len() as u64; 2] {

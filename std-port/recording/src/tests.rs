@@ -303,6 +303,15 @@ fn damage_is_seen_and_costs_no_other_chunk() {
     assert_eq!(damaged(&changed(chunks[1] + 1, &[0xff; 8])), of(&["one", "three"], 1, 0));
     assert_eq!(damaged(&changed(chunks[1], &vec![0; chunks[2] - chunks[1]])), of(&["one", "three"], 1, 0));
     assert_eq!(damaged(&changed(chunks[0], &vec![0; chunks[1] - chunks[0]])), of(&[], 1, 2));
+    // A name of a compression that swallows the sizes behind it.
+    for name in [8, 9] {
+        assert_eq!(damaged(&changed(chunks[1] + 9 + 28, &[name])), of(&["one", "three"], 1, 0));
+    }
+    // Opcodes of records that would be passed over, without the checksum at the end.
+    for opcode in [0x07, 0x86] {
+        let (texts, damage, end) = damaged(&changed(chunks[1], &[opcode])[..data_end - 3]);
+        assert_eq!((texts.len(), damage.parts, end), (2, 1, End::CutOff), "{opcode}");
+    }
     // What is also cut off.
     let cut = &changed(chunks[1] + 1, &[0xff; 8])[..data_end - 3];
     let (read, damage, end) = damaged(cut);

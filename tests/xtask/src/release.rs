@@ -188,13 +188,14 @@ fn components(folder: &Path) -> Result<()> {
     let images = fs::read_dir(workspace::root().join("examples/firmware"))?.collect::<Result<Vec<_>, _>>()?;
     let images = images.into_iter().map(|image| image.path().join("Cargo.toml")).filter(|path| path.is_file());
     let images = images.filter(|path| path.with_file_name("Cargo.lock").is_file());
-    let programs = PROGRAMS.map(|(_, manifest, _)| workspace::root().join(manifest));
-    for manifest in images.chain(programs) {
+    let programs = PROGRAMS.map(|(_, manifest, features)| (workspace::root().join(manifest), features));
+    for (manifest, features) in images.map(|manifest| (manifest, "")).chain(programs) {
         let name = format!("cara-components-{}", folder_name(&manifest));
         Run::new(&tool.to_string_lossy())
             .args(["cyclonedx", "--format", "json", "--spec-version", "1.5", "--override-filename", &name])
             .args(["--manifest-path"])
             .args([&manifest])
+            .args(if features.is_empty() { vec![] } else { vec!["--features", features] })
             .env("SOURCE_DATE_EPOCH", "0")
             .stream()?;
         collect(&manifest, &format!("{name}.json"), folder)?;

@@ -8,7 +8,7 @@ use crate::order::{ID_BYTES, PARAMETER_BYTES, parameters, performable};
 use crate::state::{Failure, copy_of};
 use crate::version::Version;
 
-/// Whether it makes the vehicle stand. Nothing that a stop is sent with refuses it.
+/// Whether it makes the vehicle stand. No id, no parameter and no number of actions refuses it.
 pub(crate) fn is_stop(action: &Action) -> bool {
     matches!(action.action_type.as_str(), "startPause" | "cancelOrder")
 }
@@ -224,7 +224,7 @@ impl Machine {
                 if let Some(node) = named.and_then(|parameter| parameter.value.as_str()) {
                     (self.record.last_node_id, self.record.last_node_sequence_id) = (node.to_owned(), 0);
                     // The order that has ended elsewhere does not go on from here, with sequence ids that it had before.
-                    self.record.is_cancelled = true;
+                    self.record.is_placed = true;
                 }
                 self.end(index, ActionStatus::Finished, "", true);
             }

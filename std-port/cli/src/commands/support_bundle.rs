@@ -224,10 +224,11 @@ fn known(global: &Global) -> anyhow::Result<Option<Vec<(&'static str, Value)>>> 
 fn end_of(path: &Path) -> Result<String, String> {
     let (bytes, is_whole) = last_bytes(path).map_err(|error| error.to_string())?;
     let text = String::from_utf8_lossy(&bytes);
-    match text.split_once('\n') {
-        _ if is_whole => Ok(text.into_owned()),
-        Some((_, lines)) if !lines.is_empty() => Ok(lines.to_owned()),
-        _ => Err(format!("its last {LOG_BYTES} bytes are of one line")),
+    let (first, last) = (text.find('\n').map(|at| at + 1), text.rfind('\n').map_or(0, |at| at + 1));
+    let first = if is_whole { Some(0) } else { first };
+    match first.and_then(|first| text.get(first..last)) {
+        Some(lines) if !lines.is_empty() || text.is_empty() => Ok(lines.to_owned()),
+        _ => Err(format!("its last {LOG_BYTES} bytes have no whole line")),
     }
 }
 

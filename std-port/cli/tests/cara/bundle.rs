@@ -290,9 +290,11 @@ fn a_log_that_has_no_lines_to_take_is_missing_in_a_bundle() {
     host.put("log", format!("first\n{}\n", "x".repeat(300 << 10)));
     let members = host.bundle(&["--log", "log"]);
     assert!(!members.contains_key("log.txt"));
-    assert!(about(&members, "missing")["log.txt"].as_str().unwrap().contains("one line"), "{members:?}");
+    assert!(about(&members, "missing")["log.txt"].as_str().unwrap().contains("no whole line"), "{members:?}");
     host.put("log", format!("{}\nlast\n", "x".repeat(300 << 10)));
     assert_eq!(host.bundle(&["--log", "log"])["log.txt"], "last\n");
+    host.put("log", "whole\nand a part");
+    assert_eq!(host.bundle(&["--log", "log"])["log.txt"], "whole\n");
     host.put("log", "");
     assert_eq!(host.bundle(&["--log", "log"])["log.txt"], "");
     rustix::fs::mkfifoat(rustix::fs::CWD, host.path("fifo"), rustix::fs::Mode::RWXU).unwrap();
