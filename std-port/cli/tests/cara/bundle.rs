@@ -224,7 +224,7 @@ fn the_keys_that_a_configuration_or_an_option_names_get_into_no_bundle() {
     host.put("option", format!("pair {}\n", keys[1]));
     host.put("variable", format!("pair {}\n", keys[2]));
     host.put("elsewhere/plant.toml", "keys = \"own\"\n");
-    host.put("log", keys.join("\n"));
+    host.put("log", keys.join("\n") + "\n");
     let mut command = host.command(&["--config", "elsewhere/plant.toml", "--log", "log", "--key-file", "option"]);
     command.env("CARA_KEYS", host.path("variable"));
     let members = host.members(command);
