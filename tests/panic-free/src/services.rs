@@ -212,7 +212,12 @@ entry!(session_requests, {
     keep(session().request(context(), unknown_text().into(), parameters(), unknown(), *unknown()));
     session().cancel(context(), *unknown());
     session().cancel_but_wait(context(), *unknown());
-    keep((session().holds(*unknown()), session().renews(), session().last_order(), session().lease_left(*unknown(), *unknown())));
+    keep((
+        session().holds(*unknown()),
+        session().renews(),
+        session().last_order(),
+        session().lease_left(*unknown(), *unknown()),
+    ));
 });
 
 entry!(session_serves, {
