@@ -160,6 +160,8 @@ fn update(order: &Order, held: &Held<'_>, rules: &Rules) -> Result<Verdict, Refu
     }
     let first = (order.nodes[0].node_id.as_str(), order.nodes[0].sequence_id);
     let expected = if held.is_executing { held.decision_point } else { Some(held.last_node) };
+    // In 3.0 a mode may have made the last node unknown, and no node is known by no name.
+    let expected = expected.filter(|(node, _)| !node.is_empty());
     if expected == Some(first) {
         return Ok(Verdict::Update);
     }

@@ -131,6 +131,21 @@ fn cancel(order: &str, id: &str) -> InstantActions {
 }
 
 #[test]
+fn no_update_goes_on_from_a_node_that_was_forgotten() {
+    let mut pair = Pair::of("a", Version::V3);
+    pair.machine.order(order("o1", 0, 0, "a!"));
+    for mode in [OperatingMode::Service, OperatingMode::Automatic] {
+        pair.vehicle.status.mode = mode;
+        pair.turn();
+    }
+    let mut update = order("o1", 1, 0, "a! b!");
+    update.nodes[0].node_id.clear();
+    update.edges[0].start_node_id.clear();
+    pair.machine.order(update);
+    assert_eq!((pair.machine.record().order_update_id, pair.left()), (0, String::new()), "{:?}", pair.errors());
+}
+
+#[test]
 fn an_order_is_cancelled_by_its_name() {
     let mut pair = Pair::of("a", Version::V3);
     pair.machine.order(order("o1", 0, 0, "a! b! c!"));

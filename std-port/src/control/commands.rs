@@ -17,7 +17,7 @@ use super::values;
 use crate::engine::peer_cell::PeerCell;
 use crate::locks::Rank;
 
-/// Bytes that may wait for a follower. A report that comes when nothing waits has room in any case.
+/// Bytes that may wait for a follower.
 const MOST_BYTES: usize = 8 << 20;
 /// The largest report. Who follows reads no line much longer, so a larger one is counted and dropped.
 const LARGEST: usize = LONGEST_LINE / 4;
@@ -87,7 +87,7 @@ impl Follower {
     fn take(&mut self, report: &Report, bytes: &[u8]) {
         let Waiting { reports, bytes: all, lost } = &mut self.waiting;
         let start = all.len();
-        let is_full = reports.len() >= self.capacity || start > 0 && start + bytes.len() > MOST_BYTES;
+        let is_full = reports.len() >= self.capacity || start + bytes.len() > MOST_BYTES;
         if is_full || bytes.len() > LARGEST {
             *lost += 1;
             return;
@@ -523,12 +523,11 @@ mod tests {
     #[test]
     fn bytes_of_calls_that_nobody_reads_are_bounded() {
         let commands = Arc::<Commands>::default();
-        let mut followed = commands.follow(8);
-        let bytes = vec![0; MOST_BYTES + 1];
-        // One finds room where nothing waits, and others as far as there are bytes.
-        for (first, second, lost) in [(MOST_BYTES + 1, 1, 1), (MOST_BYTES - 1, 1, 0), (MOST_BYTES - 1, 2, 1)] {
-            commands.report(&Report::Asked, &bytes[..first]);
-            commands.report(&Report::Asked, &bytes[..second]);
+        let mut followed = commands.follow(2 * MOST_BYTES / LARGEST);
+        let bytes = vec![0; LARGEST + 1];
+        let most = MOST_BYTES / LARGEST;
+        for (size, count, lost) in [(LARGEST + 1, 1, 1), (LARGEST, most, 0), (LARGEST, most + 2, 2)] {
+            (0..count).for_each(|_| commands.report(&Report::Asked, &bytes[..size]));
             assert_eq!(followed.take().1, lost);
         }
         // Both rooms are given back once little is used of them.
