@@ -36,7 +36,7 @@ const BACK_OFF: Duration = Duration::from_secs(1);
 
 /// What came of the broker.
 pub enum Heard {
-    /// There is a connection, and the broker has taken all subscriptions.
+    /// There is a connection, and the broker has taken the subscriptions that are needed.
     Connected(Client),
     /// It has ended, or there is none.
     Lost(String),

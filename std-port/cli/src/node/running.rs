@@ -168,8 +168,9 @@ fn runs_already(settings: &Settings, port: u16) -> Option<anyhow::Error> {
 
 fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<TcpListener> {
     http::listen(place.value).map_err(|error| {
-        let in_use = error.kind() == ErrorKind::AddrInUse;
-        if let Some(error) = runs_already(settings, place.value.port()).filter(|_| in_use) {
+        if error.kind() == ErrorKind::AddrInUse
+            && let Some(error) = runs_already(settings, place.value.port())
+        {
             return error;
         }
         let what = format!("metrics cannot be served at {}: {error}", place.value);
