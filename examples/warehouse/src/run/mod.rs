@@ -73,7 +73,7 @@ pub struct Options {
     #[arg(long, value_name = "FILE", requires = "minutes")]
     soak: Option<PathBuf>,
     /// Breaks nothing.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "soak")]
     no_faults: bool,
     /// The floor, in the `.map` format of the MovingAI benchmarks; with `--stations`.
     #[arg(long, value_name = "FILE", requires = "stations")]
@@ -250,7 +250,9 @@ impl Run<'_> {
         if self.looked.elapsed() >= Duration::from_secs(1) {
             self.looked = Instant::now();
             self.look();
+            // Behind the last fault vehicles finish, and hold more than before: none of them is off any more.
             if let Some(samples) = &mut self.samples
+                && !self.due.is_empty()
                 && samples.is_due()
             {
                 samples.write(&self.stage.held())?;

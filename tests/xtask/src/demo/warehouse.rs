@@ -58,7 +58,7 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
     let soak = options.soak.iter().flat_map(|csv| ["--soak".to_owned(), csv.to_string_lossy().into_owned()]);
     let given: Vec<String> = given.flatten().chain(standby).chain(soak).collect();
     let code = if options.board || options.soak.is_some() {
-        in_own_network(options.board, &given)?
+        in_own_network(options.board, options.soak.is_some(), &given)?
     } else {
         binaries::debug("warehouse")?.args(["run"]).args(given).code()?
     };
@@ -71,19 +71,20 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
 
 /// A short run with an emulated board among the vehicles.
 pub(crate) fn check() -> Outcome {
-    firmware::emulated(|| in_own_network(true, &[]))
+    firmware::emulated(|| in_own_network(true, false, &[]))
 }
 
 /// This host on the board's cable, and the board.
 const ADDRESSES: [&str; 2] = ["10.77.0.1/24", "10.77.0.2/24"];
 const CABLE: &str = "cable0";
 
-/// A run in a network of its own, maybe with an emulated board; its exit code.
-fn in_own_network(with_board: bool, given: &[String]) -> Result<Option<i32>> {
+/// A run in a network of its own, maybe with an emulated board; its exit code. A soak is of what people run: optimised.
+fn in_own_network(with_board: bool, is_soak: bool, given: &[String]) -> Result<Option<i32>> {
     let image = with_board.then(firmware::warehouse_image).transpose()?;
+    let built = if is_soak { binaries::release } else { binaries::debug };
     // A board is given its keys by the command beside the program, which has the page as well.
-    binaries::build(&["cara"])?;
-    let warehouse = binaries::debug("warehouse")?;
+    built("cara")?;
+    let warehouse = built("warehouse")?;
     let words = ["demo", "--warehouse"].into_iter().chain(with_board.then_some("--board"));
     let again = words.chain(given.iter().map(String::as_str));
     let needs: &[&str] = if with_board { &["qemu-system-arm"] } else { &["nft"] };
