@@ -2,8 +2,9 @@
 
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, ErrorKind};
+use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
 use anyhow::{Context, Result, bail};
 
@@ -104,6 +105,15 @@ impl Run {
         }
         child.wait()?;
         Ok(output)
+    }
+
+    /// Starts it as the first of a group of processes; its standard output comes with it.
+    pub(crate) fn started(mut self) -> Result<(Child, BufReader<ChildStdout>)> {
+        let shown = self.shown();
+        let started = self.command.process_group(0).stdout(Stdio::piped()).spawn();
+        let mut child = started.with_context(|| format!("cannot start `{shown}`"))?;
+        let output = child.stdout.take().context("standard output was piped")?;
+        Ok((child, BufReader::new(output)))
     }
 
     /// Whether it succeeded, its standard output and its standard error.
