@@ -115,6 +115,9 @@ pub(crate) const UNIT_LINE: Image = Image { name: "unit-line-quiet", feature: So
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
+/// One real board of each family.
+const OF_FAMILIES: [&str; 2] = ["nucleo-f767zi", "rp2040"];
+
 /// All of them: the emulated ones, and those of the table of boards with settings.
 pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
     let emulated = Board {
@@ -141,7 +144,7 @@ pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
         target: board.target,
         images: IMAGES,
         has_radio: board.wireless,
-        by_default: true,
+        by_default: OF_FAMILIES.contains(&board.name),
     });
     [emulated, second].into_iter().chain(real).collect()
 });

@@ -43,11 +43,13 @@ pub(crate) fn sizes(board: Option<&str>, json: Option<&Path>, write: bool) -> Re
 }
 
 /// Fails when a figure has grown by more than 2 % since the document was written.
-pub(crate) fn check() -> Outcome {
-    if let Err(reason) = BOARDS.iter().try_for_each(|board| install::rust_target(board.target)) {
+pub(crate) fn check(of: fn(&Board) -> bool) -> Outcome {
+    if let Err(reason) =
+        BOARDS.iter().filter(|board| of(board)).try_for_each(|board| install::rust_target(board.target))
+    {
         return Outcome::Skipped(reason);
     }
-    measured(|board| board.by_default).and_then(|rows| DOCUMENT.check(&rows)).into()
+    measured(of).and_then(|rows| DOCUMENT.check(&rows)).into()
 }
 
 /// The same for one board.
