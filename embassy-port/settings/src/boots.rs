@@ -2,7 +2,8 @@
 //! even where the board's noise does not.
 //!
 //! Each boot appends a record; when a page is full the other one is erased, so that the record with the highest count
-//! is never in a page that is being erased. A record has 64 bytes:
+//! is never in a page that is being erased. Where no record of the other page can be read any more, it is filled instead: one of
+//! them may have had that count. A record has 64 bytes:
 //!
 //! | offset | size | field |
 //! |---|---|---|
@@ -145,8 +146,8 @@ impl<F: NorFlash> Boots<F> {
         Ok(())
     }
 
-    /// The page with the highest count, what stands in it, and the other page.
-    fn newest(&mut self) -> Result<(u32, Seen, u32), F::Error> {
+    /// The page with the highest count, what stands in it, and the other page with what stands there.
+    fn newest(&mut self) -> Result<(u32, Seen, u32, Seen), F::Error> {
         let [one, two] = self.pages;
         let (first, second) = (self.look(one)?, self.look(two)?);
         let (page, mut seen, older, other) =
@@ -155,15 +156,19 @@ impl<F: NorFlash> Boots<F> {
         if older.newest == 0 {
             seen.lost = seen.lost.saturating_add(older.lost);
         }
-        Ok((page, seen, other))
+        Ok((page, seen, other, older))
     }
 
     /// Writes the next count, with the claim that is stored or another one.
     fn append(&mut self, claim: Option<&StoredClaim>) -> Result<u64, BootError<F::Error>> {
-        let (page, seen, other) = self.newest()?;
+        let (page, seen, other, older) = self.newest()?;
         let next = seen.newest.checked_add(1).and_then(|next| next.checked_add(seen.lost)).ok_or(BootError::Worn)?;
         let record = record(next, claim.unwrap_or(&seen.claim));
         if self.put(page, seen.free, &record)? {
+            return Ok(next);
+        }
+        // If power were cut behind the erasure, nothing would say that the counts of those that cannot be read were returned.
+        if older.newest == 0 && older.lost > 0 && self.put(other, older.free, &record)? {
             return Ok(next);
         }
         self.flash.erase(other, other + self.erase_bytes)?;
@@ -360,6 +365,47 @@ mod tests {
             }
         }
         assert!(cuts > 100 && second_cuts > 1_000, "{cuts} {second_cuts}");
+    }
+
+    /// A bit of the newest record has changed, in whichever life, and then power is cut in each word that the next two lives write
+    /// or erase: each record may have been the only one that said that its count was returned.
+    #[test]
+    fn wherever_power_is_cut_behind_a_rotten_record_counts_rise() {
+        let mut second_cuts = 0;
+        for lives in 1..12 {
+            let before = || {
+                let mut chip = Chip::new();
+                (1..=lives).for_each(|life| assert_eq!(chip.boot(), Ok(life)));
+                let record = record(lives, &StoredClaim::default());
+                let newest = chip.bytes.chunks(RECORD_BYTES).position(|bytes| bytes == record).unwrap();
+                chip.bytes[newest * RECORD_BYTES + 5] ^= 1;
+                chip
+            };
+            for power in 0.. {
+                let mut chip = before();
+                chip.power = power;
+                let first = chip.boot();
+                for second in 0.. {
+                    let mut chip = Chip { bytes: chip.bytes.clone(), power: second, worn: Vec::new() };
+                    let interrupted = chip.boot();
+                    chip.power = usize::MAX;
+                    let counts = [Ok(lives), first, interrupted, chip.boot(), chip.boot()];
+                    let returned: Vec<_> = counts.iter().flatten().collect();
+                    assert!(
+                        returned.is_sorted_by(|one, next| one < next),
+                        "{lives} lives, {power}, {second}: {counts:?}"
+                    );
+                    if interrupted.is_ok() {
+                        break;
+                    }
+                    second_cuts += 1;
+                }
+                if first.is_ok() {
+                    break;
+                }
+            }
+        }
+        assert!(second_cuts > 1_000, "{second_cuts}");
     }
 
     #[test]
