@@ -13,7 +13,8 @@ use cara_std::{AnyCall, Interfaces, LeaseWatch, ServiceError, Unit};
 use cara_vda5050::message::{ActionStatus, Load};
 use cara_vda5050::stretch::{Leg, Stretch};
 use cara_vda5050::vehicle::{
-    ACTION_STATUSES, Condition, Equipment, Equipped, EquippedServer, Guided, GuidedServer, refusal,
+    ACTION_STATUSES, Condition, Consulted, ConsultedServer, Equipment, Equipped, EquippedServer, Guided, GuidedServer,
+    refusal,
 };
 use cara_warehouse::vehicle::Shared;
 use clap::Parser;
@@ -104,14 +105,7 @@ impl Guided for Vehicle {
     ) -> Result<(), ServiceError> {
         let mut body = self.lock();
         let stretch = Stretch { number, count, edges, nodes, positions, given, deviations, max_speeds };
-        let legs = stretch.legs().filter(|legs| legs.iter().all(|leg| leg.position.is_some()));
-        let Some(legs) = legs else { return Err(ServiceError::Failed(refusal::NO_WAY)) };
-        if number + count <= body.condition.drive {
-            return Err(ServiceError::Failed(refusal::OLD_NUMBER));
-        }
-        if !body.can_drive(&legs) {
-            return Err(ServiceError::Failed(refusal::NO_WAY));
-        }
+        let legs = body.judge(&stretch)?;
         call.commit(|| {
             map.clone_into(&mut body.condition.map);
             body.legs = legs;
@@ -159,6 +153,24 @@ impl Guided for Vehicle {
         let body = self.lock();
         let is_ordered = body.may_drive();
         Condition { is_ordered, ..body.condition.clone() }
+    }
+}
+
+impl Consulted for Vehicle {
+    fn vda_can_drive(
+        &mut self,
+        number: i64,
+        count: i64,
+        edges: &str,
+        nodes: &str,
+        _map: &str,
+        positions: [f64; 24],
+        given: [bool; 16],
+        deviations: [f64; 16],
+        max_speeds: [f64; 8],
+    ) -> Result<(), ServiceError> {
+        let stretch = Stretch { number, count, edges, nodes, positions, given, deviations, max_speeds };
+        self.lock().judge(&stretch).map(drop)
     }
 }
 
@@ -231,6 +243,16 @@ impl Body {
         self.condition.position = [to[0], to[1], theta];
         self.condition.driven += (to[0] - at_x).hypot(to[1] - at_y);
         (speed, is_there)
+    }
+
+    /// The edges of a stretch that it can drive.
+    fn judge(&self, stretch: &Stretch<'_>) -> Result<Vec<Leg>, ServiceError> {
+        let legs = stretch.legs().filter(|legs| legs.iter().all(|leg| leg.position.is_some()));
+        let Some(legs) = legs else { return Err(ServiceError::Failed(refusal::NO_WAY)) };
+        if stretch.number + stretch.count <= self.condition.drive {
+            return Err(ServiceError::Failed(refusal::OLD_NUMBER));
+        }
+        if self.can_drive(&legs) { Ok(legs) } else { Err(ServiceError::Failed(refusal::NO_WAY)) }
     }
 
     /// Whether it gets there: on a floor from cell to cell.
@@ -348,6 +370,7 @@ fn start(options: &Options, name: &str, id: u32) -> anyhow::Result<(Vehicle, Uni
     // What is handled looks at its order itself: nothing is left for the hook.
     let handling = unit.my_function_list().actuator(|| ())?;
     unit.my_function_list().serve(GuidedServer { drive, handling })?;
+    unit.my_function_list().serve(ConsultedServer)?;
     unit.my_function_list().serve(EquippedServer)?;
     unit.publish_my_function_list()?;
     unit.start()?;

@@ -15,7 +15,7 @@ pub enum Kind {
     Text,
     /// An order has a member that this vehicle cannot use (6.6.4.2).
     Unsupported,
-    /// A node has no position, and the vehicle needs it.
+    /// A node has no position, and the vehicle needs it; or the vehicle refuses to drive to it behind those that it has.
     NoWay,
     /// A node is on a map that the vehicle does not have.
     UnknownMap,

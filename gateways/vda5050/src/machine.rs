@@ -4,15 +4,15 @@
 //! [`Machine::record`] to disk when [`Machine::take_changed`] says so, before it tells the vehicle or the master anything.
 
 pub(crate) mod at_once;
+mod drive;
 
 use std::time::Duration;
 
 use crate::actions::{Entry, Place, block_driving, startable};
 use crate::errors::{Kind, Refusal};
-use crate::message::{Action, ActionStatus, EStop, Edge, Header, Node, OperatingMode, Order, Report};
+use crate::message::{Action, ActionStatus, EStop, Header, OperatingMode, Order, Report};
 use crate::order::{Held, Verdict, judge};
 use crate::state::{Command, Failure, OnBrokerLoss, Policy, Record, Status};
-use crate::stretch::{LEGS, fits};
 use crate::version::Version;
 
 /// Most errors that are reported at a time; the oldest go.
@@ -21,9 +21,6 @@ pub const ERRORS: usize = 16;
 pub const INSTANT_ACTIONS: usize = 64;
 /// How long the vehicle is left alone after it has refused something.
 const BACK_OFF: Duration = Duration::from_millis(500);
-
-/// With so many edges left, or fewer, the vehicle is told of those that follow.
-const TOLD_AGAIN: usize = LEGS / 2;
 
 /// Header ids of a block.
 const HEADER_IDS: u32 = 1_000;
@@ -66,6 +63,8 @@ pub struct Machine {
     alarms: Vec<Refusal>,
     /// Why the vehicle does not take the stretch that it was told, which is told again and again.
     drive_refused: Option<String>,
+    /// The last number of the stretch that the vehicle has refused last; 0 before that.
+    refused: u64,
     /// A command to drive or to stand has changed what the vehicle does since it said how it is.
     is_status_old: bool,
     /// Why nothing is done with this vehicle, if so.
@@ -93,6 +92,7 @@ impl Machine {
             driven_at_node: None,
             alarms: Vec::new(),
             drive_refused: None,
+            refused: 0,
             is_status_old: false,
             out_of_service: None,
         }
@@ -268,7 +268,7 @@ impl Machine {
         let Order { order_id, order_update_id, zone_set_id, mut nodes, edges, .. } = order;
         let keeps_instant = self.policy.version.rules().lists_instant_actions;
         if verdict == Verdict::New {
-            self.drive_refused = None;
+            (self.drive_refused, self.refused) = (None, 0);
             let number = self.record.number;
             let mut old = std::mem::take(&mut self.record);
             // That of an instant action lasts until the next one.
@@ -443,16 +443,6 @@ impl Machine {
         self.has_changed |= forgets || self.record.errors.len() != known;
     }
 
-    /// How many of the nodes that it was told of the vehicle has passed, the one at which it stands included.
-    fn passed(&self, status: &Status) -> usize {
-        let Some(first) = self.record.drive else { return 0 };
-        let Some(ahead) = status.drive.checked_sub(first) else { return 0 };
-        let told = self.record.told.max(1);
-        let ahead = usize::try_from(ahead).unwrap_or(usize::MAX);
-        // What nobody told it, it has not driven.
-        if ahead >= told { 0 } else { ahead + usize::from(status.has_arrived) }
-    }
-
     /// What a status says of an action.
     fn learn(&mut self, index: usize, status: &Status) {
         let entry = &mut self.record.actions[index];
@@ -502,7 +492,7 @@ impl Machine {
         self.is_halt_due = false;
         self.is_position_sent = false;
         self.is_status_old = false;
-        self.drive_refused = None;
+        (self.drive_refused, self.refused) = (None, 0);
         for entry in &mut self.record.actions {
             (entry.is_sent, entry.is_end_sent) = (false, false);
         }
@@ -593,7 +583,7 @@ impl Machine {
         if let Some(command) = self.next_action(boot) {
             return Some(command);
         }
-        if !self.may_drive() || self.is_drive_sent && self.record.told > TOLD_AGAIN {
+        if !self.may_drive() || self.is_drive_enough() {
             return None;
         }
         self.next_drive(boot)
@@ -647,76 +637,15 @@ impl Machine {
         Some(Command::Act { number: entry.number, action: entry.action.clone() })
     }
 
-    /// The released edges that the vehicle drives without standing. It stands where an action forbids driving, and at both ends of an
-    /// edge with actions, which begin and end there; nor does a stretch leave its map.
-    fn stretch(&self) -> Vec<(Edge, Node)> {
-        let mut legs: Vec<(Edge, Node)> = Vec::new();
-        for (edge, node) in self.record.edges.iter().zip(&self.record.nodes).take(LEGS) {
-            if !edge.released || !node.released {
-                break;
-            }
-            let map = |node: &Node| node.node_position.as_ref().map(|at| at.map_id.clone());
-            let stands = |(before, at): &(Edge, Node)| {
-                let blocks = at.actions.iter().any(|action| action.blocking_type.blocks_driving());
-                blocks || !before.actions.is_empty() || !edge.actions.is_empty() || map(at) != map(node)
-            };
-            if legs.last().is_some_and(stands) || !fits(&legs, edge, node) {
-                break;
-            }
-            legs.push((edge.clone(), node.clone()));
-        }
-        legs
-    }
-
-    /// Tells the vehicle of a stretch, or of a longer one while it drives.
-    fn next_drive(&mut self, boot: u64) -> Option<Command> {
-        let legs = self.stretch();
-        let (edge, _) = legs.first()?;
-        if self.is_drive_sent && legs.len() <= self.record.told {
-            return None;
-        }
-        if self.record.drive.is_none() {
-            let entered = Place::Edge(edge.sequence_id);
-            for entry in self.record.actions.iter_mut().filter(|entry| entry.place == entered && !entry.is_triggered) {
-                entry.is_triggered = true;
-                self.has_changed = true;
-            }
-            // What stands on the edge begins before the vehicle moves there.
-            if let Some(command) = self.next_action(boot) {
-                return Some(command);
-            }
-            if block_driving(&self.record.actions) {
-                return None;
-            }
-            self.record.drive = Some(self.record.number + 1);
-        }
-        let number = self.record.drive?;
-        if legs.len() > self.record.told {
-            self.record.told = legs.len();
-            self.record.number = self.record.number.max(number + legs.len() as u64 - 1);
-            self.has_changed = true;
-        }
-        self.is_drive_sent = true;
-        Some(Command::Drive { number, legs })
-    }
-
     /// What the vehicle has answered to a command: nothing, or a refusal for people. One that was refused comes again, but for an
     /// action, which fails.
     pub fn answered(&mut self, command: &Command, answer: Result<(), Failure>, now: Duration) {
         let failed = answer.as_ref().is_err();
-        self.is_status_old |= matches!(command, Command::Drive { .. } | Command::Halt);
         match command {
-            Command::Drive { .. } => {
-                self.drive_refused = match &answer {
-                    Err(Failure::Refused(why) | Failure::Lost(why)) => Some(why.clone()),
-                    // That one is reported as long as it is stopped.
-                    Ok(()) | Err(Failure::Stopped(_)) => None,
-                };
-                self.is_drive_sent &= !failed;
-                // It may drive all the same, or on by what it was told before.
-                self.is_halt_due |= failed;
+            Command::Drive { number, legs, goes_on } => {
+                self.drive_answered(number + legs.len() as u64 - 1, *goes_on, answer);
             }
-            Command::Halt => self.is_halt_due = failed,
+            Command::Halt => (self.is_halt_due, self.is_status_old) = (failed, true),
             Command::Act { number, .. } => self.acted(*number, answer),
             Command::EndAction { number } => {
                 if let Some(entry) = self.record.actions.iter_mut().find(|entry| entry.number == *number) {
@@ -748,9 +677,7 @@ impl Machine {
         let since = self.driven_at_node.map(|driven| status.driven - driven);
         report.distance_since_last_node = since.filter(|metres| metres.is_finite() && *metres >= 0.0);
         let out_of_service = self.out_of_service.as_ref().map(|why| Refusal::new(Kind::OutOfService, why));
-        // Under a pause it is not told.
-        let drive = self.drive_refused.as_ref().filter(|_| self.record.is_order_open() && self.may_drive());
-        let drive = drive.map(|why| Refusal::new(Kind::DriveRefused, why).about("orderId", &self.record.order_id));
+        let drive = self.drive_error();
         let lasting = out_of_service.iter().chain(&drive).chain(&self.alarms);
         report.errors.extend(lasting.map(|refusal| refusal.error(self.policy.version)));
         Some(report)

@@ -47,6 +47,8 @@ pub struct Record {
     pub drive: Option<u64>,
     /// How many of `nodes` the vehicle has been told of, with that number and those that follow.
     pub told: usize,
+    /// The last number that the vehicle has agreed to drive.
+    pub taken: u64,
     /// By topic: the header ids below this one may have been used.
     pub header_ids: [u32; 4],
     /// Ids of instant actions and orders that are over: a late copy of one does nothing. The oldest go.
@@ -101,6 +103,8 @@ pub enum Command {
         number: u64,
         /// Over which, to which.
         legs: Vec<(Edge, Node)>,
+        /// It drives already, and goes on by what it was told before if it refuses this.
+        goes_on: bool,
     },
     /// The order to drive is given up: it stops.
     Halt,

@@ -109,7 +109,8 @@ pub trait Guided {
     /// the next ones those that follow. What it is told replaces what it was told before: an edge that it drives over it goes on with,
     /// and those that it has driven over it skips. `Stretch` reads the variables.
     /// Each call is an order: so that there is no gap between two, the motors' loop asks `Actuator::watch`, and the safe hook ends
-    /// what the order before wanted.
+    /// what the order before wanted. One that is refused has ended the order before as well: the vehicle stops. So that it is asked
+    /// before it is told more under way, it is `Consulted` too.
     #[actuator(drive)]
     #[lease(ms = 600)]
     #[allow(clippy::too_many_arguments, reason = "each is a variable of the service")]
@@ -148,6 +149,26 @@ pub trait Guided {
     /// Tells how it is.
     #[idempotent]
     fn vda_condition(&mut self) -> Condition;
+}
+
+/// A vehicle that is asked under way, before it is told to drive further. Not every one offers this.
+#[interface]
+pub trait Consulted {
+    /// Whether it would take this for `vda_drive` now. It changes nothing, and what it drives goes on.
+    #[idempotent]
+    #[allow(clippy::too_many_arguments, reason = "those of the service that it is asked about")]
+    fn vda_can_drive(
+        &mut self,
+        number: i64,
+        count: i64,
+        #[size(192)] edges: &str,
+        #[size(192)] nodes: &str,
+        #[size(64)] map: &str,
+        #[unit = "m, m, rad"] positions: [f64; 24],
+        given: [bool; 16],
+        #[unit = "m, rad"] deviations: [f64; 16],
+        #[unit = "m/s"] max_speeds: [f64; 8],
+    ) -> Result<(), ServiceError>;
 }
 
 /// What it carries, and more of its battery. What it does not know is NaN, or a count of -1.
@@ -315,10 +336,23 @@ impl Vehicle for Linked {
         let peer = self.peer.clone();
         let asked = GuidedClient::at(&peer).with(options);
         let answer = match command {
-            Command::Drive { number, legs } => {
+            Command::Drive { number, legs, goes_on } => {
                 let (stretch, [edges, nodes], map) = of_order(signed(*number), legs);
                 let Stretch { number, count, positions, given, deviations, max_speeds, .. } = stretch;
-                let client = asked.renewing(self.heart.renew());
+                let mut left = PATIENCE_TO_BEGIN;
+                // A vehicle that refuses the call itself has stopped by then.
+                if *goes_on && self.peer.function("vda_can_drive").is_some() {
+                    let (since, options) =
+                        (Instant::now(), RequestOptions { timeout: Some(PATIENCE.into()), ..options });
+                    let client = ConsultedClient::at(&peer).with(options);
+                    let call = client
+                        .vda_can_drive(number, count, &edges, &nodes, map, positions, given, deviations, max_speeds);
+                    // Without an answer it goes on by what it has, too.
+                    answered(call, || self.beat()).map_err(|error| Failure::Refused(error.to_string()))?;
+                    left = left.saturating_sub(since.elapsed());
+                }
+                let client = asked.with(RequestOptions { timeout: Some(left.into()), ..options });
+                let client = client.renewing(self.heart.renew());
                 let call =
                     client.vda_drive(number, count, &edges, &nodes, map, positions, given, deviations, max_speeds);
                 answered(call, || self.beat())

@@ -164,6 +164,11 @@ impl World {
                 }
                 self.restart();
             }
+            // Somebody stands in its way, or no longer.
+            18 => {
+                self.pair.vehicle.refuses = self.rng.choice(["", "", "d", "bc"]).unwrap();
+                self.pair.vehicle.is_consulted = self.rng.bool();
+            }
             _ => self.turn(),
         }
     }
@@ -260,6 +265,7 @@ fn sequences_of(version: Version, sequences: u64) {
             // Left alone with all that it needs, every order comes to its end.
             world.pair.machine.broker(true, world.pair.now);
             world.pair.vehicle.status.mode = OperatingMode::Automatic;
+            world.pair.vehicle.refuses = "";
             let status = world.pair.vehicle.status.clone();
             world.pair.machine.status(status);
             world.pair.machine.instant_actions(instant("stopPause", "the end"));

@@ -2,9 +2,10 @@
 
 mod fake;
 
+use cara_vda5050::machine::Machine;
 use cara_vda5050::message::Order;
 use cara_vda5050::state::Command;
-use fake::{Pair, order};
+use fake::{Pair, instant, order, policy};
 
 /// What the vehicle is told at a time: never more than is released, never past a node where it has to stand.
 #[test]
@@ -78,11 +79,82 @@ fn nodes_are_reported_as_they_are_passed_and_an_update_does_not_stop_the_vehicle
 fn a_vehicle_that_stands_early_is_told_again() {
     let mut pair = Pair::new("a");
     pair.machine.order(order("o1", 0, 0, "a! b! c! d!"));
-    let Some(Command::Drive { number, mut legs }) = pair.machine.next(pair.now) else { panic!() };
+    let Some(Command::Drive { number, mut legs, goes_on }) = pair.machine.next(pair.now) else { panic!() };
     legs.truncate(2);
-    let told = Command::Drive { number, legs };
+    let told = Command::Drive { number, legs, goes_on };
     let answer = pair.vehicle.command(&told);
     pair.machine.answered(&told, answer, pair.now);
     pair.turns(20);
     assert_eq!((pair.left().as_str(), pair.vehicle.reached.len()), ("", 3));
+}
+
+/// The vehicle has been told to drive to b and c, and refuses d, which an update has added.
+#[test]
+fn a_vehicle_that_refuses_to_drive_further_drives_to_the_end_of_what_it_has() {
+    for is_consulted in [true, false] {
+        let mut pair = Pair::new("a");
+        (pair.vehicle.steps, pair.vehicle.refuses, pair.vehicle.is_consulted) = (10, "d", is_consulted);
+        pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+        pair.turns(3);
+        pair.machine.order(order("o1", 1, 4, "c! d!"));
+        pair.turn();
+        assert!(!is_consulted || pair.vehicle.status.is_driving, "it stops in mid-edge");
+        let error = pair.machine.report().unwrap().errors.remove(0);
+        let references = error.error_references.unwrap();
+        let named = references.iter().map(|of| format!("{}={}", of.reference_key, of.reference_value));
+        assert_eq!(
+            (error.error_type.as_str(), named.collect::<Vec<_>>().join(" ")),
+            ("orderError", "topic=order orderId=o1 orderUpdateId=1 edgeId=cd nodeId=d".into())
+        );
+        let mut stops = 0;
+        for _ in 0..60 {
+            let drove = pair.vehicle.status.is_driving;
+            pair.turn();
+            stops += u32::from(drove && !pair.vehicle.status.is_driving && pair.machine.record().last_node_id != "c");
+        }
+        assert_eq!((pair.left().as_str(), pair.vehicle.status.is_driving), ("cd! d!", false), "{is_consulted}");
+        assert_eq!(stops, 0, "it stops again and again");
+        let shown = pair.machine.report().unwrap().errors;
+        assert_eq!((shown.len(), shown[0].error_type.as_str()), (1, "driveRefused"));
+        // Once it takes that, it goes on, and has driven each edge once.
+        pair.vehicle.refuses = "";
+        pair.turns(20);
+        let reached: Vec<_> = pair.vehicle.reached.iter().map(|(node, _)| node.as_str()).collect();
+        assert_eq!((pair.left().as_str(), reached), ("", vec!["b", "c", "d"]));
+        assert!(pair.machine.report().unwrap().errors.is_empty());
+    }
+}
+
+/// Neither a pause, a lost link nor a restart of the gateway makes it forget how far the vehicle agreed to drive.
+#[test]
+fn what_the_vehicle_has_agreed_to_is_driven_behind_a_stop() {
+    type Stop = fn(&mut Pair);
+    let stops: [(&str, Stop); 3] = [
+        ("pause", |pair| {
+            pair.machine.instant_actions(instant("startPause", "p1"));
+            pair.turns(3);
+            pair.machine.instant_actions(instant("stopPause", "p2"));
+        }),
+        ("link", |pair| {
+            pair.machine.vehicle_lost();
+            pair.vehicle.unlink();
+        }),
+        ("restart", |pair| {
+            pair.machine = Machine::new(pair.machine.record().clone(), policy(), pair.now);
+            pair.machine.broker(true, pair.now);
+            pair.vehicle.unlink();
+        }),
+    ];
+    for (what, stop) in stops {
+        let mut pair = Pair::new("a");
+        (pair.vehicle.steps, pair.vehicle.refuses) = (10, "d");
+        pair.machine.order(order("o1", 0, 0, "a! b! c!"));
+        pair.turns(3);
+        pair.machine.order(order("o1", 1, 4, "c! d!"));
+        pair.turns(2);
+        stop(&mut pair);
+        assert!(!pair.vehicle.status.is_driving, "{what}");
+        pair.turns(40);
+        assert_eq!((pair.left().as_str(), pair.vehicle.status.is_driving), ("cd! d!", false), "{what}");
+    }
 }

@@ -337,7 +337,7 @@ impl Master {
         let (order_id, is_cancelled) = (record.order_id.clone(), record.is_cancelled);
         let is_free = is_controlled(&self.status) && self.status.e_stop == EStop::None && !record.is_paused;
         match &command {
-            Command::Drive { number, legs } => {
+            Command::Drive { number, legs, .. } => {
                 assert!(is_free && !is_cancelled, "it is told to drive, and has to stand");
                 assert!((1..=LEGS).contains(&legs.len()));
                 let (mut stretch, [edges, nodes], _) = of_order(i64::try_from(*number).expect("it is small"), legs);

@@ -119,6 +119,10 @@ pub struct Fake {
     /// Steps until it stands, and how many are left.
     pub ramp: u32,
     braking: u32,
+    /// It refuses a stretch with one of these nodes,
+    pub refuses: &'static str,
+    /// and is asked before, or stops for each stretch that it refuses.
+    pub is_consulted: bool,
 }
 
 impl Fake {
@@ -138,12 +142,20 @@ impl Fake {
             steps: 2,
             ramp: 0,
             braking: 0,
+            refuses: "",
+            is_consulted: true,
         }
     }
 
     pub fn command(&mut self, command: &Command) -> Result<(), Failure> {
         match command {
-            Command::Drive { number, legs } => {
+            Command::Drive { number, legs, goes_on } => {
+                if legs.iter().any(|(_, node)| self.refuses.contains(&node.node_id)) {
+                    if !(*goes_on && self.is_consulted) {
+                        self.stop_driving();
+                    }
+                    return Err(Failure::Refused("no way there".into()));
+                }
                 if number + legs.len() as u64 <= self.status.drive {
                     return Err(Failure::Refused("an old number".into()));
                 }
