@@ -7,6 +7,7 @@
 #![allow(missing_docs)]
 
 mod factsheet;
+mod shape;
 mod third;
 
 use serde::de::DeserializeOwned;
@@ -17,16 +18,32 @@ pub use factsheet::*;
 
 use crate::version::Version;
 
+/// Reads a type as its derived `deserialize` does, from this shape only.
+macro_rules! shaped {
+    ($shape:ident $name:ident) => {
+        impl<'de> ::serde::Deserialize<'de> for $name {
+            fn deserialize<D: ::serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                Self::deserialize($crate::message::shape::$shape(deserializer))
+            }
+        }
+        impl ::serde::Serialize for $name {
+            fn serialize<S: ::serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                Self::serialize(self, serializer)
+            }
+        }
+    };
+}
 /// A struct of a JSON object: members that must be there; those that may be absent, or null when read.
 macro_rules! object {
     ($($(#[$attribute:meta])* $name:ident { $($(#[$of:meta])* $field:ident: $type:ty),* $(; $($(#[$of_optional:meta])* $optional:ident: $optional_type:ty),*)? $(,)? })*) => {
         $($(#[$attribute])*
         #[derive(Clone, Debug, Default, PartialEq, ::serde::Serialize, ::serde::Deserialize)]
-        #[serde(rename_all = "camelCase")]
+        #[serde(rename_all = "camelCase", remote = "Self")]
         pub struct $name {
             $($(#[$of])* pub $field: $type,)*
             $($($(#[$of_optional])* #[serde(default, skip_serializing_if = "Option::is_none")] pub $optional: Option<$optional_type>,)*)?
-        })*
+        }
+        $crate::message::shaped!(Object $name);)*
     };
 }
 /// An enum of a text; the first is what a `Default` needs.
@@ -34,10 +51,12 @@ macro_rules! words {
     ($($(#[$attribute:meta])* $name:ident { $($(#[$of:meta])* $word:ident = $text:literal),* $(,)? })*) => {
         $($(#[$attribute])*
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, ::serde::Serialize, ::serde::Deserialize)]
-        pub enum $name { $($(#[$of])* #[serde(rename = $text)] $word),* })*
+        #[serde(remote = "Self")]
+        pub enum $name { $($(#[$of])* #[serde(rename = $text)] $word),* }
+        $crate::message::shaped!(Word $name);)*
     };
 }
-pub(crate) use {object, words};
+pub(crate) use {object, shaped, words};
 
 object! {
     /// What each message starts with (6.4).
@@ -152,12 +171,29 @@ words! {
 
 /// How far from a node's place a vehicle may be: a circle in 2.x, an ellipse in 3.0 (6.6.2.1).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, from = "ReadDeviation")]
 pub enum Deviation {
     /// In metres.
     Radius(f64),
     /// In metres, and the angle from the map's x axis to that of `a`.
     Ellipse { a: f64, b: f64, theta: f64 },
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum ReadDeviation {
+    Radius(f64),
+    Ellipse(Axes),
+}
+object! { Axes { a: f64, b: f64, theta: f64 } }
+
+impl From<ReadDeviation> for Deviation {
+    fn from(read: ReadDeviation) -> Self {
+        match read {
+            ReadDeviation::Radius(radius) => Self::Radius(radius),
+            ReadDeviation::Ellipse(Axes { a, b, theta }) => Self::Ellipse { a, b, theta },
+        }
+    }
 }
 
 impl Deviation {

@@ -7,8 +7,8 @@ use cara_vda5050::message::{
     write,
 };
 use cara_vda5050::version::Version;
-use serde::Serialize;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value, json};
 
 /// Where the document counts, and not the schema: these members are added to generated messages.
@@ -230,4 +230,143 @@ fn members_may_be_null() {
     let deviation = order.nodes[1].node_position.as_ref().unwrap().allowed_deviation_xy.unwrap();
     assert_eq!(deviation, Deviation::Radius(2.0), "a whole number is a number");
     assert_eq!((&order.zone_set_id, &order.nodes[0].node_position, order.edges[0].max_speed), (&None, &None, None));
+}
+
+/// JSON whose members keep their order.
+#[derive(Clone)]
+enum Ordered {
+    Object(Vec<(String, Ordered)>),
+    List(Vec<Ordered>),
+    Other(Value),
+}
+
+impl<'de> Deserialize<'de> for Ordered {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Any;
+        impl<'de> Visitor<'de> for Any {
+            type Value = Ordered;
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("JSON")
+            }
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Ordered, A::Error> {
+                let mut members = Vec::new();
+                while let Some(member) = map.next_entry()? {
+                    members.push(member);
+                }
+                Ok(Ordered::Object(members))
+            }
+            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Ordered, A::Error> {
+                let mut elements = Vec::new();
+                while let Some(element) = list.next_element()? {
+                    elements.push(element);
+                }
+                Ok(Ordered::List(elements))
+            }
+            fn visit_bool<E>(self, value: bool) -> Result<Ordered, E> {
+                Ok(Ordered::Other(value.into()))
+            }
+            fn visit_i64<E>(self, value: i64) -> Result<Ordered, E> {
+                Ok(Ordered::Other(value.into()))
+            }
+            fn visit_u64<E>(self, value: u64) -> Result<Ordered, E> {
+                Ok(Ordered::Other(value.into()))
+            }
+            fn visit_f64<E>(self, value: f64) -> Result<Ordered, E> {
+                Ok(Ordered::Other(value.into()))
+            }
+            fn visit_str<E>(self, value: &str) -> Result<Ordered, E> {
+                Ok(Ordered::Other(value.into()))
+            }
+        }
+        deserializer.deserialize_any(Any)
+    }
+}
+
+impl Ordered {
+    fn value(&self) -> Value {
+        match self {
+            Self::Object(members) => {
+                members.iter().map(|(name, value)| (name.clone(), value.value())).collect::<Map<_, _>>().into()
+            }
+            Self::List(elements) => elements.iter().map(Self::value).collect(),
+            Self::Other(value) => value.clone(),
+        }
+    }
+
+    /// It with each object in it in turn, and each word, in another shape: a list of the members as serde would read them, and an
+    /// object. What is in values of the application is theirs.
+    fn spoilt(&self, within: &str) -> Vec<Value> {
+        match self {
+            _ if ["value", "data"].contains(&within) => Vec::new(),
+            Self::Object(members) => {
+                let list = members.iter().map(|(_, value)| value.value()).collect();
+                let with = |index: usize, other: Value| {
+                    let mut object = self.value();
+                    object[&members[index].0] = other;
+                    object
+                };
+                let inside = members.iter().enumerate().flat_map(|(index, (name, value))| {
+                    value.spoilt(name).into_iter().map(move |other| with(index, other))
+                });
+                inside.chain([list]).collect()
+            }
+            Self::List(elements) => {
+                let with = |index: usize, other: Value| {
+                    let mut list = self.value();
+                    list[index] = other;
+                    list
+                };
+                let inside = elements
+                    .iter()
+                    .enumerate()
+                    .flat_map(|(index, value)| value.spoilt(within).into_iter().map(move |other| with(index, other)));
+                inside.collect()
+            }
+            Self::Other(Value::String(word)) if word.bytes().all(|letter| letter.is_ascii_uppercase()) => {
+                vec![json!({word: null})]
+            }
+            Self::Other(_) => Vec::new(),
+        }
+    }
+}
+
+fn is_one_shape_read<T: Serialize + DeserializeOwned>(schemas: &str, topic: &str) {
+    let schema = schema(schemas, topic);
+    let mut message = generated(&schema, &schema, true, 0);
+    without_never_written(&mut message);
+    let version = Version::of(schemas).unwrap_or(Version::V3);
+    let message: T = read(version, message.to_string().as_bytes()).unwrap();
+    // In the model's order of members, and with its names.
+    let ordered: Ordered = serde_json::from_str(&serde_json::to_string(&message).unwrap()).unwrap();
+    assert!(serde_json::from_value::<T>(ordered.value()).is_ok(), "{topic}");
+    let spoilt = ordered.spoilt("");
+    assert!(spoilt.len() > usize::from(topic != "connection"), "{topic}");
+    for value in spoilt {
+        assert!(serde_json::from_value::<T>(value.clone()).is_err(), "{schemas} {topic}: {value}");
+    }
+}
+
+/// A list would go past all that looks at the names of members.
+#[test]
+fn an_object_is_read_from_an_object_only() {
+    for schemas in ["2.0.0", "2.1.0", THIRD] {
+        is_one_shape_read::<Order>(schemas, "order");
+        is_one_shape_read::<InstantActions>(schemas, "instantActions");
+        is_one_shape_read::<State>(schemas, "state");
+        is_one_shape_read::<Connection>(schemas, "connection");
+        is_one_shape_read::<Visualization>(schemas, "visualization");
+    }
+    is_one_shape_read::<Factsheet>("2.1.0", "factsheet");
+    is_one_shape_read::<Factsheet>(THIRD, "factsheet");
+    is_one_shape_read::<Responses>(THIRD, "responses");
+    is_one_shape_read::<ZoneSetMessage>(THIRD, "zoneSet");
+    // As it comes: an edge with a limit that 3.0 calls otherwise, and a circle that is an ellipse.
+    let schema = schema(THIRD, "order");
+    let mut order = generated(&schema, &schema, true, 0);
+    order["edges"][0] = json!(["e1", 1, true, "a", "b", [], null, 0.1]);
+    assert!(read::<Order>(Version::V3, order.to_string().as_bytes()).is_err());
+    let mut order = serde_json::to_value(Order::default()).unwrap();
+    order["nodes"] = json!([{"nodeId": "a", "sequenceId": 0, "released": true, "actions": [],
+        "nodePosition": {"x": 0.0, "y": 0.0, "mapId": "hall", "allowedDeviationXY": [9.0, 9.0, 0.0]}}]);
+    assert!(read::<Order>(Version::V2, order.to_string().as_bytes()).is_err());
 }
