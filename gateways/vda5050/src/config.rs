@@ -144,7 +144,8 @@ pub struct Vda5050 {
     /// Seconds between messages of topic `visualization`; 0 sends none.
     #[serde(default)]
     pub visualization_every: f64,
-    /// Orders and instant actions older than so many seconds are refused; 0 takes all. For synchronised clocks only.
+    /// Orders and instant actions older than so many seconds are refused, but for those that stop; 0 takes all. For synchronised clocks
+    /// only.
     #[serde(default)]
     pub oldest: f64,
     /// The factsheet of the series, as JSON.

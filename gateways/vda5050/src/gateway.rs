@@ -301,11 +301,13 @@ impl Gateway {
             }
             Heard::Message(topic, is_retained, bytes) => match topic.as_str() {
                 "order" => match self.checked::<Order>("order", is_retained, &bytes) {
-                    Ok(order) if self.is_broker_there => self.driver.machine.order(order),
-                    Ok(order) => self.refuse(&late("order", &order.header)),
+                    Ok(order) => match self.is_of_now("order", &order.header) {
+                        Ok(()) => self.driver.machine.order(order),
+                        Err(refusal) => self.refuse(&refusal),
+                    },
                     Err(refusal) => self.refuse(&refusal),
                 },
-                "instantActions" => match self.checked::<InstantActions>("instantActions", is_retained, &bytes) {
+                "instantActions" => match self.checked("instantActions", is_retained, &bytes) {
                     Ok(message) => self.at_once(message),
                     Err(refusal) => self.refuse(&refusal),
                 },
@@ -329,14 +331,37 @@ impl Gateway {
         }
     }
 
-    /// What came while the broker did not answer was sent who knows when. What stops the vehicle counts all the same.
+    /// What stops the vehicle counts whenever it was sent, and whatever the master's clock says.
     fn at_once(&mut self, mut message: InstantActions) {
-        let sent = message.actions.len();
-        message.actions.retain(|action| self.is_broker_there || is_stop(action));
-        if message.actions.len() < sent {
-            self.refuse(&late("instantActions", &message.header));
+        if let Err(refusal) = self.is_of_now("instantActions", &message.header) {
+            let sent = message.actions.len();
+            message.actions.retain(is_stop);
+            if message.actions.len() < sent {
+                self.refuse(&refusal);
+            }
         }
         self.driver.machine.instant_actions(message);
+    }
+
+    /// What came while the broker did not answer was sent who knows when.
+    fn is_of_now(&self, topic: &str, header: &Header) -> Result<(), Refusal> {
+        let refused = |text: &str| {
+            let refusal = Refusal::new(Kind::Validation, text).about("topic", topic);
+            Err(refusal.about("headerId", header.header_id))
+        };
+        if !self.is_broker_there {
+            return refused("the message came while the broker did not answer");
+        }
+        if self.config.vda5050.oldest > 0.0 {
+            let Ok(sent) = humantime::parse_rfc3339_weak(&header.timestamp) else {
+                return refused("the timestamp cannot be read");
+            };
+            let age = SystemTime::now().duration_since(sent).unwrap_or_default();
+            if age.as_secs_f64() > self.config.vda5050.oldest {
+                return refused("the message is too old");
+            }
+        }
+        Ok(())
     }
 
     fn refuse(&mut self, refusal: &Refusal) {
@@ -354,7 +379,7 @@ impl Gateway {
         }
     }
 
-    /// A message for this vehicle, of now.
+    /// A message for this vehicle.
     fn checked<T: serde::de::DeserializeOwned + HasHeader>(
         &self,
         topic: &str,
@@ -367,22 +392,13 @@ impl Gateway {
             return Err(refused("a retained message is not of now".into()));
         }
         let message: T = read(self.config.version(), bytes).map_err(|error| refused(error.to_string()))?;
-        let Header { header_id, timestamp, version, manufacturer, serial_number } = message.header();
+        let Header { header_id, version, manufacturer, serial_number, .. } = message.header();
         let refused = |text: &str| Err(refused(text.to_owned()).about("headerId", header_id));
         if (manufacturer, serial_number) != (&self.config.vda5050.manufacturer, &self.serial_number) {
             return refused("the message is for another vehicle");
         }
         if Version::of(version) != Some(self.config.version()) {
             return refused("the message is of another version");
-        }
-        if self.config.vda5050.oldest > 0.0 {
-            let Ok(sent) = humantime::parse_rfc3339_weak(timestamp) else {
-                return refused("the timestamp cannot be read");
-            };
-            let age = SystemTime::now().duration_since(sent).unwrap_or_default();
-            if age.as_secs_f64() > self.config.vda5050.oldest {
-                return refused("the message is too old");
-            }
         }
         Ok(message)
     }
@@ -551,11 +567,6 @@ fn header(config: &Config, serial_number: &str, header_id: u32) -> Header {
         manufacturer: config.vda5050.manufacturer.clone(),
         serial_number: serial_number.to_owned(),
     }
-}
-
-fn late(topic: &str, header: &Header) -> Refusal {
-    let refusal = Refusal::new(Kind::Validation, "the message came while the broker did not answer");
-    refusal.about("topic", topic).about("headerId", header.header_id)
 }
 
 /// No vehicle has zones: `supportedZones` of the factsheet is empty.

@@ -8,9 +8,10 @@ use std::net::{TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use cara_vda5050::mqtt::{Heard, Link, Place};
+use fake::{instant, order};
 use plant::{PATIENCE, Plant, Process};
 use rumqttc::QoS;
 
@@ -64,6 +65,41 @@ fn a_subscription_that_is_refused_is_a_broker_that_is_away() {
     // Without this one a late last will stays.
     let _takes_orders = broker(&listener, &[0, 0, 0x80]);
     assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::Connected(_)));
+}
+
+/// The master's clock is an hour behind: what it sends is old, and what stops the vehicle counts.
+#[test]
+fn no_time_stamp_refuses_a_stop() {
+    let mut plant = Plant::start("{ do = \"stop\" }");
+    plant.change("oldest = 0.0", "oldest = 60.0");
+    let stamp = |at: SystemTime| humantime::format_rfc3339_millis(at).to_string();
+    let now = || stamp(SystemTime::now());
+    let behind = || stamp(SystemTime::now() - Duration::from_secs(3_600));
+    let send = |plant: &Plant, kind: &str, id: &str, timestamp: String| {
+        let mut message = instant(kind, id);
+        message.header.timestamp = timestamp;
+        plant.publish("instantActions", false, &message);
+    };
+    let mut sent = order("o1", 0, 0, "a! k!");
+    sent.header.timestamp = behind();
+    plant.publish("order", false, &sent);
+    plant.wait_for("it is too old", |plant| plant.has_error("validationError"));
+    sent.header.timestamp = now();
+    plant.publish("order", false, &sent);
+    plant.wait_for("it drives", |plant| plant.state()["driving"] == true && !plant.has_error("validationError"));
+    for (index, timestamp) in [behind(), "yesterday".into()].into_iter().enumerate() {
+        let id = format!("p{index}");
+        send(&plant, "startPause", &id, timestamp.clone());
+        plant.wait_for("it stands", |plant| plant.action(&id) == "FINISHED" && plant.state()["driving"] == false);
+        // What makes it go on is refused.
+        send(&plant, "stopPause", "old", timestamp);
+        plant.wait_for("that is too old", |plant| plant.has_error("validationError"));
+        assert!(plant.state()["paused"] == true && plant.action("old").is_empty());
+        send(&plant, "stopPause", &format!("on{index}"), now());
+        plant.wait_for("it goes on", |plant| plant.state()["driving"] == true);
+    }
+    send(&plant, "cancelOrder", "c1", behind());
+    plant.wait_for("it is cancelled", |plant| plant.action("c1") == "FINISHED" && plant.state()["driving"] == false);
 }
 
 /// One that is retained would come again with each connection.

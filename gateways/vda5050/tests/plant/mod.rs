@@ -209,6 +209,15 @@ impl Plant {
         text
     }
 
+    /// One of the gateway's own, of the first vehicle or of all.
+    pub fn metric(&self, name: &str) -> u64 {
+        let text = self.scrape();
+        let values = text.lines().filter_map(|line| line.strip_prefix("cara_vda5050_")?.strip_prefix(name));
+        let value =
+            values.map(|rest| rest.trim_start_matches("{vehicle=\"0001\"}")).find_map(|rest| rest.strip_prefix(' '));
+        value.unwrap_or_else(|| panic!("{name}: {text}")).parse().unwrap()
+    }
+
     /// CPUs that the gateway takes in a while.
     pub fn used(&self, time: Duration) -> f64 {
         let ticks = || {
@@ -232,6 +241,17 @@ impl Plant {
 
     pub fn start_gateway(&mut self) {
         self.gateway = Some(self.gateway_of(&self.file()));
+    }
+
+    /// Starts it again with something else in its configuration.
+    pub fn change(&mut self, from: &str, to: &str) {
+        self.kill_gateway();
+        let text = std::fs::read_to_string(self.file()).unwrap();
+        assert!(text.contains(from), "{from}");
+        std::fs::write(self.file(), text.replace(from, to)).unwrap();
+        self.heard.lock().unwrap().clear();
+        self.start_gateway();
+        self.wait_for("ONLINE", |plant| plant.connection() == "ONLINE" && plant.state() != Value::Null);
     }
 
     /// One with this configuration.
@@ -286,6 +306,16 @@ impl Plant {
     pub fn publish(&self, topic: &str, retain: bool, message: &impl serde::Serialize) {
         let (root, message) = (self.version().rules().root, write(self.version(), message));
         self.client.publish(format!("uagv/{root}/KIT/0001/{topic}"), QoS::AtMostOnce, retain, message).unwrap();
+    }
+
+    /// A message of so many bytes, which the master's own client would not take.
+    pub fn publish_long(&self, topic: &str, bytes: usize) {
+        let mut options = MqttOptions::new("long", "127.0.0.1", self.port);
+        options.set_max_packet_size(1 << 20, bytes + 1_024);
+        let (client, mut connection) = Client::new(options, 10);
+        client.publish(format!("uagv/v2/KIT/0001/{topic}"), QoS::AtLeastOnce, false, vec![b' '; bytes]).unwrap();
+        let is_sent = |event| matches!(event, Ok(Event::Incoming(Packet::PubAck(_))));
+        assert!(connection.iter().any(is_sent));
     }
 
     pub fn order(&self, id: &str, update: u32, first: u32, way: &str) -> Order {
