@@ -325,7 +325,9 @@ impl Gateway {
             Heard::TooLong(topic, bytes) => {
                 self.seen.received.fetch_add(1, Ordering::Relaxed);
                 let text = format!("the message has {bytes} bytes, and {LARGEST} at most are read");
-                self.refuse(&Refusal::new(Kind::Validation, text).about("topic", topic));
+                let refusal = Refusal::new(Kind::Validation, text);
+                // Of one that is too long to be held nothing else is known.
+                self.refuse(&topic.into_iter().fold(refusal, |refusal, topic| refusal.about("topic", topic)));
             }
             Heard::Acknowledged => {}
         }

@@ -3,15 +3,17 @@
 //! Each connection is a client of its own, so that nothing that was queued before a loss is sent behind it, and files of TLS are read
 //! again.
 
+use std::iter::repeat;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use rumqttc::{
-    Client, Event, LastWill, MqttOptions, Packet, QoS, SubscribeFilter, SubscribeReasonCode, TlsConfiguration,
-    Transport,
+    Client, ConnectionError, Event, LastWill, MqttOptions, Packet, QoS, RecvTimeoutError, StateError, SubscribeFilter,
+    SubscribeReasonCode, TlsConfiguration, Transport, mqttbytes,
 };
 
 use crate::config;
@@ -31,6 +33,8 @@ const NEEDED: [&str; 3] = ["order", "instantActions", "cara-probe"];
 const WAITING: usize = 256;
 /// Messages that wait to be looked at: as many are looked at in one turn of the loop.
 pub const HEARD: usize = 16;
+/// A broker that has not answered the subscriptions for so long counts as away, as one that has refused them.
+const ANSWERED: Duration = Duration::from_secs(5);
 /// Between two attempts to connect.
 const BACK_OFF: Duration = Duration::from_secs(1);
 
@@ -42,8 +46,9 @@ pub enum Heard {
     Lost(String),
     /// The last level of its topic, whether it is a retained one, and its bytes.
     Message(String, bool, Vec<u8>),
-    /// One with more than [`LARGEST`] bytes: the last level of its topic, and how many.
-    TooLong(String, usize),
+    /// One with more than [`LARGEST`] bytes: the last level of its topic, if that was read, and how many. One that ends the connection
+    /// is told of before that.
+    TooLong(Option<String>, usize),
     /// What was sent with quality of service 1 has arrived.
     Acknowledged,
 }
@@ -81,7 +86,10 @@ impl Link {
         let ended = ends.clone();
         std::thread::Builder::new().name(format!("mqtt {}", place.client_id)).spawn(move || {
             while !ended.load(Ordering::SeqCst) {
-                let why = connection(&place, &sender).err().map_or_else(String::new, |error| reason(&error));
+                // One that has panicked, as where the resolver's thread cannot be started, is tried again like any other.
+                let ended = catch_unwind(AssertUnwindSafe(|| connection(&place, &sender)));
+                let ended = ended.unwrap_or_else(|_| Err(anyhow!("the connection has panicked")));
+                let why = ended.err().map_or_else(String::new, |error| reason(&error));
                 if sender.send(Heard::Lost(why)).is_err() {
                     return;
                 }
@@ -120,9 +128,29 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
     let (client, mut connection) = Client::new(options(place)?, WAITING);
     // Who listens holds the only one then: when that goes, the connection ends without a farewell, and the last will is sent.
     let mut client = Some(client);
-    for event in connection.iter() {
+    let mut subscribed: Option<Instant> = None;
+    loop {
+        let left = subscribed.filter(|_| client.is_some()).map(|since| ANSWERED.saturating_sub(since.elapsed()));
+        ensure!(left != Some(Duration::ZERO), "the broker does not answer the subscriptions");
+        let event = match left {
+            None => connection.recv().map_err(|_| RecvTimeoutError::Disconnected),
+            Some(left) => connection.recv_timeout(left),
+        };
+        let event = match event {
+            Ok(event) => event,
+            // It is looked at above.
+            Err(RecvTimeoutError::Timeout) => continue,
+            Err(RecvTimeoutError::Disconnected) => return Ok(()),
+        };
+        if let Err(error) = &event
+            && let Some(bytes) = too_long(error)
+        {
+            sender.send(Heard::TooLong(None, bytes)).context("nobody listens")?;
+            bail!("a message of {bytes} bytes came: one with more than {LARGEST_TAKEN} ends the connection");
+        }
         let heard = match event? {
             Event::Incoming(Packet::ConnAck(_)) => {
+                subscribed = Some(Instant::now());
                 let filter = |topic: &&str| SubscribeFilter::new(format!("{}/{topic}", place.prefix), QoS::AtMostOnce);
                 if let Some(client) = &client {
                     client.try_subscribe_many(place.topics.iter().map(filter))?;
@@ -130,8 +158,10 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
                 continue;
             }
             Event::Incoming(Packet::SubAck(answer)) => {
-                let codes = place.topics.iter().zip(&answer.return_codes);
-                for (topic, _) in codes.filter(|(_, code)| **code == SubscribeReasonCode::Failure) {
+                // What is not answered is refused.
+                let codes = answer.return_codes.into_iter().chain(repeat(SubscribeReasonCode::Failure));
+                let codes = place.topics.iter().zip(codes);
+                for (topic, _) in codes.filter(|(_, code)| *code == SubscribeReasonCode::Failure) {
                     let text = format!("the broker refuses to send {topic} of {}", place.prefix);
                     ensure!(!NEEDED.contains(topic), text);
                     log::line(text);
@@ -147,7 +177,7 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
                 let Some(topic) = topic else { continue };
                 place.recording.take(false, &message.topic, message.retain, &message.payload);
                 if message.payload.len() > LARGEST {
-                    Heard::TooLong(topic.to_owned(), message.payload.len())
+                    Heard::TooLong(Some(topic.to_owned()), message.payload.len())
                 } else {
                     Heard::Message(topic.to_owned(), message.retain, message.payload.to_vec())
                 }
@@ -158,7 +188,16 @@ fn connection(place: &Place, sender: &SyncSender<Heard>) -> Result<()> {
         // One that waits holds the connection back, and the broker with it.
         sender.send(heard).context("nobody listens")?;
     }
-    Ok(())
+}
+
+/// How many bytes a message has that ends the connection, if that is why it ends.
+const fn too_long(error: &ConnectionError) -> Option<usize> {
+    match error {
+        ConnectionError::MqttState(StateError::Deserialization(mqttbytes::Error::PayloadSizeLimitExceeded(bytes))) => {
+            Some(*bytes)
+        }
+        _ => None,
+    }
 }
 
 fn options(place: &Place) -> Result<MqttOptions> {

@@ -8,7 +8,8 @@ use std::net::{TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant, SystemTime};
 
 use cara_vda5050::mqtt::{Heard, Link, Place};
 use fake::{instant, order};
@@ -17,6 +18,14 @@ use rumqttc::QoS;
 
 /// Takes a connection and its subscriptions, with these answers.
 fn broker(listener: &TcpListener, answers: &[u8]) -> TcpStream {
+    let (mut stream, id) = subscribed(listener);
+    stream.write_all(&[0x90, 2 + answers.len() as u8, id[0], id[1]]).unwrap();
+    stream.write_all(answers).unwrap();
+    stream
+}
+
+/// Takes a connection: that, and the packet id of its subscriptions.
+fn subscribed(listener: &TcpListener) -> (TcpStream, [u8; 2]) {
     let (mut stream, _) = listener.accept().unwrap();
     let packet = |stream: &mut TcpStream| {
         // No packet of this test has 128 bytes or more but the first, whose length takes two.
@@ -36,35 +45,108 @@ fn broker(listener: &TcpListener, answers: &[u8]) -> TcpStream {
     stream.write_all(&[0x20, 2, 0, 0]).unwrap();
     let (kind, body) = packet(&mut stream);
     assert_eq!(kind, 8, "SUBSCRIBE");
-    stream.write_all(&[0x90, 2 + answers.len() as u8, body[0], body[1]]).unwrap();
-    stream.write_all(answers).unwrap();
-    stream
+    (stream, [body[0], body[1]])
+}
+
+fn link(listener: &TcpListener, will: Box<dyn Fn() -> Vec<u8> + Send>) -> Link {
+    let port = listener.local_addr().unwrap().port();
+    Link::start(Place {
+        broker: toml::from_str(&format!("host = \"127.0.0.1\"\nport = {port}")).unwrap(),
+        client_id: "KIT-0001".into(),
+        prefix: "uagv/v2/KIT/0001".into(),
+        topics: vec!["order", "instantActions", "connection"],
+        will,
+        recording: Default::default(),
+        expiry: Arc::default(),
+    })
+    .unwrap()
+}
+
+fn why_lost(link: &Link) -> String {
+    match link.heard.recv_timeout(PATIENCE).unwrap() {
+        Heard::Lost(why) => why,
+        _ => panic!("something else"),
+    }
 }
 
 /// A vehicle that no stop would reach is not ONLINE.
 #[test]
 fn a_subscription_that_is_refused_is_a_broker_that_is_away() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = listener.local_addr().unwrap().port();
-    let link = Link::start(Place {
-        broker: toml::from_str(&format!("host = \"127.0.0.1\"\nport = {port}")).unwrap(),
-        client_id: "KIT-0001".into(),
-        prefix: "uagv/v2/KIT/0001".into(),
-        topics: vec!["order", "instantActions", "connection"],
-        will: Box::new(Vec::new),
-        recording: Default::default(),
-        expiry: Arc::default(),
-    })
-    .unwrap();
-    let refusing = broker(&listener, &[0, 0x80, 0]);
-    match link.heard.recv_timeout(PATIENCE).unwrap() {
-        Heard::Lost(why) => assert_eq!(why, "the broker refuses to send instantActions of uagv/v2/KIT/0001"),
-        _ => panic!("something else"),
+    let link = link(&listener, Box::new(Vec::new));
+    // The second one is refused, or not answered at all.
+    for answers in [&[0, 0x80, 0][..], &[0]] {
+        let _refusing = broker(&listener, answers);
+        assert_eq!(why_lost(&link), "the broker refuses to send instantActions of uagv/v2/KIT/0001");
     }
-    drop(refusing);
     // Without this one a late last will stays.
     let _takes_orders = broker(&listener, &[0, 0, 0x80]);
     assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::Connected(_)));
+}
+
+#[test]
+fn a_broker_that_answers_no_subscription_is_one_that_is_away() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let link = link(&listener, Box::new(Vec::new));
+    let begun = Instant::now();
+    let _silent = subscribed(&listener);
+    assert_eq!(why_lost(&link), "the broker does not answer the subscriptions");
+    assert!(begun.elapsed() >= Duration::from_secs(4), "{:?}", begun.elapsed());
+    // It is tried again.
+    let _answers = broker(&listener, &[0, 0, 0]);
+    assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::Connected(_)));
+}
+
+/// Nobody else would connect this vehicle again.
+#[test]
+fn a_connection_that_panics_is_tried_again() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let panics = AtomicBool::new(true);
+    let link =
+        link(&listener, Box::new(move || if panics.swap(false, Ordering::SeqCst) { panic!() } else { Vec::new() }));
+    assert_eq!(why_lost(&link), "the connection has panicked");
+    let _answers = broker(&listener, &[0, 0, 0]);
+    assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::Connected(_)));
+}
+
+/// It says that one came: the master sees it in the state.
+#[test]
+fn a_message_that_cannot_be_held_ends_the_connection_and_is_told_of() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let link = link(&listener, Box::new(Vec::new));
+    let mut broker = broker(&listener, &[0, 0, 0]);
+    assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::Connected(_)));
+    // The head of a message of 16 MiB and one byte: nothing of it is read.
+    broker.write_all(&[0x30, 0x81, 0x80, 0x80, 0x08]).unwrap();
+    assert!(matches!(link.heard.recv_timeout(PATIENCE).unwrap(), Heard::TooLong(None, 16_777_217)));
+    assert_eq!(why_lost(&link), "a message of 16777217 bytes came: one with more than 16777216 ends the connection");
+}
+
+/// The vehicle does what is set for a broker that is away, and the connection comes back.
+#[test]
+fn behind_a_message_that_cannot_be_held_the_connection_comes_back() {
+    let mut plant = Plant::start("{ do = \"finish-base\", seconds = 60.0, metres = 50.0 }");
+    for (policy, way) in [("finish-base", "a! k!"), ("stop", "k! a!")] {
+        if policy == "stop" {
+            plant.change("do = \"finish-base\", seconds = 60.0, metres = 50.0", "do = \"stop\"");
+        }
+        let (id, end) = (policy, &way[3..4]);
+        plant.order(id, 0, 0, way);
+        plant.wait_for("it drives", |plant| plant.state()["orderId"] == id && plant.state()["driving"] == true);
+        let losses = plant.metric("broker_losses_total");
+        plant.publish_long("order", 17 << 20);
+        plant.wait_for("the connection ends", |plant| plant.metric("broker_losses_total") > losses);
+        plant.wait_for("it is there again, and says why", |plant| {
+            plant.metric("broker") == 1 && plant.metric("refused_total") > 0 && plant.has_error("validationError")
+        });
+        if policy == "stop" {
+            plant.wait_for("it stands", |plant| plant.state()["paused"] == true && plant.has_error("brokerLost"));
+            plant.go_on();
+        } else {
+            assert_eq!(plant.count("stood"), 0);
+        }
+        plant.wait_for_end(id, end);
+    }
 }
 
 /// The master's clock is an hour behind: what it sends is old, and what stops the vehicle counts.
@@ -176,11 +258,7 @@ fn a_log_that_nobody_reads_ends_no_vehicle() {
     drop(reader);
     lose_the_broker(&mut plant);
     // The lines are counted.
-    plant.wait_for("lost lines", |plant| {
-        let text = plant.scrape();
-        let lost = text.lines().find_map(|line| line.strip_prefix("cara_vda5050_log_lost_total "));
-        lost.is_some_and(|lost| lost.parse::<u64>().unwrap() > 0)
-    });
+    plant.wait_for("lost lines", |plant| plant.metric("log_lost_total") > 0);
 }
 
 #[test]
