@@ -83,19 +83,22 @@ fn main() -> Result<ExitCode> {
         let listener = TcpListener::bind(address).with_context(|| format!("cannot serve metrics at {address}"))?;
         let (unit, seen) = (system.downgrade(), seen.clone());
         let text = move || metrics::text(&unit.upgrade().map(|unit| unit.metrics()).unwrap_or_default(), &seen);
-        std::thread::Builder::new().name("metrics".into()).spawn(move || metrics::serve(&listener, text))?;
+        let thread = std::thread::Builder::new().name("metrics".into());
+        thread.spawn(move || metrics::serve(&listener, text)).context("cannot start the thread of metrics")?;
     }
     // No line of the log holds a vehicle up from here on.
-    let _log = log::start()?;
+    let _log = log::start().context("cannot start the thread of the log")?;
     let clients = config.vehicle.iter().zip(&seen);
     let clients = clients.map(|(vehicle, seen)| (config.broker.of(vehicle), seen.expiry.clone())).collect();
-    tls::watch(clients)?;
+    tls::watch(clients).context("cannot start the thread that looks at certificates")?;
     let recording = Recording::start(&config)?;
     let is_fenced = std::thread::scope(|scope| -> Result<bool> {
         let _ends = EndsAll;
         for (vehicle, seen) in config.vehicle.iter().zip(&seen) {
             let (config, system, recording) = (&config, &system, &recording);
-            std::thread::Builder::new().name(vehicle.serial_number.clone()).spawn_scoped(scope, move || {
+            let serial_number = &vehicle.serial_number;
+            let thread = std::thread::Builder::new().name(serial_number.clone());
+            let started = thread.spawn_scoped(scope, move || {
                 // What ends one vehicle's loop is no reason to stop the others: it stops by its lease, and is begun anew.
                 while !END.is_due.load(Ordering::SeqCst) {
                     seen.turns.fetch_add(1, Ordering::Relaxed);
@@ -108,9 +111,10 @@ fn main() -> Result<ExitCode> {
                     }
                     std::thread::sleep(BEGUN_ANEW);
                 }
-            })?;
+            });
+            started.with_context(|| format!("cannot start the thread of vehicle {serial_number}"))?;
         }
-        tell(seen.clone())?;
+        tell(seen.clone()).context("cannot start the thread of the watchdog")?;
         // Whether anybody reads it or not.
         let _ = writeln!(stdout(), "up with {} vehicles", config.vehicle.len());
         while !END.is_due.load(Ordering::SeqCst) {

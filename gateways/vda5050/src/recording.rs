@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use cara_recording::{Limits, Recorder, StartError};
 
 use crate::config::Config;
@@ -66,7 +66,8 @@ impl Recording {
                 let _ = own.recorder.set(recorder);
             }
         };
-        std::thread::Builder::new().name("recording".into()).spawn(open)?;
+        let thread = std::thread::Builder::new().name("recording".into());
+        thread.spawn(open).context("cannot start the thread of the recording")?;
         Ok(Self(Some(shared)))
     }
 
