@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use cara_processes::network;
 use cara_vda5050::config::Config;
-use cara_vda5050::message::{ActionParameter, Connection, ConnectionState, Header, write};
+use cara_vda5050::message::{ActionParameter, Connection, ConnectionState, Header, Order, write};
 use cara_vda5050::vehicle::LEASE_MS;
 use cara_vda5050::version::Version;
 use fake::{instant, order};
@@ -148,6 +148,31 @@ fn a_vehicle_drives_through_and_carries_something() {
     plant.wait_for("it has picked", |plant| plant.action("o1-l22n-pick") == "FINISHED");
     assert_eq!(plant.state()["loads"][0]["loadId"], "pallet-7");
     assert_eq!([plant.count("passed"), plant.count("arrived")], [10, 1]);
+    check_messages(&plant);
+}
+
+/// One of the warehouse, which refuses a cell that is not beside the one before: what it drives goes on, to its end.
+#[test]
+fn a_vehicle_that_refuses_an_update_drives_to_the_end_of_its_base() {
+    let plant = Plant::on_floor(1, &["3,4".into()], "{ do = \"stop\" }", "2.1.0", |_| Default::default());
+    let place = |mut order: Order| {
+        for node in &mut order.nodes {
+            let x = node.node_id.bytes().next().map_or(0, |name| 3 + name - b'a');
+            let at = node.node_position.as_mut().unwrap();
+            (at.x, at.y) = (if node.node_id == "d" { 20.0 } else { f64::from(x) }, 4.0);
+        }
+        plant.publish("order", false, &order);
+    };
+    place(order("o1", 0, 0, "a! b! c!"));
+    plant.wait_for("it drives", |plant| plant.state()["driving"] == true);
+    place(order("o1", 1, 4, "c! d!"));
+    plant.wait_for("the master hears of it", |plant| plant.has_error("orderError"));
+    plant.wait_for("it stands at c", |plant| plant.state()["lastNodeId"] == "c" && plant.has_error("driveRefused"));
+    assert_eq!([plant.count("stood"), plant.count("arrived c")], [0, 1], "{:?}", plant.vehicle.lines());
+    plant.instant("cancelOrder", "c1");
+    plant.wait_for("it is cancelled", |plant| plant.action("c1") == "FINISHED");
+    place(order("o2", 0, 0, "c! b!"));
+    plant.wait_for_end("o2", "b");
     check_messages(&plant);
 }
 
@@ -513,14 +538,7 @@ fn a_network_that_loses_everything_stops_the_vehicle() {
     ] {
         let mut plant = Plant::start(policy);
         let (port, holds) = black_hole(plant.port);
-        plant.kill_gateway();
-        let text = std::fs::read_to_string(plant.file()).unwrap();
-        let proxied = text.replace(&format!("port = {}\n", plant.port), &format!("port = {port}\n"));
-        assert_ne!(text, proxied);
-        std::fs::write(plant.file(), proxied).unwrap();
-        plant.heard.lock().unwrap().clear();
-        plant.start_gateway();
-        plant.wait_for("ONLINE", |plant| plant.connection() == "ONLINE" && plant.state() != Value::Null);
+        plant.change(&format!("port = {}\n", plant.port), &format!("port = {port}\n"));
         plant.order("o1", 0, 0, "a! k!");
         plant.vehicle.wait_for("drive 1 k");
         let lost = Instant::now();
