@@ -80,6 +80,10 @@ pub struct Broker {
     /// Milliseconds between probes: messages of each vehicle to its own topic `cara-probe` and back. 0 sends none.
     #[serde(default = "probe")]
     pub probe: u64,
+    /// Probes go over topic `instantActions` instead, as messages without an action: so that the broker counts as away if it sends no
+    /// stop. The client has to be allowed to publish there.
+    #[serde(default)]
+    pub probe_stops: bool,
     /// Milliseconds without a probe coming back after which the broker counts as away.
     #[serde(default = "probe_timeout")]
     pub probe_timeout: u64,
@@ -254,6 +258,7 @@ impl Config {
         );
         ensure!(broker.keep_alive >= 5, "keep_alive is 5 s at least");
         ensure!(broker.probe == 0 || broker.probe_timeout > broker.probe, "probe_timeout is longer than probe");
+        ensure!(broker.probe > 0 || !broker.probe_stops, "probe_stops needs probe");
         ensure!(
             broker.certificate_file.is_some() == broker.key_file.is_some(),
             "a certificate and its key go together"

@@ -18,7 +18,7 @@ use crate::machine::at_once::is_stop;
 use crate::machine::{ERRORS, Machine, Topic};
 use crate::message::{
     BatteryState, Connection, ConnectionState, Factsheet, Header, InstantActions, Order, Report, Responses, State,
-    Visualization, ZoneSetMessage, read, write,
+    Visualization, ZoneSetMessage, probe, read, sent_probe, write,
 };
 use crate::metrics::Seen;
 use crate::mqtt::{HEARD, Heard, LARGEST, Link, Place};
@@ -162,7 +162,7 @@ impl Gateway {
             write(shared.version(), &Connection { header, connection_state: ConnectionState::Broken })
         };
         let client_id = format!("{}-{}", config.vda5050.manufacturer, vehicle.serial_number);
-        let probes: &[_] = if config.broker.probe > 0 { &["cara-probe"] } else { &[] };
+        let probes: &[_] = if config.broker.probe > 0 && !config.broker.probe_stops { &["cara-probe"] } else { &[] };
         let link = Link::start(Place {
             broker: config.broker.clone(),
             client_id,
@@ -307,9 +307,12 @@ impl Gateway {
                     },
                     Err(refusal) => self.refuse(&refusal),
                 },
-                "instantActions" => match self.checked("instantActions", is_retained, &bytes) {
-                    Ok(message) => self.at_once(message),
-                    Err(refusal) => self.refuse(&refusal),
+                "instantActions" => match self.own_probe(&bytes) {
+                    None => match self.checked("instantActions", is_retained, &bytes) {
+                        Ok(message) => self.at_once(message),
+                        Err(refusal) => self.refuse(&refusal),
+                    },
+                    sent => self.hear_probe(sent),
                 },
                 "zoneSet" => match self.checked("zoneSet", is_retained, &bytes) {
                     Ok(message) => self.refuse(&unwanted_zones(&message)),
@@ -320,7 +323,7 @@ impl Gateway {
                     Err(refusal) => self.refuse(&refusal),
                 },
                 "connection" => self.hear_connection(&bytes),
-                _ => self.hear_probe(&bytes),
+                _ => self.hear_probe(std::str::from_utf8(&bytes).ok().and_then(|text| text.parse().ok())),
             },
             Heard::TooLong(topic, bytes) => {
                 self.seen.received.fetch_add(1, Ordering::Relaxed);
@@ -406,10 +409,15 @@ impl Gateway {
     }
 
     /// A probe says when it was sent: one that was held up proves nothing of now, nor do messages behind it.
-    fn hear_probe(&mut self, bytes: &[u8]) {
-        let sent = std::str::from_utf8(bytes).ok().and_then(|text| text.parse().ok()).map(Duration::from_millis);
-        let sent = sent.filter(|sent| *sent <= self.began.elapsed()).map(|sent| self.began + sent);
+    fn hear_probe(&mut self, sent: Option<u64>) {
+        let sent =
+            sent.map(Duration::from_millis).filter(|sent| *sent <= self.began.elapsed()).map(|sent| self.began + sent);
         self.probed[1] = sent.map_or(self.probed[1], |sent| sent.max(self.probed[1]));
+    }
+
+    /// When it was sent, if this is a probe that goes the way of what stops the vehicle.
+    fn own_probe(&self, bytes: &[u8]) -> Option<u64> {
+        sent_probe(bytes).filter(|_| self.config.broker.probe_stops)
     }
 
     /// Sends probes, and takes a broker that does not return them for one that is away.
@@ -421,8 +429,12 @@ impl Gateway {
         }
         if self.probed[0].elapsed() >= every {
             self.probed[0] = Instant::now();
-            let sent = self.began.elapsed().as_millis().to_string();
-            let _ = client.try_publish(format!("{}/cara-probe", self.prefix), QoS::AtMostOnce, false, sent);
+            let sent = self.began.elapsed().as_millis();
+            let (topic, text) = match self.config.broker.probe_stops {
+                true => ("instantActions", probe(&header(&self.config, &self.serial_number, 0), sent)),
+                false => ("cara-probe", sent.to_string().into_bytes()),
+            };
+            let _ = client.try_publish(format!("{}/{topic}", self.prefix), QoS::AtMostOnce, false, text);
         }
         let answers = self.probed[1].elapsed() < Duration::from_millis(self.config.broker.probe_timeout);
         if !answers && self.is_broker_there {

@@ -231,6 +231,27 @@ impl ActionStatus {
 /// The most bytes of a text in a message, but for the values of an action's parameters.
 const TEXT_BYTES: usize = 1_024;
 
+/// What a probe of topic `instantActions` begins with: it is an instant action message of nothing with one more member.
+pub const PROBE: &[u8] = b"{\"caraProbe\":";
+
+/// A probe that was sent so many milliseconds after the start.
+pub fn probe(header: &Header, sent: u128) -> Vec<u8> {
+    let header = serde_json::to_string(header).unwrap_or_default();
+    [PROBE, format!("{sent},\"actions\":[],{}", header.trim_start_matches('{')).as_bytes()].concat()
+}
+
+/// When a probe was sent. One with an action is none.
+pub fn sent_probe(bytes: &[u8]) -> Option<u64> {
+    #[derive(Deserialize)]
+    #[serde(rename_all = "camelCase")]
+    struct Probe {
+        cara_probe: u64,
+        actions: [(); 0],
+    }
+    let Probe { cara_probe, actions: [] } = bytes.starts_with(PROBE).then(|| serde_json::from_slice(bytes).ok())??;
+    Some(cara_probe)
+}
+
 /// Reads a message of a version, with the names that 2.0's schemas have instead of the document's. Texts of it are kept and reported:
 /// their length is bounded.
 pub fn read<T: DeserializeOwned>(version: Version, text: &[u8]) -> Result<T, serde_json::Error> {

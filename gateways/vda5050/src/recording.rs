@@ -12,6 +12,7 @@ use cara_recording::{Limits, Recorder, StartError};
 
 use crate::config::Config;
 use crate::log;
+use crate::message;
 
 /// What is recorded can be read after this time.
 const CHUNK: Duration = Duration::from_secs(1);
@@ -73,7 +74,8 @@ impl Recording {
 
     /// Records a message. Never waits: what finds no place is counted.
     pub fn take(&self, is_sent: bool, topic: &str, is_retained: bool, payload: &[u8]) {
-        let Some(shared) = self.0.as_ref().filter(|_| !topic.ends_with(PROBE)) else { return };
+        let is_probe = topic.ends_with(PROBE) || payload.starts_with(message::PROBE);
+        let Some(shared) = self.0.as_ref().filter(|_| !is_probe) else { return };
         match shared.recorder.get() {
             Some(recorder) => recorder.take_mqtt(is_sent, topic, is_retained, payload),
             None => drop(shared.missed.fetch_add(1, Ordering::Relaxed)),

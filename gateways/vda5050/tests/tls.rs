@@ -6,6 +6,7 @@ mod plant;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
+use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use cara_vda5050::config::Broker;
@@ -235,5 +236,37 @@ fn within(what: &str, mut is_so: impl FnMut() -> bool) {
     while !is_so() {
         assert!(Instant::now() < end, "{what}");
         std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// mosquitto takes a subscription for which its access list has no line, and sends nothing: with `probe_stops` that is noticed.
+#[test]
+fn a_broker_that_sends_no_stop_is_noticed_where_probes_go_the_same_way() {
+    for (rights, is_there) in [("readwrite", true), ("read", false), ("write", false)] {
+        let tls = free_port();
+        let plant = Plant::with("{ do = \"stop\" }", "2.1.0", |folder| {
+            let (broker, gateway) = secured(folder, tls, 400);
+            let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("example-acl");
+            let text = std::fs::read_to_string(&example).unwrap();
+            let own = "pattern read uagv/v2/KIT/%u/instantActions";
+            assert!(text.contains(own));
+            std::fs::write(folder.join("acl"), text.replace(own, &own.replace("read", rights))).unwrap();
+            let broker = broker.replace(&example.display().to_string(), &folder.join("acl").display().to_string());
+            (broker, format!("{gateway}\nprobe_stops = true"))
+        });
+        // A vehicle that no stop reaches does not begin to drive, or stands within the time of a probe.
+        if !is_there {
+            plant.wait_for("the broker counts as away", |plant| plant.metric("broker_losses_total") > 0);
+        }
+        for _ in 0..4 {
+            sleep(Duration::from_millis(700));
+            assert_eq!(plant.metric("broker") == 1, is_there, "{rights}");
+        }
+        plant.order("o1", 0, 0, "a! b!");
+        match is_there {
+            true => plant.wait_for_end("o1", "b"),
+            false => plant.wait_for("it is refused", |plant| plant.has_error("validationError")),
+        }
+        assert_eq!(plant.count("drive "), usize::from(is_there), "{rights}");
     }
 }
