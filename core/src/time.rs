@@ -125,3 +125,43 @@ impl From<Duration> for core::time::Duration {
         Self::from_micros(span.0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::arithmetic_side_effects)]
+    use super::*;
+
+    #[test]
+    fn what_does_not_fit_into_a_request_is_the_longest_that_does() {
+        let longest = u64::from(u32::MAX);
+        let encoded = [0, 1, longest - 1, longest, longest + 1, u64::MAX].map(|it| Duration::from_micros(it).as_wire());
+        assert_eq!(encoded, [0, 1, u32::MAX - 1, u32::MAX, u32::MAX, u32::MAX]);
+    }
+
+    #[test]
+    fn spans_are_those_of_the_standard_library_and_end_at_the_longest() {
+        let span = Duration::from_millis(2_500);
+        assert_eq!(
+            (span.as_micros(), span.as_millis(), span.times(3)),
+            (2_500_000, 2_500, Duration::from_micros(7_500_000))
+        );
+        assert_eq!((span.divided_by(4), span.divided_by(0)), (Duration::from_micros(625_000), span));
+        assert_eq!(Duration::from(core::time::Duration::from_micros(2_500_000)), span);
+        assert_eq!(core::time::Duration::from(span), core::time::Duration::from_micros(2_500_000));
+        assert_eq!(Duration::from(core::time::Duration::MAX), Duration::MAX);
+        assert_eq!(Duration::from_secs(u64::MAX).times(2) + span, Duration::MAX);
+    }
+
+    #[test]
+    fn nothing_is_before_the_start_or_shorter_than_nothing() {
+        let (early, late) = (Instant::from_micros(1_000), Instant::from_micros(3_500));
+        let between = Duration::from_micros(2_500);
+        assert_eq!((late.since(early), early.since(late)), (between, Duration::ZERO));
+        assert_eq!((early + between, late - between, early - between), (late, early, Instant::START));
+        assert_eq!(
+            (between - Duration::from_millis(1), Duration::from_millis(1) - between),
+            (Duration::from_micros(1_500), Duration::ZERO)
+        );
+        assert_eq!(late + Duration::MAX, Instant::FAR_FUTURE);
+    }
+}

@@ -97,9 +97,58 @@ pub struct StoredClaim {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use proptest::prelude::*;
+    use std::format;
 
     use super::*;
+    use crate::host::secure::Plain;
+
+    /// Has a key with one manager. A code is the end of what it stands for: another claim has another one.
+    struct Keyed(Identity);
+
+    impl Authenticator for Keyed {
+        fn mode(&self) -> Mode {
+            Mode::Secured
+        }
+
+        fn sign_for_fleet(&self, _: &[u8]) -> [u8; CODE_BYTES] {
+            [0; CODE_BYTES]
+        }
+
+        fn is_of_fleet(&self, _: &[u8], _: &[u8; CODE_BYTES]) -> bool {
+            false
+        }
+
+        fn sign_for(&self, peer: &Identity, datagram: &[u8]) -> Option<[u8; CODE_BYTES]> {
+            datagram.last_chunk().filter(|_| *peer == self.0).copied()
+        }
+
+        fn is_of(&self, peer: &Identity, datagram: &[u8], code: &[u8; CODE_BYTES]) -> bool {
+            self.sign_for(peer, datagram) == Some(*code)
+        }
+    }
+
+    #[test]
+    fn a_tag_is_of_one_claim_and_of_one_key() {
+        let [own, other] = [1, 2].map(|id| Identity::m_unit("manager", id).unwrap());
+        let keyed = Keyed(own.clone());
+        let claim = Claim { term: 5, claimant: 9 };
+        let tagged = claim.tagged(&own, &keyed).unwrap();
+        assert!(tagged.claim == claim && tagged.is_genuine(&own, &keyed) && !tagged.is_genuine(&other, &keyed));
+        for claim in [Claim { term: 6, ..claim }, Claim { claimant: 8, ..claim }] {
+            assert!(!TaggedClaim { claim, ..tagged }.is_genuine(&own, &keyed), "{claim}");
+        }
+        assert_eq!(claim.tagged(&other, &keyed), None, "there is no key");
+        let plain = claim.tagged(&own, &Plain).unwrap();
+        assert!(plain == TaggedClaim { claim, tag: [0; CODE_BYTES] } && plain.is_genuine(&own, &Plain));
+        assert!(!plain.is_genuine(&own, &keyed), "a claim of plain mode counts in plain mode only");
+    }
+
+    #[test]
+    fn a_claim_is_shown_by_its_term_and_what_tells_its_claimant_from_others() {
+        assert_eq!(format!("{}", Claim { term: 12, claimant: 0x00ab_0000_0000_0001 }), "12.00ab");
+    }
 
     proptest! {
         #[test]

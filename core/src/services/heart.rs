@@ -161,5 +161,18 @@ mod tests {
         let heart = heart();
         heart.beat(at(500));
         assert_eq!(age(heart, 490), Some(1));
+        heart.beat(at(100_001));
+        assert_eq!(age(heart, 40_001), Some(1), "by the most that is allowed");
+        assert!(age(heart, 40_000) > Some(60_000), "by more");
+    }
+
+    #[test]
+    fn a_loop_that_has_hung_for_weeks_has_no_new_beat() {
+        let heart = heart();
+        heart.beat(at(1_000));
+        for days in [1, 24, 25, 26, 40, 49] {
+            let hung = days * 86_400_000;
+            assert!(age(heart, 1_000 + hung) >= Some(hung), "{days}");
+        }
     }
 }

@@ -235,6 +235,68 @@ fn a_live_order_gives_way_to_its_own_caller_or_to_a_take_over() {
     }
 }
 
+#[test]
+fn the_claim_of_an_order_is_reported_whole() {
+    for (term, claimant) in [(1 << 32 | 5, 0xfedc_ba98_7654_3210), (7, 1), (u64::MAX, 1 << 32)] {
+        let (under, made) = (claim::Claim { term, claimant }, at(1_000_000));
+        let claim =
+            Claim { holder: 7, replaces: None, takes_over: false, operator: true, link: 3, call: 9, under, made };
+        let lease = Lease::new();
+        lease.claim(made, at(1_500_000), &claim).unwrap();
+        let last = LastOrder { holder: 7, link: 3, call: 9, claim: under, end: None };
+        assert_eq!(lease.state(), ActuatorState { latch: None, last: Some(last) });
+    }
+}
+
+#[test]
+fn what_is_cut_without_a_ramp_is_dead_before_the_unit_looks() {
+    let lease = Lease::new();
+    lease.cut(lease.begin(at(1_000_000), at(1_501_000)).unwrap());
+    assert_eq!(stages(&lease, &[1_000, 1_100, 1_501, 1_502]), [Stage::Dead; 4]);
+    let (lease, order) = on_a_ramp();
+    lease.cut(order);
+    assert_eq!(stages(&lease, &[1_100, 1_800, 1_802]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+}
+
+#[test]
+fn a_renewal_that_comes_too_late_prolongs_no_ramp() {
+    let (lease, order) = on_a_ramp();
+    lease.cut(order);
+    assert!(!lease.renew(order, at(3_000_000)));
+    assert_eq!(stages(&lease, &[1_802, 2_900]), [Stage::Dead; 2]);
+    let (lease, order) = on_a_ramp();
+    lease.inhibit(at(1_100_000), Latch { by: 0, reason: 1 });
+    assert!(!lease.renew(order, at(3_000_000)) && lease.left(at(1_100_000)) == Some(Duration::from_millis(401)));
+}
+
+#[test]
+fn an_unused_lease_is_on_no_ramp_when_its_clock_starts() {
+    let lease = Lease::new();
+    lease.set_ramp(Duration::from_millis(300));
+    assert_eq!(stages(&lease, &[0, 1, 299]), [Stage::Dead; 3]);
+    assert!(lease.begin(at(1_000), at(501_000)).is_some());
+}
+
+#[test]
+fn no_order_begins_on_a_lease_that_is_stopped() {
+    let lease = Lease::new();
+    lease.inhibit(at(1_000_000), Latch { by: 0, reason: 1 });
+    assert!(lease.begin(at(1_100_000), at(1_500_000)).is_none());
+    lease.reset(at(1_200_000), at(1_200_000));
+    assert!(lease.begin(at(1_200_000), at(1_500_000)).is_some());
+}
+
+#[test]
+fn a_stop_is_seen_behind_however_many_orders() {
+    for before in [0, 1, 1 << 30, 1 << 31] {
+        let lease = Lease::new();
+        lease.order.store(before, Ordering::Release);
+        let changes = lease.changes();
+        lease.inhibit(at(1_000), Latch { by: 0, reason: 1 });
+        assert_ne!(lease.changes(), changes, "{before}");
+    }
+}
+
 /// Steps with a lease. The number is how far the reader's clock advances in between.
 #[derive(Clone, Copy, Debug)]
 enum Step {
