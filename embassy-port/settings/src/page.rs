@@ -12,6 +12,7 @@
 //!
 //! A board keeps two copies in pages that are erased separately. [`newest`] takes the sound one with the higher
 //! generation; [`replaced`] tells which one to write next, so that the newest sound copy is never the one being erased.
+//! `cara provision` writes both, one after the other: keys of before would count again where the newer copy is damaged.
 //!
 //! A copy that cannot be used may be one whose writing was cut off, or the newest one with a bit that has changed. So the other
 //! one counts, which may be older, unless it is for plain mode: nobody takes a board's keys away by damaging them.

@@ -219,12 +219,47 @@ fn the_board_on_the_probe_is_told_and_started_again() {
         done(path, &reported("nucleo-f767zi", &["--fleet", fleet]));
     }
     let held = pages.map(|page| decode(&fs::read(page).unwrap()).unwrap());
-    assert_eq!(held.each_ref().map(|(settings, _)| settings.fleet), [Fleet(3), Fleet(2)]);
-    assert_eq!(held.map(|(_, generation)| generation), [3, 2]);
+    assert_eq!(held.each_ref().map(|(settings, _)| settings.fleet), [Fleet(3), Fleet(3)]);
+    assert_eq!(held.map(|(_, generation)| generation), [5, 6]);
     let asked = fs::read_to_string(path.join("asked")).unwrap();
     assert!(asked.lines().all(|line| line.contains("--chip STM32F767ZITx")), "{asked}");
     assert!(asked.contains("download --chip STM32F767ZITx --binary-format bin --base-address 0x8180000"), "{asked}");
     assert!(asked.ends_with("reset --chip STM32F767ZITx\n"), "{asked}");
+    // Wherever that is cut, the board has a sound copy.
+    let written: Vec<_> =
+        asked.lines().filter(|line| line.starts_with("download")).map(|line| line.contains("0x8180000")).collect();
+    assert_eq!(written, [true, false].repeat(fleets.len()), "the older one first: {asked}");
+}
+
+/// Keys that were revoked, or those with a manager of before, do not count again when a bit of the newest copy changes.
+#[test]
+fn no_older_keys_are_left_on_the_board() {
+    let folder = with_probe();
+    let path = folder.path();
+    let (mut store, keys) = with_keys(path);
+    let pages = ["page-0x8180000", "page-0x81c0000"].map(|page| path.join(page));
+    pages.iter().for_each(|page| fs::write(page, [0xFF; BYTES]).unwrap());
+    let provision = || done(path, &["nucleo-f767zi", "--keys", &keys]);
+    let held = |page: &Path| held(page).1.discoveries().map(|(number, _)| number).collect::<Vec<_>>();
+    provision();
+    assert_eq!(pages.each_ref().map(|page| held(page)), [[1], [1]]);
+    store.keys_mut().rotate().unwrap();
+    store.save().unwrap();
+    provision();
+    assert_eq!(pages.each_ref().map(|page| held(page).len()), [2, 2]);
+    // In a file for another programmer there is one copy, and the other is named.
+    let [first, second] = ["page-0x8180000", "page-0x81c0000"];
+    let previous = |first, second, more: &[&'static str]| {
+        done(path, &[&["rp2040", "--keys", &keys, "--output", "next", "--previous", first, second], more].concat())
+    };
+    let said = previous(first, second, &[]);
+    assert!(said.contains("erase the page at 0x101ff000"), "{said}");
+    fs::write(path.join("blank"), [0xFF; BYTES]).unwrap();
+    let said = previous("blank", second, &[]);
+    assert!(said.contains("erase the page at 0x101ff000"), "{said}");
+    assert!(!previous("blank", "blank", &[]).contains("erase"));
+    let said = previous(first, second, &["--uf2"]);
+    assert!(!said.contains("erase") && said.matches("settings and keys").count() == 2, "{said}");
 }
 
 /// An STM32H7 cannot read what it was writing when its power was cut.

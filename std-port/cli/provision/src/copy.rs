@@ -3,7 +3,7 @@
 use cara_settings::Settings;
 use cara_settings::board::Board;
 use cara_settings::keys::kept;
-use cara_settings::page::{BYTES, Copy, encode_with, replaced};
+use cara_settings::page::{BYTES, Copy, PageError, decode, encode_with, replaced};
 use cara_settings::uf2::{PAYLOAD, Place, block};
 use cara_std::keys::Owner;
 use zeroize::Zeroizing;
@@ -32,24 +32,33 @@ pub(super) struct Written {
     pub(super) left: Option<Owner>,
 }
 
-/// The copy that comes after those on the board; it replaces the older one.
-pub(super) fn next(board: &Board, content: &Content, first: &[u8], second: &[u8]) -> anyhow::Result<Written> {
+/// The copies that come after those on the board, to be written one after the other: the first replaces the older one. The other
+/// goes as well, since its keys, which may have been revoked, would count again where the new copy is damaged.
+pub(super) fn next(board: &Board, content: &Content, first: &[u8], second: &[u8]) -> anyhow::Result<[Written; 2]> {
     let [one, two] = board.pages;
     let (copy, generation) = replaced(first, second);
-    let address = match copy {
-        Copy::First => one,
-        Copy::Second => two,
+    let (address, other) = match copy {
+        Copy::First => (one, two),
+        Copy::Second => (two, one),
     };
     let held = || kept(&content.settings, first, second).map(Secrets::kept);
     let secrets = content.secrets.clone().or_else(held);
     let left = if secrets.is_none() { owner(first, second) } else { None };
-    Ok(Written { left, ..written(&content.settings, secrets.as_ref(), address, generation)? })
+    let written = |address, generation| written(&content.settings, secrets.as_ref(), address, generation);
+    Ok([Written { left, ..written(address, generation)? }, written(other, generation.wrapping_add(1))?])
+}
+
+/// Whether the page at this address holds something that may be a copy.
+pub(super) fn is_held(board: &Board, pages: &[Zeroizing<Vec<u8>>; 2], address: u32) -> bool {
+    let held = pages.iter().zip(board.pages).find(|(_, at)| *at == address);
+    held.is_some_and(|(page, _)| decode(page) != Err(PageError::Absent))
 }
 
 /// Both copies, for a board with unknown content.
-pub(super) fn both(board: &Board, Content { settings, secrets }: &Content) -> anyhow::Result<Vec<Written>> {
-    let copies = (1..).zip(board.pages);
-    copies.map(|(generation, address)| written(settings, secrets.as_ref(), address, generation)).collect()
+pub(super) fn both(board: &Board, Content { settings, secrets }: &Content) -> anyhow::Result<[Written; 2]> {
+    let [one, two] = board.pages;
+    let written = |address, generation| written(settings, secrets.as_ref(), address, generation);
+    Ok([written(one, 1)?, written(two, 2)?])
 }
 
 fn written(settings: &Settings, secrets: Option<&Secrets>, address: u32, generation: u32) -> anyhow::Result<Written> {

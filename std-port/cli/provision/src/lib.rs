@@ -33,7 +33,7 @@ use self::secrets::Secrets;
 /// Writes a board's identity, manager and network settings to its flash.
 ///
 /// Without --output it goes to the board on this computer's debug probe, through probe-rs, which must be installed; the
-/// board then starts again. The board keeps two copies, and the newest one is never overwritten.
+/// board then starts again. The board keeps two copies: the newest one is overwritten behind the other one.
 #[derive(clap::Args)]
 #[command(after_help = "\
 cara provision nucleo-f767zi --keys ~/.config/cara/keys/agv-17-17-s_unit-7.keys
@@ -52,7 +52,7 @@ pub struct Arguments {
     /// Write a file instead of the board.
     #[arg(long, value_name = "FILE", requires = "board")]
     output: Option<PathBuf>,
-    /// The file is for the drive of a Raspberry Pi chip's boot loader. Unless --previous is given it holds both copies.
+    /// The file is for the drive of a Raspberry Pi chip's boot loader. It holds both copies.
     #[arg(long, requires = "output")]
     uf2: bool,
     /// With --output: what the board's two pages hold now, read from it before.
@@ -113,28 +113,35 @@ fn write_file(
     global: &Global,
 ) -> anyhow::Result<()> {
     let previous = arguments.previous.as_deref().map(|files| pages(files, board)).transpose()?;
-    let written = match (&previous, arguments.uf2) {
-        (Some([first, second]), _) => vec![copy::next(board, content, first, second)?],
+    let both = match &previous {
+        Some([first, second]) => copy::next(board, content, first, second)?,
         // Whatever the pages hold, these are newer than nothing.
-        (None, true) => copy::both(board, content)?,
-        (None, false) => vec![copy::next(board, content, &[], &[])?],
+        None => copy::both(board, content)?,
     };
-    let bytes = match board.uf2.filter(|_| arguments.uf2) {
-        Some(families) => copy::uf2(&written, families.data),
-        None => Zeroizing::new(written.iter().flat_map(|copy| copy.bytes.iter().copied()).collect()),
+    let [next, other] = &both;
+    let (written, bytes) = match board.uf2.filter(|_| arguments.uf2) {
+        Some(families) => (&both[..], copy::uf2(&both, families.data)),
+        None => (core::slice::from_ref(next), next.bytes.clone()),
     };
     let has_keys = written.iter().any(|copy| copy.has_keys);
     let is_secret = has_keys || content.settings.wifi.is_some();
     store(file, &bytes, is_secret)?;
-    report(board, &written, Some(file), content, global)?;
+    report(board, written, Some(file), content, global)?;
     if previous.is_none() && arguments.uf2 && !has_keys && !global.json {
         output::line("keys that the board has are gone with it: give --keys if it is to keep any")?;
     }
-    if previous.is_none() && !arguments.uf2 && !global.json {
-        let [_, second] = board.pages;
-        output::line(format_args!(
+    if arguments.uf2 || global.json {
+        return Ok(());
+    }
+    let second = other.address;
+    match &previous {
+        None => output::line(format_args!(
             "an older copy at {second:#x} would count as newer: erase that page, or give --previous"
-        ))?;
+        ))?,
+        Some(pages) if copy::is_held(board, pages, second) => output::line(format_args!(
+            "behind it, erase the page at {second:#x}: what it holds would count again if the new copy were damaged"
+        ))?,
+        Some(_) => {}
     }
     Ok(())
 }

@@ -16,14 +16,13 @@ use cara_tools::exit::Ended;
 
 const PROGRAM: &str = "probe-rs";
 
-/// Writes the next copy to the board on the probe, and starts the board again.
-///
-/// Where its pages cannot be read, as on an STM32H7 whose power was cut while one was written, both copies are.
-pub(super) fn provision(board: &Board, content: &Content) -> anyhow::Result<Vec<Written>> {
+/// Writes the next copies to the board on the probe, and starts the board again. Its pages may be such as cannot be read, as on an
+/// STM32H7 whose power was cut while one was written.
+pub(super) fn provision(board: &Board, content: &Content) -> anyhow::Result<[Written; 2]> {
     let folder = folder().context("cannot make a folder for the copies")?;
     let [first, second] = board.pages.map(|address| read(board, address, &folder.path().join("read.bin")));
     let written = match (first?, second?) {
-        (Some(first), Some(second)) => vec![copy::next(board, content, &first, &second)?],
+        (Some(first), Some(second)) => copy::next(board, content, &first, &second)?,
         _ => copy::both(board, content)?,
     };
     for copy in &written {
