@@ -287,6 +287,15 @@ fn no_order_begins_on_a_lease_that_is_stopped() {
 }
 
 #[test]
+fn a_hook_is_awaited_from_an_orders_death_to_its_end() {
+    let (lease, order) = on_a_ramp();
+    assert!(!lease.awaits_hook(), "it lives");
+    lease.cut(order);
+    assert!(lease.awaits_hook());
+    assert!(lease.end(at(1_100_000), order, LeaseEnd::Expired) && !lease.awaits_hook(), "its hook runs");
+}
+
+#[test]
 fn a_stop_is_seen_behind_however_many_orders() {
     for before in [0, 1, 1 << 30, 1 << 31] {
         let lease = Lease::new();
