@@ -159,7 +159,8 @@ fn files(options: &Options) -> MapFiles {
     }
 }
 
-/// Of a file, or drawn for a run of some minutes: so many that the vehicles are busy half of the time.
+/// Of a file, or drawn for a run of some minutes: so many that the vehicles are busy half of the time, and half as many in a soak, in
+/// which they are off, stopped or waiting for others besides.
 fn take_orders(options: &Options, files: &MapFiles, map: &Map, span: Duration) -> Result<Vec<Order>> {
     let own = files.map.with_extension("orders");
     let file = match (&options.orders, options.minutes) {
@@ -172,7 +173,8 @@ fn take_orders(options: &Options, files: &MapFiles, map: &Map, span: Duration) -
     }
     // Two legs, each of a third of the sides on average, a second a cell.
     let seconds_each = 2.0 * f64::from(map.width() + map.height()) / 3.0;
-    let count = span.as_secs_f64() / seconds_each * f64::from(options.vehicles) / 2.0;
+    let share = if options.soak.is_some() { 0.25 } else { 0.5 };
+    let count = span.as_secs_f64() / seconds_each * f64::from(options.vehicles) * share;
     let released = span.mul_f64(RELEASED);
     Ok(orders::draw(map, (count as usize).max(1), released, &mut fastrand::Rng::with_seed(options.seed)))
 }
