@@ -104,7 +104,6 @@ mod machine;
 mod mail;
 #[cfg(feature = "net")]
 mod net;
-mod owned;
 mod peer;
 mod port;
 mod publishing;

@@ -72,8 +72,7 @@ impl<T> Runner<T> {
                 Step::Again => self.serve_started(),
                 Step::Idle => true,
             };
-            // A waker that has given way may have been the last of a task, with which something was dropped.
-            if is_through && self.rest(context) && !self.shared.unwanted.is_due() {
+            if is_through && self.rest(context) {
                 return Poll::Pending;
             }
             let machine = &mut *self.shared.machine.borrow_mut();
