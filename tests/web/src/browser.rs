@@ -152,7 +152,9 @@ impl Browser {
         Ok(self.client.find(Locator::Css(selector)).await?.text().await?)
     }
 
+    /// Clicks an element in the middle of the window, where nothing that stays at its edge covers it.
     pub(crate) async fn click(&self, selector: &str) -> Result<()> {
+        self.run(&format!("document.querySelector({})?.scrollIntoView({{block: 'center'}})", json!(selector))).await?;
         let element = self.client.find(Locator::Css(selector)).await.with_context(|| selector.to_owned())?;
         element.click().await.with_context(|| format!("cannot click {selector}"))
     }

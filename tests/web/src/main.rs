@@ -284,10 +284,12 @@ async fn tablet(browser: &Browser) -> Result<()> {
     browser.resize(DESKTOP).await
 }
 
-/// Nothing scrolls sideways, whatever is open.
+/// Nothing scrolls sideways, whatever is open, and the bar covers nothing that is scrolled to.
 async fn widths(browser: &Browser, url: &str) -> Result<()> {
     const OPEN: &str = "document.querySelectorAll('details').forEach((one) => { one.open = true; })";
     const FITS: &str = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
+    const BELOW_BAR: &str = "(document.querySelector('#nodes tr button').scrollIntoView(),
+        document.querySelector('#nodes tr button').getBoundingClientRect().top >= document.querySelector('.bar').getBoundingClientRect().bottom)";
     let narrow = Browser::start_narrow(400).await?;
     narrow.open(url).await?;
     narrow.says("#nodes", "agv-1/11").await?;
@@ -295,12 +297,15 @@ async fn widths(browser: &Browser, url: &str) -> Result<()> {
     narrow.wait("functions are shown", "document.querySelector('#functions summary')").await?;
     narrow.run(OPEN).await?;
     narrow.wait("400 pixels suffice", &format!("innerWidth === 400 && {FITS}")).await?;
+    narrow.wait("a button that is scrolled to is below the bar", BELOW_BAR).await?;
     narrow.close().await?;
     browser.run(&format!("window.were = [...document.querySelectorAll('details[open]')]; {OPEN}")).await?;
     for width in [500, 640, 900, 1080, 1440, 1920] {
         browser.resize((width, 1180)).await?;
         browser.wait(&format!("{width} pixels suffice"), FITS).await?;
+        browser.wait("a button that is scrolled to is below the bar", BELOW_BAR).await?;
     }
+    browser.run("scrollTo(0, 0)").await?;
     browser.run("document.querySelectorAll('details').forEach((one) => { one.open = were.includes(one); })").await?;
     browser.resize(DESKTOP).await
 }
@@ -327,7 +332,6 @@ async fn stop(browser: &Browser) -> Result<()> {
     browser.press('S').await?;
     browser.says("#stop-title", "Stop of all").await?;
     browser.says("#stop-summary", &all).await?;
-    browser.run("document.querySelector('#doctor').scrollIntoView()").await?;
     browser.click("#doctor").await?;
     browser.says("#doctor-about", "looked").await?;
     browser.wait("the doctor's findings are shown", "document.querySelector('#findings li')").await

@@ -55,6 +55,11 @@ const makeWay = () => connection.abort(Object.assign(new Error("a stop needs the
 pages.onmessage = makeWay;
 const stopAll = (what) => stop.all(what, () => { pages.postMessage(what); makeWay(); });
 
+// What is scrolled to, by the keyboard too, comes to stand below the bar and not under it.
+const barHeight = new ResizeObserver(([bar]) => {
+  document.documentElement.style.scrollPaddingTop = `${bar.target.offsetHeight}px`;
+});
+
 async function prepare() {
   for (;;) await wait(await stop.prepare() ? PREPARE : RETRY);
 }
@@ -174,6 +179,7 @@ async function survey(about, path, seconds) {
 
 api.token();
 theme();
+barHeight.observe(document.querySelector(".bar"));
 map.start(nodes.choose);
 $("theme").onclick = nextTheme;
 $("stop-all").onclick = () => stopAll("stop");
