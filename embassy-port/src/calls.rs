@@ -18,7 +18,8 @@ use embassy_time::Timer;
 use crate::details;
 use crate::handle::Handle;
 use crate::link::InFlight;
-use crate::machine::{Dropped, Machine};
+use crate::machine::Machine;
+use crate::owned::Owned;
 use crate::peer::Peer;
 use crate::port::Board;
 use crate::time::{now, timer};
@@ -191,16 +192,17 @@ impl<T> Caller for Peer<T> {
             pending.give_up();
             return Poll::Ready(Err(Error::Cancelled.into()));
         }
-        let mut machine = self.unit.shared.machine.borrow_mut();
-        let Some(outcome) = machine.outcome(&call, outgoing.parameters, cx.waker()) else { return Poll::Pending };
+        let outcome = self.unit.lend(|machine| {
+            let outcome = machine.outcome(&call, outgoing.parameters, cx.waker())?;
+            Some(outcome.map_err(|error| machine.failed(&call, error)))
+        });
+        let Some(outcome) = outcome else { return Poll::Pending };
         Poll::Ready(match outcome {
             Ok(()) => {
                 pending.stage = Stage::Over;
                 Ok(call)
             }
-            Err(error) => {
-                let failed = machine.failed(&call, error);
-                drop(machine);
+            Err(failed) => {
                 pending.give_up();
                 Err(failed)
             }
@@ -235,15 +237,12 @@ impl<T> Handle<T> {
     /// Nothing waits for a call any more, and what it started is not wanted. While the machine is in use, it is given up right
     /// behind that.
     fn give_up(&self, call: InFlight) {
+        let (link, call) = (call.link, Owned::made(&call));
         match self.shared.machine.try_borrow_mut() {
-            Ok(mut machine) => machine.give_up(&call),
+            Ok(mut machine) => machine.give_up(link, call),
             Err(_) => {
-                let give_up = |machine: &mut Machine<T>, dropped: &Dropped| {
-                    if let Dropped::Hold(call) = dropped {
-                        machine.give_up(call);
-                    }
-                };
-                self.shared.unwanted.add(give_up, Dropped::Hold(call));
+                self.shared.unwanted.mark(link, call);
+                self.shared.unwanted.made.set(Some(Machine::give_up_marked));
             }
         }
     }
@@ -270,6 +269,7 @@ impl<T> Machine<T> {
         });
         let call = called.unwrap_or(Err(Error::NotConnected))?;
         self.wait(call);
+        self.own(link, Owned::made(&call));
         Ok(call)
     }
 }

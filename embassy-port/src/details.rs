@@ -75,7 +75,7 @@ impl<T> TakenCall<T> {
             if self.is_cancelled() {
                 return Poll::Ready(());
             }
-            self.unit.shared.machine.borrow_mut().wakers.leases.register(cx);
+            self.unit.lend(|machine| machine.wakers.leases.register(cx));
             pin!(timer(self.waited_until())).poll(cx)
         })
         .await;

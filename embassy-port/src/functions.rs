@@ -35,12 +35,13 @@ impl<T> Handle<T> {
         for link in 0..self.links() {
             let Some((serial, reported)) = self.look(|machine| machine.reported(link)) else { continue };
             poll_fn(|cx| {
-                let mut machine = self.shared.machine.borrow_mut();
-                if machine.has_read(link, serial, reported) {
-                    return Poll::Ready(());
-                }
-                machine.wakers.news.register(cx);
-                Poll::Pending
+                self.lend(|machine| {
+                    if machine.has_read(link, serial, reported) {
+                        return Poll::Ready(());
+                    }
+                    machine.wakers.news.register(cx);
+                    Poll::Pending
+                })
             })
             .await;
         }

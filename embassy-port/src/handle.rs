@@ -51,6 +51,16 @@ impl<T> Handle<T> {
         result
     }
 
+    /// Lends the unit to a task that waits. The runner looks again only for what is dropped meanwhile, with a waker that gives way.
+    pub(crate) fn lend<R>(&self, act: impl FnOnce(&mut Machine<T>) -> R) -> R {
+        let mut machine = self.shared.machine.borrow_mut();
+        let result = act(&mut machine);
+        if self.shared.unwanted.is_due() {
+            machine.wake_runner();
+        }
+        result
+    }
+
     pub(crate) fn look<R>(&self, look: impl FnOnce(&Machine<T>) -> R) -> R {
         look(&self.shared.machine.borrow())
     }
@@ -87,7 +97,7 @@ impl<T> Handle<T> {
             if done(self) {
                 return Poll::Ready(());
             }
-            self.shared.machine.borrow_mut().wakers.news.register(cx);
+            self.lend(|machine| machine.wakers.news.register(cx));
             Poll::Pending
         })
         .await;
@@ -109,14 +119,13 @@ impl<T> Handle<T> {
     /// counted in [`Self::events_lost`]. Cancelling loses nothing.
     pub async fn next_event(&self) -> UnitEvent {
         poll_fn(|cx| {
-            let mut machine = self.shared.machine.borrow_mut();
-            match machine.events.take() {
+            self.lend(|machine| match machine.events.take() {
                 Some(event) => Poll::Ready(event),
                 None => {
                     machine.wakers.events.register(cx.waker());
                     Poll::Pending
                 }
-            }
+            })
         })
         .await
     }
@@ -144,7 +153,7 @@ impl<T> Handle<T> {
             if !lease.is_live() {
                 return Poll::Ready(());
             }
-            self.shared.machine.borrow_mut().wakers.leases.register(cx);
+            self.lend(|machine| machine.wakers.leases.register(cx));
             Poll::Pending
         })
         .await;

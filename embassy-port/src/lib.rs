@@ -104,6 +104,7 @@ mod machine;
 mod mail;
 #[cfg(feature = "net")]
 mod net;
+mod owned;
 mod peer;
 mod port;
 mod publishing;

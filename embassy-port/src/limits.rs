@@ -38,7 +38,7 @@ use crate::security::OVERHEAD;
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Connections: one for an s_unit; for an m_unit one more than its nodes, so that it can refuse a node by name. 7,100
+    /// Connections: one for an s_unit; for an m_unit one more than its nodes, so that it can refuse a node by name. 7,300
     /// bytes each, and twice `stream`. While all are in use, a unit that dials is not answered, and tries again.
     pub links: usize,
     /// Longest message received, in bytes of its block of parameters. 1 byte for each buffer, and 4 with `datagram` and
@@ -54,7 +54,7 @@ pub struct Limits {
     pub functions: usize,
     /// Functions kept of each peer's list. 104 bytes each, for each link. Others are skipped, which an event tells.
     pub their_functions: usize,
-    /// Calls in flight to one peer, and calls of one peer that run; one is kept for an emergency. 112 bytes each, for
+    /// Calls in flight to one peer, and calls of one peer that run; one is kept for an emergency. 136 bytes each, for
     /// each link. One more is [`Error::Full`]; one more of the peer's waits.
     pub calls: usize,
     /// Calls of one peer that wait for those that run. They lie in message buffers, of which 2 are left free: with

@@ -1,6 +1,5 @@
 //! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
 
-use cara_core::config::LEASES;
 use cara_core::distribution::claim::{Claim, StoredClaim, TaggedClaim};
 use cara_core::distribution::connection_handler::Command;
 use cara_core::distribution::function_list::FunctionList;
@@ -23,12 +22,13 @@ use crate::config::Table;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::limits::Limits;
-use crate::link::{InFlight, Link};
+use crate::link::Link;
 use crate::mail::{Connection, Mail};
+use crate::owned::{Owned, Places};
 use crate::port::{Board, LinkContext, LinkCounters, LinkSession};
 use crate::replies::ReplyBox;
 use crate::security::Proof;
-use crate::task_slots::{Running, TaskSlot};
+use crate::task_slots::TaskSlot;
 use crate::time::{now, timer};
 
 /// Tasks that are woken for the same thing. Each further one looks every [`LOOK`].
@@ -44,52 +44,58 @@ pub(crate) struct Shared<T: 'static> {
     pub(crate) unwanted: Unwanted<T>,
 }
 
-/// A call that was dropped.
-pub(crate) enum Dropped {
-    /// One of this unit's, which a hold had.
-    Hold(InFlight),
-    /// One of a peer's, which a task had taken.
-    Taken(Running),
-}
-
 /// A pointer, so that the image of a unit that drops no such thing does not contain the function.
-type GiveUp<T> = fn(&mut Machine<T>, &Dropped);
-#[cfg(feature = "streams")]
-type EndReadings<T> = fn(&mut Machine<T>);
+type GiveUp<T> = Cell<Option<fn(&mut Machine<T>)>>;
 
-/// What the machine gives up when it is free: outside of its cell, for what is dropped while it is in use. Executors on the heap
-/// drop a task with its last waker, which the machine may have.
+/// What the machine gives up when it is free: outside of its cell, for what is dropped while it is in use.
 pub(crate) struct Unwanted<T: 'static> {
-    calls: Cell<heapless::Vec<(GiveUp<T>, Dropped), LEASES>>,
+    /// Of each link.
+    places: &'static [Places],
+    /// Gives up this unit's calls that are marked there.
+    pub(crate) made: GiveUp<T>,
+    /// Answers calls of peers that are marked there.
+    pub(crate) taken: GiveUp<T>,
     /// Ends the subscriptions whose cells say that they were dropped.
     #[cfg(feature = "streams")]
-    pub(crate) end_readings: Cell<Option<EndReadings<T>>>,
+    pub(crate) readings: GiveUp<T>,
 }
 
 impl<T> Unwanted<T> {
-    pub(crate) const fn new() -> Self {
+    pub(crate) const fn new(places: &'static [Places]) -> Self {
         Self {
-            calls: Cell::new(heapless::Vec::new()),
+            places,
+            made: Cell::new(None),
+            taken: Cell::new(None),
             #[cfg(feature = "streams")]
-            end_readings: Cell::new(None),
+            readings: Cell::new(None),
         }
     }
 
-    /// At most [`LEASES`] at a time are kept: what another hold has ends with its heart, and who made another call that was taken
-    /// waits until its deadline.
-    pub(crate) fn add(&self, give_up: GiveUp<T>, call: Dropped) {
-        let mut calls = self.calls.take();
-        let _ = calls.push((give_up, call));
-        self.calls.set(calls);
+    fn all(&self) -> impl Iterator<Item = &GiveUp<T>> {
+        #[cfg(feature = "streams")]
+        let all = [&self.made, &self.taken, &self.readings];
+        #[cfg(not(feature = "streams"))]
+        let all = [&self.made, &self.taken];
+        all.into_iter()
+    }
+
+    /// The value of a call was dropped.
+    pub(crate) fn mark(&self, link: u16, call: Owned) {
+        if let Some(places) = self.places.get(usize::from(link)) {
+            places.mark(call);
+        }
+    }
+
+    /// Whether something was dropped.
+    pub(crate) fn is_due(&self) -> bool {
+        self.all().any(|give_up| give_up.get().is_some())
     }
 
     pub(crate) fn release(&self, machine: &mut Machine<T>) {
-        for (give_up, call) in &self.calls.take() {
-            give_up(machine, call);
-        }
-        #[cfg(feature = "streams")]
-        if let Some(end) = self.end_readings.take() {
-            end(machine);
+        for give_up in self.all() {
+            if let Some(give_up) = give_up.take() {
+                give_up(machine);
+            }
         }
     }
 }
@@ -118,6 +124,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
     pub(crate) links: &'static mut [Link],
+    /// Where calls of each link are marked.
+    pub(crate) places: &'static [Places],
     pub(crate) mail: Mail,
     pub(crate) reply: ReplyBox,
     #[cfg(feature = "streams")]

@@ -31,6 +31,7 @@ use crate::link::Link;
 use crate::link::Waiter;
 use crate::machine::{Machine, Shared, Started, Unwanted, Wakers};
 use crate::mail::{self, Carrier, Transport};
+use crate::owned::{FREE, Place, Places};
 use crate::port::Board;
 use crate::replies::ReplyBox;
 use crate::runner::Runner;
@@ -70,6 +71,8 @@ pub struct Resources<
 > {
     shared: MaybeUninit<Shared<T>>,
     links: MaybeUninit<[Link; LINKS]>,
+    marks: MaybeUninit<[[[Place; CALLS]; 2]; LINKS]>,
+    places: MaybeUninit<[Places; LINKS]>,
     mail: mail::Memory<LINKS, STREAM, DATAGRAM>,
     sessions: [SessionMemory<OWN, THEIR, CALLS>; LINKS],
     nodes: MaybeUninit<[[Option<Known<SocketAddrV4>>; KNOWN]; LINKS]>,
@@ -183,6 +186,8 @@ impl<
         Self {
             shared: MaybeUninit::uninit(),
             links: MaybeUninit::uninit(),
+            marks: MaybeUninit::uninit(),
+            places: MaybeUninit::uninit(),
             mail: mail::Memory::new(),
             sessions: [const { SessionMemory::new() }; LINKS],
             nodes: MaybeUninit::uninit(),
@@ -255,6 +260,8 @@ impl<
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
         }
+        let marks = &*self.marks.write([const { [const { [FREE; CALLS] }; 2] }; LINKS]);
+        let places = &*self.places.write(marks.each_ref().map(|marks| Places::new(marks.as_flattened())));
         let machine = Machine {
             hub: Hub {
                 node: node(config.node, storage),
@@ -274,6 +281,7 @@ impl<
             ),
             pool: Pool::new(&mut pool[..]),
             links: self.links.write(self.sessions.each_mut().map(SessionMemory::link)),
+            places,
             mail,
             reply: ReplyBox::new(self.reply.write([0; REPLY])),
             #[cfg(feature = "streams")]
@@ -301,7 +309,7 @@ impl<
         let shared = self.shared.write(Shared {
             machine: RefCell::new(machine),
             state: RefCell::new(state),
-            unwanted: Unwanted::new(),
+            unwanted: Unwanted::new(places),
         });
         // In its place: changed before it is moved there, it would lie on the stack more than once.
         let machine = shared.machine.get_mut();

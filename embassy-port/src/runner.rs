@@ -72,7 +72,8 @@ impl<T> Runner<T> {
                 Step::Again => self.serve_started(),
                 Step::Idle => true,
             };
-            if is_through && self.rest(context) {
+            // A waker that has given way may have been the last of a task, with which something was dropped.
+            if is_through && self.rest(context) && !self.shared.unwanted.is_due() {
                 return Poll::Pending;
             }
             let machine = &mut *self.shared.machine.borrow_mut();

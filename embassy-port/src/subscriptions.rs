@@ -188,7 +188,7 @@ impl<T> Drop for Subscription<T> {
             }
             Err(_) => {
                 self.reading.is_dropped.set(true);
-                self.unit.shared.unwanted.end_readings.set(Some(Machine::end_dropped));
+                self.unit.shared.unwanted.readings.set(Some(Machine::end_dropped));
             }
         }
     }

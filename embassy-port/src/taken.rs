@@ -12,7 +12,8 @@ use core::fmt;
 
 use crate::handle::Handle;
 use crate::lease::LeaseWatch;
-use crate::machine::{Dropped, Machine};
+use crate::machine::Machine;
+use crate::owned::Owned;
 use crate::task_slots::{Holds, Running, TaskSlot, answer};
 use crate::time::{now, timer};
 
@@ -61,7 +62,7 @@ impl<T> Machine<T> {
     }
 
     /// Answers a call whose task has dropped it.
-    fn drop_taken(&mut self, running: &Running) {
+    pub(crate) fn drop_taken(&mut self, running: &Running) {
         self.wake_runner();
         let error = Err(Error::Service(ServiceError::NotReady));
         if !self.answer(running, error) && !self.park(*running, error) {
@@ -157,7 +158,10 @@ impl<T> Machine<T> {
             return Some(Err(error));
         }
         match core::mem::replace(&mut slot.holds, Holds::Nothing) {
-            Holds::Call { running, call, caller, .. } => Some(Ok((running, call, caller))),
+            Holds::Call { running, call, caller, .. } => {
+                self.own(running.link, Owned::taken(&running));
+                Some(Ok((running, call, caller)))
+            }
             _ => None,
         }
     }
@@ -200,14 +204,13 @@ impl<T> Handle<T> {
     /// fit, in which case the caller gets [`ServiceError::NotReady`].
     pub async fn next_call(&self, function: &str, parameters: &mut ParametersView) -> Result<TakenCall<T>, Error> {
         let (running, call, caller) = core::future::poll_fn(|cx| {
-            let mut machine = self.shared.machine.borrow_mut();
-            match machine.take_call(function, parameters) {
+            self.lend(|machine| match machine.take_call(function, parameters) {
                 Some(taken) => core::task::Poll::Ready(taken),
                 None => {
                     machine.wakers.calls.register(cx);
                     core::task::Poll::Pending
                 }
-            }
+            })
         })
         .await?;
         let machine = self.shared.machine.borrow();
@@ -251,12 +254,8 @@ impl<T> Drop for TakenCall<T> {
         match self.unit.shared.machine.try_borrow_mut() {
             Ok(mut machine) => machine.drop_taken(&running),
             Err(_) => {
-                let drop_taken = |machine: &mut Machine<T>, dropped: &Dropped| {
-                    if let Dropped::Taken(running) = dropped {
-                        machine.drop_taken(running);
-                    }
-                };
-                self.unit.shared.unwanted.add(drop_taken, Dropped::Taken(running));
+                self.unit.shared.unwanted.mark(running.link, Owned::taken(&running));
+                self.unit.shared.unwanted.taken.set(Some(Machine::drop_marked));
             }
         }
     }

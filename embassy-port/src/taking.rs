@@ -11,6 +11,7 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::typed::{TypedCall, Variables, failure};
 
 use crate::handler::Served;
+use crate::owned::Owned;
 use crate::taken::TakenCall;
 
 /// As [`TypedCall`], for a function whose method takes the call and returns: `call: &impl LongCall<Left, Blocked, State = Agv>`.
@@ -65,9 +66,13 @@ impl<T: 'static, P: Variables, F: Variables> LongCall<P, F> for Served<T> {
     type State = T;
 
     fn take(&self) -> TypedTaken<T, P, F> {
+        let running = self.running.take();
+        if let Some(running) = &running {
+            self.unit.look(|machine| machine.own(running.link, Owned::taken(running)));
+        }
         let call = TakenCall {
             unit: self.unit,
-            running: self.running.take(),
+            running,
             caller: self.caller.clone(),
             priority: self.priority,
             deadline: self.deadline,

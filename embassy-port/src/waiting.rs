@@ -6,10 +6,12 @@ use cara_core::config::Priority;
 use cara_core::distribution::block;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
+use cara_core::services::requests::CallId;
 use cara_core::time::Instant;
 
 use crate::link::{InFlight, Waiter};
 use crate::machine::Machine;
+use crate::owned::Owned;
 use crate::replies::called;
 
 impl<T> Machine<T> {
@@ -70,15 +72,15 @@ impl<T> Machine<T> {
     }
 
     /// Nothing waits for a call any more, and what it started is not wanted.
-    pub(crate) fn give_up(&mut self, call: &InFlight) {
-        let Some(link) = self.links.get_mut(usize::from(call.link)) else { return };
+    pub(crate) fn give_up(&mut self, index: u16, call: Owned) {
+        let Some(link) = self.link_mut(index) else { return };
         for place in link.places() {
-            place.take_if(|waiter| waiter.call == *call);
+            place.take_if(|waiter| Owned::made(&waiter.call) == call);
         }
         if link.serial == call.serial {
-            self.with(call.link, |session, cx| session.cancel(cx, call.id));
+            self.with(index, |session, cx| session.cancel(cx, CallId(call.id)));
         }
-        let _ = self.reply.take(call);
+        self.reply.held.take_if(|(held, _)| held.link == index && Owned::made(held) == call);
         self.wakers.runner.wake();
     }
 

@@ -64,10 +64,15 @@ pub struct Ticket {
     id: u32,
 }
 
-#[cfg(all(test, feature = "scheduling"))]
 impl Ticket {
-    pub(crate) const fn of(index: u16, id: u32) -> Self {
+    /// The ticket of these [parts](Self::parts), for ports that store it in them.
+    pub const fn of(index: u16, id: u32) -> Self {
         Self { index, id }
+    }
+
+    /// Its place among the running calls of its link, and the caller's id.
+    pub const fn parts(self) -> (u16, u32) {
+        (self.index, self.id)
     }
 }
 

@@ -5,7 +5,7 @@
 
 use super::due::Part;
 use super::wire::{Phase, Wire};
-use super::{Event, RequestOptions};
+use super::{Event, RequestOptions, Session};
 use crate::ability::DETAILS;
 use crate::config::{LEASES, Priority};
 use crate::distribution::function_list::Slot;
@@ -55,6 +55,13 @@ pub(super) struct Calling<P: Port> {
     releases: Releases,
     /// The newest call of a function with a lease.
     pub(super) last_order: Option<(Slot, CallId)>,
+}
+
+impl<P: Port> Session<P> {
+    /// Whether an answered call may hold a lease at the peer, so that [`cancel`](Self::cancel) releases it.
+    pub fn may_hold(&self, call: CallId) -> bool {
+        self.calling.answered.iter().any(|known| known.call == call) || self.calling.holds(call)
+    }
 }
 
 impl<P: Port> Calling<P> {
