@@ -2,6 +2,7 @@
 
 use core::cell::{Cell, RefCell};
 use core::fmt;
+use core::task::Waker;
 
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersInner;
@@ -24,6 +25,8 @@ pub struct SubscriptionInner<B: ?Sized> {
     /// Its subscription was dropped while the machine was in use.
     pub(crate) is_dropped: Cell<bool>,
     pub(crate) state: RefCell<State>,
+    /// The task that waits for values. Apart, since it may end with its waker, and with it another subscription.
+    task: Cell<WakerRegistration>,
     pub(crate) values: RefCell<ParametersInner<B>>,
 }
 
@@ -41,7 +44,6 @@ pub(crate) struct State {
     /// On arrival.
     pub(crate) age: Duration,
     pub(crate) refused: Option<Error>,
-    pub(crate) task: WakerRegistration,
 }
 
 pub(crate) struct Wanted {
@@ -60,12 +62,12 @@ impl<const BYTES: usize> SubscriptionInner<[u8; BYTES]> {
             arrived: Instant::START,
             age: Duration::ZERO,
             refused: None,
-            task: WakerRegistration::new(),
         };
         Self {
             next: Cell::new(None),
             is_dropped: Cell::new(false),
             state: RefCell::new(state),
+            task: Cell::new(WakerRegistration::new()),
             values: RefCell::new(ParametersInner::sized()),
         }
     }
@@ -89,20 +91,27 @@ impl Reading {
     }
 
     pub(crate) fn receive(&self, now: Instant, age: Duration, block: &ReplyBlock<'_>) {
-        let mut values = self.values.borrow_mut();
-        // Each time: the node may have published the stream with other variables.
-        let outcome = values.lay_out(block.signature()).and_then(|()| block.read_into(&mut values));
-        let state = &mut *self.state.borrow_mut();
-        (state.refused, state.is_there) = (outcome.err(), outcome.is_ok());
-        (state.arrived, state.age) = (now, age);
-        state.count = state.count.wrapping_add(1);
-        state.task.wake();
+        {
+            let mut values = self.values.borrow_mut();
+            // Each time: the node may have published the stream with other variables.
+            let outcome = values.lay_out(block.signature()).and_then(|()| block.read_into(&mut values));
+            let state = &mut *self.state.borrow_mut();
+            (state.refused, state.is_there) = (outcome.err(), outcome.is_ok());
+            (state.arrived, state.age) = (now, age);
+            state.count = state.count.wrapping_add(1);
+        }
+        self.task.take().wake();
     }
 
     pub(crate) fn was_answered(&self, answer: Option<Error>) {
-        let mut state = self.state.borrow_mut();
-        state.refused = answer;
-        state.task.wake();
+        self.state.borrow_mut().refused = answer;
+        self.task.take().wake();
+    }
+
+    pub(crate) fn register(&self, waker: &Waker) {
+        let mut task = self.task.take();
+        task.register(waker);
+        self.task.set(task);
     }
 }
 

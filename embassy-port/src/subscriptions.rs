@@ -164,15 +164,18 @@ impl<T> Subscription<T> {
     /// subscription, until its list changes, or the cell is too small.
     pub async fn next(&mut self) -> Result<(), Error> {
         poll_fn(|cx| {
-            let state = &mut *self.reading.state.borrow_mut();
-            if let Some(error) = state.refused {
+            let (refused, count) = {
+                let state = self.reading.state.borrow();
+                (state.refused, state.count)
+            };
+            if let Some(error) = refused {
                 return Poll::Ready(Err(error));
             }
-            if state.count == self.seen {
-                state.task.register(cx.waker());
+            if count == self.seen {
+                self.reading.register(cx.waker());
                 return Poll::Pending;
             }
-            self.seen = state.count;
+            self.seen = count;
             Poll::Ready(Ok(()))
         })
         .await

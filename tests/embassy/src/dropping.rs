@@ -23,8 +23,13 @@ impl Drop for Dropping {
 
 /// The waker of a task with `held` in its frame: the last clone drops it, on this thread. One at a time.
 pub fn dropping(held: impl Any) -> Waker {
-    HELD.with_borrow_mut(|all| all.push(Box::new(held)));
+    hold(held);
     Waker::from(Arc::new(Dropping))
+}
+
+/// Puts more into the frame of that task.
+pub fn hold(held: impl Any) {
+    HELD.with_borrow_mut(|all| all.push(Box::new(held)));
 }
 
 /// Whether what the task has in its frame is still there.

@@ -31,7 +31,7 @@ mod wire;
 pub use bench::{Bench, Board, SOCKETS};
 pub use cara_ethernet::{Fault, FaultCounts, Faults};
 pub use clock::now;
-pub use dropping::{dropping, is_held};
+pub use dropping::{dropping, hold, is_held};
 pub use security::{keys, security};
 pub use values::number;
 pub use wire::{Wire, WireCounts};

@@ -3,7 +3,7 @@
 use std::cell::{Cell, RefCell};
 use std::pin::pin;
 use std::rc::Rc;
-use std::task::Context;
+use std::task::{Context, Waker};
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{Error, Limit};
@@ -12,7 +12,7 @@ use cara_core::time::Duration;
 use cara_embassy::{
     Config, Handle, Limits, Publisher, StreamCell, Subscription, SubscriptionCell, Variables, resources,
 };
-use cara_embassy_host::{Bench, Board, dropping, is_held, keys};
+use cara_embassy_host::{Bench, Board, dropping, hold, is_held, keys};
 
 const LONG: Duration = Duration::from_secs(30);
 const EVERY: Duration = Duration::from_millis(20);
@@ -131,6 +131,52 @@ fn a_subscription_that_is_dropped_while_the_machine_is_in_use_ends_behind_it() {
     let _anew = agv.subscribe("pose", Duration::ZERO, cell).expect("the cell is free");
     pair.publish(1);
     assert!(pair.bench.run_until(|| pair.sent() == 1, LONG), "the stream goes on");
+}
+
+#[test]
+fn a_waker_of_one_subscription_may_end_another_one() {
+    let pair = Pair::met(9);
+    let [mut first, second] = [(); 2].map(|()| pair.subscribe::<64>("pose", Duration::ZERO));
+    let waker = dropping(second);
+    let mut waits = Box::pin(first.next());
+    assert!(waits.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+    drop(waker);
+    assert!(is_held());
+    // The cell has the last waker, which gives way to this one.
+    assert!(waits.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending());
+    assert!(!is_held());
+    drop(waits);
+    pair.publish(1);
+    assert!(pair.bench.run_until(|| newest(&first).is_some(), LONG), "the first one goes on");
+}
+
+/// Looks at the newest value when it is dropped.
+struct Last(Subscription<()>, Rc<Cell<Option<u32>>>);
+
+impl Drop for Last {
+    fn drop(&mut self) {
+        self.1.set(newest(&self.0).map(|(number, _)| number));
+    }
+}
+
+#[test]
+fn a_task_that_ends_with_its_waker_may_look_at_the_value_that_has_come() {
+    let pair = Pair::met(10);
+    let seen = Rc::new(Cell::new(None));
+    let mut last = Last(pair.subscribe::<64>("pose", Duration::ZERO), seen.clone());
+    // The node has answered.
+    pair.bench.run_for(Duration::from_secs(1));
+    let waker = {
+        let mut waits = Box::pin(last.0.next());
+        let waker = dropping(());
+        assert!(waits.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+        waker
+    };
+    hold(last);
+    drop(waker);
+    pair.publish(7);
+    assert!(pair.bench.run_until(|| !is_held(), LONG));
+    assert_eq!(seen.get(), Some(7));
 }
 
 #[test]
