@@ -21,7 +21,7 @@ use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
 use cara_core::services::session::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
 use cara_core::services::stream::{Newest, Source};
-use cara_core::services::{Context, OwnFunctions, Port, slots_for};
+use cara_core::services::{Context, OwnFunctions, Port, Ticket, slots_for};
 use cara_core::storage::{Lent, Pool};
 
 use crate::linkage::{keep, unknown, unknown_slice, unknown_text};
@@ -211,6 +211,7 @@ entry!(session_set, {
 entry!(session_requests, {
     keep(session().request(context(), unknown_text().into(), parameters(), unknown(), *unknown()));
     session().cancel(context(), *unknown());
+    keep((session().may_hold(*unknown()), Ticket::of(*unknown(), *unknown()).parts()));
     session().cancel_but_wait(context(), *unknown());
     keep((
         session().holds(*unknown()),
