@@ -28,6 +28,11 @@ impl Manager<'_> {
             // One that is switched off, or just now, slows down by itself.
             let is_off = |failed: &CallError| matches!(failed.error, Error::NotConnected | Error::Interrupted);
             let asked = outcomes.iter().filter(|(_, outcome)| !outcome.as_ref().is_err_and(is_off)).count();
+            for (vehicle, outcome) in &outcomes {
+                if let Some(failed) = outcome.as_ref().err().filter(|failed| !is_off(failed)) {
+                    println!("not-stopped {} {failed}", vehicle.name());
+                }
+            }
             println!("stopped-all {stopped} {asked} {}", took.as_micros());
         });
     }

@@ -7,7 +7,7 @@ pub mod soak;
 mod stage;
 pub mod truth;
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -34,6 +34,8 @@ const SMALL: u32 = 40;
 const STOPPED: Duration = Duration::from_secs(2);
 /// A vehicle is off for so long.
 const OFF: Duration = Duration::from_secs(3);
+/// A vehicle that was switched off so shortly before, or just on again, need not acknowledge a stop of all.
+const HARDLY_ON: Duration = Duration::from_secs(5);
 /// The manager hangs for so long: leases end, and links do not.
 const FROZEN: Duration = Duration::from_millis(1_200);
 /// The manager is away for so long.
@@ -129,6 +131,8 @@ pub fn run(options: &Options) -> Result<ExitCode> {
         old_manager: None,
         killed: None,
         stopping_all: false,
+        off: HashMap::new(),
+        hardly_on: 0,
         is_alone: false,
         frozen: false,
         looked: Instant::now(),
@@ -194,6 +198,10 @@ struct Run<'m> {
     killed: Option<Instant>,
     /// All are told to stop, and the manager has not said how many have.
     stopping_all: bool,
+    /// When vehicles were last switched off.
+    off: HashMap<String, Instant>,
+    /// Of the vehicles that have not acknowledged the stop of all, those that were hardly on.
+    hardly_on: usize,
     /// Nobody stands by, since one was killed and is not started again yet.
     is_alone: bool,
     /// It hangs.
@@ -304,11 +312,17 @@ impl Run<'_> {
                 self.tally.mended += 1;
                 self.stage.show(&format!("{name} has been mended"));
             }
+            ["not-stopped", name, ..] => {
+                let is_hardly_on = self.off.get(name).is_some_and(|off| off.elapsed() < HARDLY_ON);
+                self.hardly_on += usize::from(is_hardly_on);
+                self.stage.show(&format!("{line}{}", if is_hardly_on { ": it was switched off" } else { "" }));
+            }
             ["stopped-all", stopped, asked, micros] => {
                 let took = Duration::from_micros(micros.parse()?);
+                let asked = asked.parse::<usize>()?.saturating_sub(std::mem::take(&mut self.hardly_on));
                 self.stopping_all = false;
                 self.stage.show(&format!("stop-all: {stopped} of {asked} have stopped"));
-                self.tally.stopped_all.push((stopped.parse()?, asked.parse()?, took));
+                self.tally.stopped_all.push((stopped.parse()?, asked, took));
             }
             ["fenced:", ..] if self.old_manager == Some(number) => {
                 self.old_manager = None;
@@ -402,6 +416,7 @@ impl Run<'_> {
                     Fault::Off => {
                         self.stage.show(&format!("{name} is switched off"));
                         self.stage.notify_vehicle("off", &name)?;
+                        self.off.insert(name.clone(), Instant::now());
                         Some((OFF, Due::SwitchOn(name)))
                     }
                     _ => {
