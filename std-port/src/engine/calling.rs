@@ -30,6 +30,9 @@ use crate::sys::stream::{Received, Wait};
 /// How long a caller waits at a time for room or for its turn, before it looks again.
 pub(super) const PAUSE: Duration = Duration::from_millis(20);
 
+/// What a caller reads at a time, until a read is as long. A program may have hundreds of threads that call, and most replies are short.
+const FIRST_READ_BYTES: usize = 16 * 1024;
+
 thread_local! {
     /// The buffer that a caller reads into. A caller that reads runs no handlers, so a thread uses one at a time.
     static READ_BUFFER: std::cell::RefCell<Vec<u8>> = const { std::cell::RefCell::new(Vec::new()) };
@@ -244,8 +247,7 @@ impl<T: Send + 'static> Engine<T> {
     ) -> (Locked<'l, LinkState>, Instant) {
         READ_BUFFER.with_borrow_mut(|buffer| {
             if buffer.is_empty() {
-                // Zeroed pages of the system, which cost nothing before something is read.
-                *buffer = vec![0; READ_BYTES];
+                *buffer = vec![0; FIRST_READ_BYTES];
             }
             loop {
                 if state.is_paused() {
@@ -269,6 +271,9 @@ impl<T: Send + 'static> Engine<T> {
                 match received {
                     Received::Bytes(count) => {
                         self.take_in(now, link, &mut state, buffer.get_mut(..count).unwrap_or_default(), own);
+                        if count == buffer.len() && count < READ_BYTES {
+                            *buffer = vec![0; READ_BYTES];
+                        }
                     }
                     Received::WouldBlock => {}
                     Received::Closed => state.session.disconnected(CloseReason::Reset),
