@@ -236,6 +236,7 @@ impl<T: Send + 'static> Peer<T> {
     /// How its link is now, while it is connected.
     #[cfg(feature = "control")]
     pub(crate) fn link_info(&self) -> Option<LinkInfo> {
+        let connected = self.cell.connected_for()?;
         let link = self.link().ok()?;
         let mut state = link.lock();
         Some(LinkInfo {
@@ -244,12 +245,7 @@ impl<T: Send + 'static> Peer<T> {
             calls_here: state.session.calls_held(),
             queued_bytes: state.session.bytes_queued(),
             stream_ms: state.session.stream_silent_for(self.engine.now()).as_millis(),
-            datagrams: state.session.hears_datagrams().map(|hears| match (hears, state.session.is_heard()) {
-                (true, true) => DatagramsInfo::Pass,
-                (true, false) => DatagramsInfo::ToUnit,
-                (false, true) => DatagramsInfo::ToNode,
-                (false, false) => DatagramsInfo::None,
-            }),
+            datagrams: datagrams(state.session.hears_datagrams(), state.session.is_heard(), connected),
             segment: link.stream.segment(),
             cipher: state.session.cipher().suite().map(CipherInfo::of),
         })
@@ -475,5 +471,38 @@ impl<T: Send + 'static> Peer<T> {
     /// What happened on its links, the earlier ones included: (name, count), zeros included.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         pairs(self.engine.accounts.of_peer(&self.cell))
+    }
+}
+
+/// A node that has been connected for less may not have reported yet that datagrams arrive there.
+#[cfg(feature = "control")]
+const REPORTED: std::time::Duration = std::time::Duration::from_secs(3);
+
+/// Where datagrams pass, as far as that is known `connected` after the node has joined.
+#[cfg(feature = "control")]
+fn datagrams(hears: Option<bool>, is_heard: bool, connected: std::time::Duration) -> Option<DatagramsInfo> {
+    let is_reported = is_heard || connected >= REPORTED;
+    Some(match (hears?, is_heard) {
+        (true, true) => DatagramsInfo::Pass,
+        (true, false) => DatagramsInfo::ToUnit,
+        (false, true) => DatagramsInfo::ToNode,
+        (false, false) => DatagramsInfo::None,
+    })
+    .filter(|_| is_reported)
+}
+
+#[cfg(all(test, feature = "control"))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_fresh_node_has_not_reported_is_not_known() {
+        let fresh = REPORTED - std::time::Duration::from_millis(1);
+        assert_eq!(datagrams(Some(true), false, fresh), None);
+        assert_eq!(datagrams(Some(false), false, fresh), None);
+        assert_eq!(datagrams(Some(true), true, fresh), Some(DatagramsInfo::Pass));
+        assert_eq!(datagrams(Some(false), true, fresh), Some(DatagramsInfo::ToNode));
+        assert_eq!(datagrams(Some(true), false, REPORTED), Some(DatagramsInfo::ToUnit));
+        assert_eq!(datagrams(None, true, REPORTED), None);
     }
 }

@@ -15,8 +15,6 @@ use std::time::Duration;
 const SETTLED: Duration = Duration::from_secs(10);
 /// And any one for this long, since another one may show itself in its name.
 const WATCHED: Duration = Duration::from_secs(2);
-/// A node that has been connected for less may not have reported yet that datagrams arrive there.
-const REPORTED_MS: u64 = 3_000;
 /// Missed signs of life below which nothing is said.
 const FEW_MISSES: u64 = 3;
 /// Segments of this size or less are used where longer ones do not pass.
@@ -102,8 +100,7 @@ pub(crate) fn clock(unit: &Running, node: &NodeInfo) -> Option<Finding> {
 pub(crate) fn ways(unit: &Running, node: &NodeInfo) -> Vec<Finding> {
     let name = format!("{}/{}", node.name, node.id);
     let (own, address) = (unit.name(), node.address.as_deref().unwrap_or("an unknown address"));
-    let is_known = node.connected_ms.is_none_or(|ms| ms >= REPORTED_MS);
-    let blocked = match node.link.and_then(|link| link.datagrams).filter(|_| is_known) {
+    let blocked = match node.link.and_then(|link| link.datagrams) {
         None | Some(DatagramsInfo::Pass) => None,
         Some(DatagramsInfo::ToUnit) => {
             Some(format!("datagrams of {own} do not arrive at {name} ({address}); those of {name} do here"))
@@ -231,11 +228,6 @@ mod tests {
         assert!(died[0].1.contains("dead 2 times") && !died[0].1.contains("segments"), "{died:?}");
         let short = reported(LinkInfo { segment: Some(524), ..link }, 1);
         assert!(short[0].1.contains("segments of 524 bytes"), "{short:?}");
-        let fresh = &mut seen.running[0].nodes[0];
-        fresh.connected_ms = Some(REPORTED_MS - 1);
-        fresh.link = Some(LinkInfo { datagrams: Some(DatagramsInfo::ToUnit), ..link });
-        seen.running[0].count("agv/7", &[("StreamsDied", 0)]);
-        assert_eq!(ids(&seen), [Id::Connected]);
     }
 
     #[test]
