@@ -73,6 +73,28 @@ pub(crate) fn run(Arguments {}: Arguments, global: &Global) -> anyhow::Result<Ex
     Ok(outcome?.into())
 }
 
+/// When the next screen is drawn.
+struct Pace {
+    drawn: Instant,
+    due: Instant,
+}
+
+impl Pace {
+    fn draw(&mut self, clock: impl Fn() -> Instant, draw: impl FnOnce() -> io::Result<()>) -> io::Result<()> {
+        if clock() >= self.due {
+            draw()?;
+            // Its end counts: a screen may take longer than `SOONEST`, and keys would wait for one screen a message.
+            self.drawn = clock();
+            self.due = self.drawn + LATEST;
+        }
+        Ok(())
+    }
+
+    fn heard(&mut self) {
+        self.due = self.drawn + SOONEST;
+    }
+}
+
 /// Until it is to end.
 fn show(
     mut app: App,
@@ -84,16 +106,14 @@ fn show(
 ) -> io::Result<Exit> {
     let start = Instant::now();
     app.started_ms = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis() as u64;
-    let (mut drawn, mut due) = (start, start);
+    let mut pace = Pace { drawn: start, due: start };
     loop {
-        let now = Instant::now();
-        if now >= due {
-            screen.terminal.draw(|frame| draw::draw(frame, &app, start.elapsed(), theme))?;
-            (drawn, due) = (now, now + LATEST);
-        }
-        match messages.recv_timeout(due.saturating_duration_since(now)) {
+        pace.draw(Instant::now, || {
+            screen.terminal.draw(|frame| draw::draw(frame, &app, start.elapsed(), theme)).map(drop)
+        })?;
+        match messages.recv_timeout(pace.due.saturating_duration_since(Instant::now())) {
             Ok(message) => {
-                due = drawn + SOONEST;
+                pace.heard();
                 match take(&mut app, message, start.elapsed())? {
                     Some(Act::Quit) => return Ok(Exit::Done),
                     Some(Act::Ask(task, ask)) => feed.act(task, ask),

@@ -1,6 +1,7 @@
 //! Screens of the state, without a terminal and a manager.
 
-use std::time::Duration;
+use std::cell::Cell;
+use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{
     CipherInfo, ConstraintsInfo, DatagramsInfo, InhibitedInfo, LimitsInfo, LinkInfo, NodeInfo, OrderInfo, RefusedInfo,
@@ -15,6 +16,7 @@ use ratatui::style::{Color, Modifier};
 
 use super::app::{Act, App, Ask, Counted, EVENTS, Mode, News, Probe, Snapshot, Value, View};
 use super::draw::{Theme, draw};
+use super::{Pace, SOONEST};
 
 fn at(ms: u64) -> Duration {
     Duration::from_millis(ms)
@@ -661,4 +663,23 @@ fn memory_is_bounded() {
     // What is known of a node goes with it.
     app.reported(many(1), at(10_500));
     assert!(app.round_trips.is_empty() && app.values.is_empty());
+}
+
+/// A screen of hundreds of nodes takes a while, and as many events come when they join: what is typed waits behind those.
+#[test]
+fn screens_that_take_long_hold_no_messages_up() {
+    let start = Instant::now();
+    let (now, screens) = (Cell::new(start), Cell::new(0));
+    let mut pace = Pace { drawn: start, due: start };
+    for _ in 0..1_000 {
+        let draw = || {
+            screens.set(screens.get() + 1);
+            now.set(now.get() + 3 * SOONEST);
+            Ok(())
+        };
+        pace.draw(|| now.get(), draw).unwrap();
+        now.set(now.get() + Duration::from_micros(100));
+        pace.heard();
+    }
+    assert_eq!(screens.get(), 3, "each 40 ms in 100 ms of messages");
 }
