@@ -21,8 +21,8 @@ use crate::command::Run;
 use crate::groups::Outcome;
 use crate::{install, msrv, workspace};
 pub(crate) use abilities::{abilities, targets};
-use boards::{BOARDS, Board, Image};
-pub(crate) use boards::{built, find, image_build};
+use boards::{BOARDS, Board, Chosen, Image};
+pub(crate) use boards::{built, each_time, find, image_build};
 pub(crate) use faults::{Faults, check as check_faults, faults};
 pub(crate) use flash::flash;
 use image::{Footprint, footprint};
@@ -32,14 +32,14 @@ pub(crate) use sizes::{check as check_sizes, sizes};
 /// Builds the images of one board, or of all of them, with the files that are flashed beside them.
 pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
     for board in chosen(name)? {
-        build_images(board)?;
+        build_images(board, |_, _| true)?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
-fn build_images(board: &Board) -> Result<()> {
+fn build_images(board: &Board, of: Chosen) -> Result<()> {
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
-    for image in board.images {
+    for image in board.images.iter().filter(|image| of(board, image)) {
         let elf = board.build(image)?;
         println!("{}", elf.display());
         if let Some(place) = cara_settings::board::find(board.name) {
@@ -49,19 +49,22 @@ fn build_images(board: &Board) -> Result<()> {
     Ok(())
 }
 
-/// Builds and links the images of boards, with a Rust as old as promised as far as their dependencies say.
-pub(crate) fn link(of: fn(&Board) -> bool) -> Outcome {
-    let boards = || BOARDS.iter().filter(|board| of(board));
-    if let Err(reason) = boards().try_for_each(|board| install::rust_target(board.target)) {
-        return Outcome::Skipped(reason);
+/// Builds and links images of boards, with a Rust as old as promised as far as their dependencies say.
+pub(crate) fn link(of: Chosen) -> Outcome {
+    match boards::with(of) {
+        Err(reason) => Outcome::Skipped(reason),
+        Ok(boards) => boards
+            .into_iter()
+            .try_for_each(|board| build_images(board, of))
+            .and_then(|()| msrv::check_firmware())
+            .into(),
     }
-    boards().try_for_each(build_images).and_then(|()| msrv::check_firmware()).into()
 }
 
 /// Links the firmware of every board, then compares what it takes.
 pub(crate) fn check_all_boards() -> Outcome {
-    match link(|_| true) {
-        Outcome::Passed => check_sizes(|_| true),
+    match link(|_, _| true) {
+        Outcome::Passed => check_sizes(|_, _| true),
         other => other,
     }
 }

@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use anyhow::{Context, Result, bail};
 
 use crate::command::Run;
-use crate::workspace;
+use crate::{install, workspace};
 
 /// A board.
 pub(crate) struct Board {
@@ -19,8 +19,8 @@ pub(crate) struct Board {
     pub(crate) images: &'static [Image],
     /// Whether it has a radio that is loaded with files which are no part of the project.
     pub(crate) has_radio: bool,
-    /// Whether it is built and measured each time that everything is checked.
-    pub(crate) by_default: bool,
+    /// Whether images of it are built and measured each time that everything is checked.
+    by_default: bool,
 }
 
 /// What is built for a board.
@@ -35,12 +35,22 @@ pub(crate) struct Image {
     pub(crate) is_secured: bool,
     /// What not every image has, on the emulated board.
     pub(crate) feature: Option<&'static str>,
+    /// Built and measured with all boards only: it has nothing that the others have not.
+    is_seldom: bool,
+}
+
+/// Which images of which boards.
+pub(crate) type Chosen = fn(&Board, &Image) -> bool;
+
+/// What is built and measured each time that everything is checked.
+pub(crate) const fn each_time(board: &Board, image: &Image) -> bool {
+    board.by_default && !image.is_seldom
 }
 
 impl Image {
     /// With logs and without a cipher.
     const fn plain(name: &'static str, program: &'static str) -> Self {
-        Self { name, program, has_logs: true, is_secured: false, feature: None }
+        Self { name, program, has_logs: true, is_secured: false, feature: None, is_seldom: false }
     }
 
     const fn named(self, name: &'static str) -> Self {
@@ -53,6 +63,10 @@ impl Image {
 
     const fn quiet(self) -> Self {
         Self { has_logs: false, ..self }
+    }
+
+    const fn seldom(self) -> Self {
+        Self { is_seldom: true, ..self }
     }
 
     /// Whether the other images of its kind are compared with it.
@@ -77,15 +91,15 @@ const EMULATED: &[Image] = &[
     Image::plain("agv-plain", "agv"),
     STREAMS,
     WAREHOUSE,
-    UNIT.secured().named("unit-secured"),
-    UNIT,
-    FIXED,
+    UNIT.secured().named("unit-secured").seldom(),
+    UNIT.seldom(),
+    FIXED.seldom(),
     ECHO,
     Image::plain("agv-quiet", "agv").secured().quiet(),
-    Image { name: "agv-streams-quiet", ..STREAMS }.quiet(),
-    UNIT.secured().quiet().named("unit-secured-quiet"),
+    Image { name: "agv-streams-quiet", ..STREAMS }.quiet().seldom(),
+    UNIT.secured().quiet().named("unit-secured-quiet").seldom(),
     UNIT.quiet().named("unit-quiet"),
-    FIXED.secured().quiet().named("unit-fixed-secured-quiet"),
+    FIXED.secured().quiet().named("unit-fixed-secured-quiet").seldom(),
     FIXED.quiet().named("unit-fixed-quiet"),
     Image::plain("echo-quiet", "echo").quiet(),
 ];
@@ -148,6 +162,12 @@ pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
     });
     [emulated, second].into_iter().chain(real).collect()
 });
+
+/// Boards of which there is such an image, once what the compiler needs for them is installed; why it cannot be.
+pub(crate) fn with(of: Chosen) -> Result<Vec<&'static Board>, String> {
+    let boards = BOARDS.iter().filter(|board| board.images.iter().any(|image| of(board, image)));
+    boards.map(|board| install::rust_target(board.target).map(|()| board)).collect()
+}
 
 /// The board of a name; the error lists all.
 pub(crate) fn find(name: &str) -> Result<&'static Board> {

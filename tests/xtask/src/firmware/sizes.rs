@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use cara_processes::files;
 use serde_json::{Value, json};
 
-use super::boards::{self, BOARDS, Board, Image, RADIO, RESOURCES};
+use super::boards::{self, Board, Chosen, Image, RADIO, RESOURCES};
 use super::breakdown::Row;
 use super::image::{Footprint, footprint};
 use super::{NOT_ALLOWED, TESTED, tests};
@@ -23,7 +23,7 @@ const DOCUMENT: Document = Document { file: "docs/sizes.md", command: "cargo xta
 pub(crate) fn sizes(board: Option<&str>, json: Option<&Path>, write: bool) -> Result<ExitCode> {
     json.map_or(Ok(()), files::can_write)?;
     let board = board.map(boards::find).transpose()?;
-    let rows = board.map_or_else(|| measured(|_| true), of_board)?;
+    let rows = board.map_or_else(|| measured(|_, _| true), |board| of_board(board, |_, _| true))?;
     println!("{}", table(&rows));
     println!("The stack is measured on emulated boards only; the others were linked, and not run.");
     if board.is_none() {
@@ -43,36 +43,34 @@ pub(crate) fn sizes(board: Option<&str>, json: Option<&Path>, write: bool) -> Re
 }
 
 /// Fails when a figure has grown by more than 2 % since the document was written.
-pub(crate) fn check(of: fn(&Board) -> bool) -> Outcome {
-    if let Err(reason) =
-        BOARDS.iter().filter(|board| of(board)).try_for_each(|board| install::rust_target(board.target))
-    {
-        return Outcome::Skipped(reason);
+pub(crate) fn check(of: Chosen) -> Outcome {
+    match boards::with(of) {
+        Err(reason) => Outcome::Skipped(reason),
+        Ok(_) => measured(of).and_then(|rows| DOCUMENT.check(&rows)).into(),
     }
-    measured(of).and_then(|rows| DOCUMENT.check(&rows)).into()
 }
 
 /// The same for one board.
 pub(super) fn check_board(name: &str) -> Result<()> {
-    DOCUMENT.check(&of_board(boards::find(name)?)?)
+    DOCUMENT.check(&of_board(boards::find(name)?, |_, _| true)?)
 }
 
-fn measured(of: impl Fn(&Board) -> bool) -> Result<Vec<Row>> {
+fn measured(of: Chosen) -> Result<Vec<Row>> {
     let mut rows = Vec::new();
-    for board in BOARDS.iter().filter(|board| of(board)) {
+    for board in boards::with(of).map_err(anyhow::Error::msg)? {
         if board.has_radio && std::env::var_os(RADIO).is_none() {
             println!("{} is left out: {RADIO} does not say where its radio's files are", board.name);
             continue;
         }
-        rows.extend(of_board(board)?);
+        rows.extend(of_board(board, of)?);
     }
     Ok(rows)
 }
 
-fn of_board(board: &'static Board) -> Result<Vec<Row>> {
+fn of_board(board: &'static Board, of: Chosen) -> Result<Vec<Row>> {
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
     let mut found = Vec::new();
-    for image in board.images {
+    for image in board.images.iter().filter(|image| of(board, image)) {
         let path = board.build(image)?;
         // A board tells by its logs how deep its stack has been. There is no load for a vehicle of the warehouse.
         let has_load = image.has_logs && image.program != boards::WAREHOUSE.program;
