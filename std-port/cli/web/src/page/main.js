@@ -57,7 +57,7 @@ const stopAll = (what) => stop.all(what, () => { pages.postMessage(what); makeWa
 
 // What is scrolled to, by the keyboard too, comes to stand below the bar and not under it.
 const barHeight = new ResizeObserver(([bar]) => {
-  document.documentElement.style.scrollPaddingTop = `${bar.target.offsetHeight}px`;
+  document.documentElement.style.scrollPaddingTop = `${Math.ceil(bar.target.getBoundingClientRect().height)}px`;
 });
 
 async function prepare() {
