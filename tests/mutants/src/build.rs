@@ -13,12 +13,12 @@ use serde_json::Value;
 /// What judges, the quickest first: package, program, and the tests of it. Faults that come seldom need many seeds.
 const JUDGES: [(&str, &str, &[&str]); 7] = [
     ("cara-core", "cara_core", &["services::lease", "distribution::latch", "distribution::claim", "services::heart"]),
-    ("cara-sim", "chaos", &["whatever"]),
     ("cara-sim", "orders", &["five_vehicles"]),
+    ("cara-sim", "chaos", &["whatever"]),
     ("cara-core", "cara_core", &["services::"]),
-    ("cara-sim", "standby", &[]),
     ("cara-core", "cara_core", &["distribution::connection_handler"]),
     ("cara-sim", "world", &[]),
+    ("cara-sim", "standby", &[]),
 ];
 const SEEDS: &str = "24";
 /// Seconds of a processor that one judge may take, many times what it takes without a mutant. A busy machine does not change it.
