@@ -31,8 +31,8 @@ impl Surroundings {
     }
 
     /// Differences from the environment of this program: no units of other hosts are met, nothing is left behind, and what
-    /// the guide's programs have in common with each other and with the workspace is built once. Tests beside this one are
-    /// heard: their managers have other names than the guide's.
+    /// the guide's programs have in common is built once and quickly. Tests beside this one are heard: their managers have
+    /// other names than the guide's.
     fn environment(&self) -> Vec<(&'static str, PathBuf)> {
         let before = PathBuf::from(std::env::var_os("HOME").unwrap_or_default());
         let kept = |name: &str, below: &str| std::env::var_os(name).map_or_else(|| before.join(below), PathBuf::from);
@@ -43,7 +43,9 @@ impl Surroundings {
             ("CARA_CONTROL_DIR", self.home.path().join("control")),
             ("CARA_INTERFACES", PathBuf::from("lo")),
             ("NO_COLOR", PathBuf::from("1")),
-            ("CARGO_BUILD_BUILD_DIR", self.root.join("target")),
+            ("CARGO_BUILD_BUILD_DIR", self.home.path().join("build")),
+            ("CARGO_PROFILE_DEV_OPT_LEVEL", PathBuf::from("0")),
+            ("CARGO_PROFILE_DEV_DEBUG", PathBuf::from("0")),
         ]
     }
 }
