@@ -165,12 +165,18 @@ fn fnv(bytes: &[u8]) -> u64 {
 /// The sockets in a directory, live or stale; none in a directory that other users can write to.
 pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, LocationError> {
     let is_named = set("CARA_CONTROL_DIR").is_some_and(|named| named == directory);
-    match enter(directory, if is_named { EnteredBy::Anybody } else { EnteredBy::Owner }) {
-        Ok(_) => {}
-        Err(LocationError::System { error, .. }) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        Err(error) => return Err(error),
-    }
-    let entries = std::fs::read_dir(directory).map_err(|error| LocationError::system(directory, error))?;
+    let entries = enter(directory, if is_named { EnteredBy::Anybody } else { EnteredBy::Owner })
+        .and_then(|_| std::fs::read_dir(directory).map_err(|error| LocationError::system(directory, error)));
+    // One that was only seen in use may go at any time, and a file take its place or that of one above it.
+    let is_gone = |kind| match kind {
+        io::ErrorKind::NotFound => true,
+        io::ErrorKind::NotADirectory => !is_named && !directory.is_symlink(),
+        _ => false,
+    };
+    let entries = match entries {
+        Err(LocationError::System { error, .. }) if is_gone(error.kind()) => return Ok(Vec::new()),
+        entries => entries?,
+    };
     let mut sockets: Vec<PathBuf> = entries
         .filter_map(|entry| entry.ok().map(|entry| entry.path()))
         .filter(|path| path.to_string_lossy().ends_with(SUFFIX))
@@ -440,6 +446,17 @@ mod tests {
         let link = above.path().join("link");
         std::os::unix::fs::symlink(above.path(), &link).unwrap();
         assert!(matches!(Location::open(&link.join("unit.sock"), false), Err(LocationError::System { .. })));
+    }
+
+    #[test]
+    fn a_file_in_the_place_of_a_directory_has_no_sockets() {
+        let above = directory();
+        let file = above.path().join("run");
+        std::fs::write(&file, "in the way").unwrap();
+        assert!(sockets(&file.join("cara")).unwrap().is_empty() && sockets(&file).unwrap().is_empty());
+        let link = above.path().join("link");
+        std::os::unix::fs::symlink(above.path(), &link).unwrap();
+        assert!(sockets(&link).is_err());
     }
 
     /// Some directory of another user; there is none that root does not own in every container, so root looks on.
