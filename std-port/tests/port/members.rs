@@ -156,6 +156,7 @@ fn publishing_to_one_node_is_for_that_node() {
     };
     let (first, second) = (start("first", 1), start("second", 2));
     until("both have come", || manager.number_of_s_units() == 2);
+    until("they know it", || [&first, &second].iter().all(|agv| agv.manager().is_some()));
     manager.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
     let span = cara_std::Duration::from_secs(10);
     manager.s_unit("first").unwrap().publish_and_wait(span).unwrap();
