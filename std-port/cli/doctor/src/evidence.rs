@@ -63,7 +63,7 @@ pub(crate) struct KeysSeen {
     pub(crate) refused: Vec<String>,
 }
 
-/// One life of a node, between two times at which it was seen.
+/// One life of a node, as far as it was seen.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Life {
     /// `NAME/ID`.
@@ -71,7 +71,9 @@ pub(crate) struct Life {
     pub(crate) epoch: u64,
     /// Where it was seen.
     pub(crate) at: String,
+    /// It had begun by then.
     pub(crate) first: Duration,
+    /// It had not ended by then: before `first`, where that is when a report was read that was asked for earlier.
     pub(crate) last: Duration,
 }
 
@@ -203,7 +205,7 @@ pub(crate) fn overlapping(lives: &[Life]) -> Option<(&Life, &Life)> {
         .iter()
         .enumerate()
         .flat_map(|(index, first)| lives.iter().skip(index + 1).map(move |second| (first, second)));
-    pairs.into_iter().find(|(first, second)| first.last > second.first + OVERTAKING)
+    pairs.into_iter().find(|(first, second)| first.last > second.first + OVERTAKING && second.last >= first.first)
 }
 
 #[cfg(test)]

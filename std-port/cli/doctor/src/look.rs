@@ -233,7 +233,9 @@ impl Looking {
         if self.refreshed.is_none_or(|at| at.elapsed() >= REFRESH) {
             self.evidence.running = self.sources.look();
             self.refreshed = Some(Instant::now());
-            self.note_lives();
+            let now = self.survey.age();
+            let asked = |unit: &Running| now.saturating_sub(unit.asked.elapsed());
+            note_lives(&mut self.evidence.connected_lives, &self.evidence.running, now, asked);
         }
         let evidence = &mut self.evidence;
         evidence.listened = self.survey.age();
@@ -262,22 +264,22 @@ impl Looking {
             evidence.answered_alone = late.map(|(heard, _)| heard.source).collect();
         }
     }
+}
 
-    /// Which lives of nodes the units of this host have connected.
-    fn note_lives(&mut self) {
-        let now = self.survey.age();
-        let lives = &mut self.evidence.connected_lives;
-        for node in self.evidence.running.iter().flat_map(|unit| &unit.nodes).filter(|node| node.connected) {
-            let epoch = node.epoch.as_deref().and_then(|text| u64::from_str_radix(text, 16).ok());
-            let (Some(epoch), name) = (epoch, format!("{}/{}", node.name, node.id)) else { continue };
-            let full = lives.len() >= MOST_LIVES;
-            match lives.iter_mut().find(|life| life.epoch == epoch && life.node == name) {
-                Some(life) => life.last = now,
-                None if full => {}
-                None => {
-                    let at = node.address.clone().unwrap_or_default();
-                    lives.push(Life { node: name, epoch, at, first: now, last: now });
-                }
+/// Which lives of nodes the units of this host have connected: of each it is known that it had begun by now, and that it had not
+/// ended when the unit was asked.
+fn note_lives(lives: &mut Vec<Life>, running: &[Running], now: Duration, asked: impl Fn(&Running) -> Duration) {
+    let nodes = running.iter().flat_map(|unit| unit.nodes.iter().map(move |node| (unit, node)));
+    for (unit, node) in nodes.filter(|(_, node)| node.connected) {
+        let epoch = node.epoch.as_deref().and_then(|text| u64::from_str_radix(text, 16).ok());
+        let (Some(epoch), name) = (epoch, format!("{}/{}", node.name, node.id)) else { continue };
+        let (full, asked) = (lives.len() >= MOST_LIVES, asked(unit));
+        match lives.iter_mut().find(|life| life.epoch == epoch && life.node == name) {
+            Some(life) => life.last = life.last.max(asked),
+            None if full => {}
+            None => {
+                let at = node.address.clone().unwrap_or_default();
+                lives.push(Life { node: name, epoch, at, first: now, last: asked });
             }
         }
     }
@@ -304,7 +306,40 @@ fn neighbours(table: &str) -> Vec<Ipv4Addr> {
 
 #[cfg(test)]
 mod tests {
+    use cara_std::control::protocol::NodeInfo;
+
+    use super::super::evidence::overlapping;
+    use super::super::evidence::samples::{life, node_info, running};
     use super::*;
+
+    /// On a host that is slow a report is read late, and again and again until the next one comes.
+    #[test]
+    fn a_report_shows_no_life_that_is_later_than_its_question() {
+        let mut unit = running("boss", 1);
+        unit.nodes = vec![NodeInfo { epoch: Some("1".into()), ..node_info("agv", 7, true) }];
+        let units = [unit];
+        let overlaps = |lives: &[Life], other: &Life| {
+            let mut all = vec![lives[0].clone(), other.clone()];
+            all.sort_by_key(|life| life.first);
+            overlapping(&all).is_some()
+        };
+        // The node has started again in the third second, and is seen since.
+        let (second, again) = (Duration::from_secs, life("agv/7", 2, 2_000, 5_000));
+        let mut lives = Vec::new();
+        note_lives(&mut lives, &units, second(1), |_| second(1));
+        note_lives(&mut lives, &units, second(3), |_| second(1));
+        assert_eq!((lives.len(), lives[0].first, lives[0].last), (1, second(1), second(1)));
+        assert!(!overlaps(&lives, &again));
+        // Also where it is read for the first time then.
+        let mut late = Vec::new();
+        note_lives(&mut late, &units, second(3), |_| second(1));
+        assert!(!overlaps(&late, &again));
+        // A life that is told of in an answer to a later question goes on.
+        for lives in [&mut lives, &mut late] {
+            note_lives(lives, &units, second(4), |_| second(3));
+            assert!(overlaps(lives, &again));
+        }
+    }
 
     #[test]
     fn devices_and_neighbours_are_read_from_the_systems_tables() {

@@ -26,6 +26,8 @@ pub(crate) struct Running {
     pub(crate) unit: UnitInfo,
     /// Nodes that have joined, connected or not.
     pub(crate) nodes: Vec<NodeInfo>,
+    /// When it was asked for them: what it said of them held later, and may hold no longer.
+    pub(crate) asked: Instant,
     pub(crate) refused: Vec<RefusedInfo>,
     pub(crate) counters: Vec<Counted>,
     /// Its open files, where they can be seen.
@@ -187,6 +189,7 @@ fn ask(client: &mut Client, which: Option<&Which>) -> Result<Running, ControlErr
             unit = Some(info);
         }
     }
+    let asked = Instant::now();
     for answer in client.ask(&Question::Nodes { offering: None })? {
         match answer? {
             Answer::Node(node) => nodes.push(node),
@@ -208,7 +211,7 @@ fn ask(client: &mut Client, which: Option<&Which>) -> Result<Running, ControlErr
     }
     let unit = unit.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "it did not give its identity"))?;
     let files = files_of_tcp_port(unit.tcp_port);
-    Ok(Running { unit, nodes, refused, counters, files })
+    Ok(Running { unit, nodes, asked, refused, counters, files })
 }
 
 /// All counters, or those of the one link that is asked about.

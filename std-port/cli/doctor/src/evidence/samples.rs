@@ -1,7 +1,7 @@
 //! Evidence for tests: a host in order, in fleet 7.
 
 use std::net::SocketAddr;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{ConstraintsInfo, KeysInfo, NodeInfo, UnitInfo};
 use cara_std::survey::{Heard, Ports, Reach, Standing, Versions};
@@ -120,7 +120,8 @@ pub(crate) fn running(name: &str, id: u32) -> Running {
         connected: 0,
         leading: None,
     };
-    Running { unit, nodes: Vec::new(), refused: Vec::new(), counters: Vec::new(), files: None }
+    let (nodes, refused, counters) = (Vec::new(), Vec::new(), Vec::new());
+    Running { unit, nodes, asked: Instant::now(), refused, counters, files: None }
 }
 
 pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
