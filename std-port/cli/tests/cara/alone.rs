@@ -153,12 +153,18 @@ fn cara_does_not_pretend_to_be_a_unit_that_runs() {
     ran.says("manager/1 answers at");
 }
 
-/// A control connection that the unit serves; `None` when it has refused it.
+/// A control connection that the unit serves; `None` when it has refused it. It waits for an answer: an idle one gives way.
 fn served(socket: &Path) -> Option<UnixStream> {
     let stream = UnixStream::connect(socket).unwrap();
-    let mut line = String::new();
-    BufReader::new(&stream).read_line(&mut line).unwrap();
-    (line.contains(r#""answer":"hello""#) && !line.contains("full")).then_some(stream)
+    let mut lines = BufReader::new(&stream).lines().map_while(Result::ok);
+    let hello = lines.next()?;
+    if !hello.contains(r#""answer":"hello""#) || hello.contains("full") {
+        return None;
+    }
+    (&stream).write_all(b"{\"ask\":\"watch\"}\n").ok()?;
+    let is_watching = lines.next()?.contains("watching");
+    drop(lines);
+    is_watching.then_some(stream)
 }
 
 #[test]
