@@ -29,7 +29,7 @@ fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
     let clinic = Clinic::new();
     let secured = manager(&clinic, |boss| boss);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").insecure());
-    for reported in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&[])] {
         reported.is(&["mode-mismatch"], 4);
         assert!(
             reported.found(0).contains("agv/7 at ") && reported.found(0).contains("boss/1 is secured"),
@@ -40,7 +40,7 @@ fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
     let clinic = Clinic::new();
     let _plain = manager(&clinic, |boss| boss.insecure());
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
-    for reported in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&[])] {
         reported.is(&["mode-mismatch"], 4);
         assert!(reported.found(0).contains("boss/1 is in plain mode"), "{reported:?}");
     }
@@ -65,7 +65,7 @@ fn keys_of_another_root_are_told_of_the_node_and_of_its_manager() {
     let others = draw(clinic.fleet);
     let ours = manager(&clinic, |boss| boss);
     let vehicle = clinic.started(clinic.unit("agv", 7, "boss").keys(others.ring(&agv()).unwrap()));
-    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&[])] {
         reported.is(&["wrong-keys"], 4);
         assert!(reported.found(0).starts_with("agv/7 at "), "{reported:?}");
         let advice = reported.advice(0);
@@ -124,7 +124,7 @@ fn a_change_of_keys_that_left_a_node_behind_is_told() {
     drop(store);
     let _manager = manager(&clinic, |boss| boss);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(old));
-    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
+    for reported in [clinic.doctor(&["agv"]), clinic.doctor(&[])] {
         reported.is(&["key-generations"], 4);
         assert!(
             reported.found(0).contains("with generation 1 ") && reported.found(0).contains("generation 2:"),
