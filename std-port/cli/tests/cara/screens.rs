@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_std::access::AccessTable;
 use cara_std::{Definition, ParametersView, Priority, Served, ServiceError, ServiceOptions, Unit};
@@ -170,6 +170,16 @@ fn two_hundred_nodes_are_scrolled_in_any_window() {
     let build = |(name, id): (&String, u32)| stage.vehicle(name, id).build().unwrap();
     let units: Vec<_> = names.iter().zip(1..).map(build).collect();
     units.iter().for_each(|unit| unit.start().unwrap());
+    // So many take their time on a busy host.
+    let start = Instant::now();
+    let joined = || {
+        let reported = stage.ends(0, &["scan", "--json"]).json();
+        reported["nodes"].as_array().unwrap().iter().filter(|node| node["connected"] == true).count()
+    };
+    while joined() < units.len() {
+        assert!(start.elapsed() < Duration::from_secs(180), "not all have joined");
+        std::thread::sleep(Duration::from_millis(500));
+    }
     let mut top = top(&stage, &[], &[]);
     top.shows("200 of 200 s_units");
     for (keys, node) in [
