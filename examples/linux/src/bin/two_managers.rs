@@ -1,6 +1,6 @@
 //! Two managers on one network, and an s_unit that joins only its own: it holds its manager's name and ID number.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use cara_examples::{Network, Stop, log_to_stderr, say};
@@ -9,8 +9,10 @@ use clap::Parser;
 
 /// How often the managers search.
 const SEARCH_EVERY: Duration = Duration::from_millis(250);
-/// How often both managers have searched when this ends; the wrong one has had each of them.
+/// How often both managers have searched at least when this ends; the wrong one has had each of them.
 const SEARCHES: u32 = 8;
+/// How long they search at most until the AGV has its manager and they have each other.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Two managers and an s_unit, in one process.
 #[derive(Parser)]
@@ -36,7 +38,11 @@ fn main() -> Result<()> {
     north.start()?;
     south.start()?;
     agv.start()?;
-    for _ in 0..SEARCHES {
+    let has_joined = || south.number_of_s_units() == 1 && agv.is_connected();
+    let is_complete = || has_joined() && [&north, &south].iter().all(|manager| manager.number_of_m_units() == 1);
+    let (start, mut searches) = (Instant::now(), 0);
+    while searches < SEARCHES || !is_complete() && start.elapsed() < PATIENCE {
+        searches += 1;
         north.broadcast();
         south.broadcast();
         if let Some(outcome) = stop.wait_for(SEARCH_EVERY) {
