@@ -4,9 +4,8 @@ use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::Stdio;
-use std::time::{Duration, Instant};
 
-use crate::support::{PATIENCE, Ran, Stage, private_folder, until};
+use crate::support::{Ran, Stage, private_folder, until};
 
 /// What an operator asks of a manager, running or for the time of the command.
 const VERBS: &[&[&str]] = &[
@@ -71,11 +70,7 @@ fn options_before_and_behind_the_verb_are_looked_at_together() {
 fn a_unit_is_chosen_where_several_run() {
     let stage = Stage::with(&[]);
     let mut other = stage.command(&["node", "--name", "other", "--id", "2"]).spawn().unwrap();
-    let start = Instant::now();
-    while stage.cara(&["counters", "--unit", "other/2"]).code != 0 {
-        assert!(start.elapsed() < PATIENCE, "the other unit does not answer");
-        std::thread::sleep(Duration::from_millis(50));
-    }
+    until("the other unit answers", || stage.cara(&["counters", "--unit", "other/2"]).code == 0);
     let several = stage.cara(&["counters"]);
     let chosen = ["other/2", "other"].map(|unit| stage.cara(&["scan", "--unit", unit, "--json"]));
     other.kill().unwrap();
@@ -153,11 +148,14 @@ fn cara_does_not_pretend_to_be_a_unit_that_runs() {
         let mut command = stage.command(&["scan", "--as", "manager/1"]);
         Ran::of(command.env("CARA_CONTROL_DIR", elsewhere.path()).output().unwrap())
     };
-    let (start, mut ran) = (Instant::now(), scan());
+    let mut ran = scan();
     // Where the answer comes late it has begun to be the unit, and is told that it runs already.
-    while ran.code == 5 && start.elapsed() < PATIENCE {
-        ran = scan();
-    }
+    until("the answer comes in time", || {
+        if ran.code == 5 {
+            ran = scan();
+        }
+        ran.code != 5
+    });
     assert_eq!(ran.code, 2, "{}", ran.everything());
     ran.says("manager/1 answers at");
 }
