@@ -27,9 +27,10 @@ impl Manager<'_> {
             let stopped = outcomes.iter().filter(|(_, outcome)| outcome.is_ok()).count();
             // One that is switched off, or just now, slows down by itself.
             let is_off = |failed: &CallError| matches!(failed.error, Error::NotConnected | Error::Interrupted);
-            let asked = outcomes.iter().filter(|(_, outcome)| !outcome.as_ref().is_err_and(is_off)).count();
+            let mut asked = stopped;
             for (vehicle, outcome) in &outcomes {
                 if let Some(failed) = outcome.as_ref().err().filter(|failed| !is_off(failed)) {
+                    asked += 1;
                     println!("not-stopped {} {failed}", vehicle.name());
                 }
             }
