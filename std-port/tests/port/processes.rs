@@ -11,12 +11,12 @@ use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
 use cara_std::{
-    CloseReason, Definition, Error, LeaseEnd, OrderOutcome, Parameters, ParametersView, Refusal, Renew, RequestOptions,
-    Served, ServiceError, ServiceOptions, StartError, UnitEvent,
+    CloseReason, Definition, Error, LeaseEnd, OrderOutcome, Parameters, ParametersView, Peer, Refusal, Renew,
+    RequestOptions, Served, ServiceError, ServiceOptions, StartError, UnitEvent,
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
+use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, unless_stalled, until, within};
 
 const PART: &str = "CARA_TEST_PART";
 
@@ -102,7 +102,12 @@ fn as_child() {
             let manager = system(fleet).control(Control::Off).build().unwrap();
             manager.start().unwrap();
             until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
-            manager.nodes_offering("go_to")[0].call("go_to", &mut number(1)).renewing(Renew::Process).wait().unwrap();
+            // On a slow machine the call may come when its lease would be over.
+            until("it begins", || {
+                let vehicles = manager.nodes_offering("go_to");
+                let goes = |to: &Peer| to.call("go_to", &mut number(1)).renewing(Renew::Process).wait().is_ok();
+                vehicles.first().is_some_and(goes)
+            });
             until_input_ends();
         }
     }
@@ -279,12 +284,18 @@ fn a_second_manager_starts_only_where_the_first_does_not_answer() {
 
 #[test]
 fn a_vehicle_stops_once_when_its_manager_is_killed() {
+    let length = Duration::from_millis(1_500);
+    // A renewal passes several threads, which are late one after the other.
+    unless_stalled(length / 8, || goes_until_its_manager_is_killed(length));
+}
+
+/// `None` if the lease has ended before.
+fn goes_until_its_manager_is_killed(length: Duration) -> Option<()> {
     let fleet = fleet();
     let stops = Arc::new(AtomicUsize::new(0));
     let stopped = stops.clone();
     let agv = unit("agv", 7, fleet).build().unwrap();
     let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
-    let length = Duration::from_millis(1_500);
     let options = ServiceOptions::new().lease(length, move || {
         stopped.fetch_add(1, Ordering::SeqCst);
     });
@@ -292,11 +303,15 @@ fn a_vehicle_stops_once_when_its_manager_is_killed() {
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();
     let mut manager = Process::manager(fleet);
-    until("it moves", || lease.is_live());
+    let mut goes_on = within(PATIENCE, || lease.is_live());
     let began = Instant::now();
-    while began.elapsed() < 2 * length {
-        assert!(lease.is_live(), "the lease is renewed");
+    while goes_on && began.elapsed() < 2 * length {
         std::thread::sleep(Duration::from_millis(5));
+        goes_on = lease.is_live();
+    }
+    // Also behind the whole span, whatever was looked at in it.
+    if !goes_on || !lease.is_live() {
+        return None;
     }
     manager.kill();
     until("it stops", || stops.load(Ordering::SeqCst) == 1);
@@ -304,4 +319,5 @@ fn a_vehicle_stops_once_when_its_manager_is_killed() {
     until("it knows", || !agv.is_connected());
     agv.stop();
     assert_eq!(stops.load(Ordering::SeqCst), 1);
+    Some(())
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use cara_std::{Error, LeaseEnd, Renew, RequestOptions, ServiceOptions, UnitEvent};
 
 use super::{patient, runtime};
-use crate::support::{counter, fleet, meet, number, pair, service, system, unit, until};
+use crate::support::{PATIENCE, counter, fleet, meet, number, pair, service, system, unit, until};
 
 #[test]
 fn a_node_and_a_function_are_waited_for() {
@@ -104,7 +104,8 @@ fn round_trips_are_measured_in_turn_and_one_that_is_dropped_gives_its_turn_up() 
 fn what_is_held_is_released_and_its_end_is_told() {
     let (manager, agv) = pair();
     let definition = "lift(number: int) -> (number: int)".parse().unwrap();
-    let options = ServiceOptions::new().lease(Duration::from_millis(800), || {});
+    // So long that nothing ends by time.
+    let options = ServiceOptions::new().lease(PATIENCE.saturating_mul(4), || {});
     let lease = agv.my_function_list().add_service(&definition, options, service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let wanted = RequestOptions { renew: Renew::Process, ..patient() };
