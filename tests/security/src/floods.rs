@@ -2,7 +2,7 @@
 
 use std::net::TcpStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow, ensure};
 use cara_core::config::Mode;
@@ -16,13 +16,14 @@ use cara_std::{Error, Interfaces, Parameters, Peer, RequestOptions};
 use crate::ground::agv;
 use crate::links::Extent;
 use crate::linux::{Linux, LinuxManager, named, wait_for};
-use crate::speaker::{framed, fresh_mark, hello};
+use crate::speaker::{PATIENCE, framed, fresh_mark, hello};
 use crate::tally::{Counters, Report, Row};
 use crate::target::Target;
 use crate::trial::risen;
 
-/// The deadline that calls keep during a flood. Generous: the machine is shared.
-const DEADLINE: Duration = Duration::from_secs(2);
+/// The deadline that calls keep during a flood. A flood that harms keeps calls waiting for as long as it lasts, and the machine is
+/// shared and may stand still for seconds: that is no success of the attacker. How long the longest call took is printed.
+const DEADLINE: Duration = PATIENCE;
 /// Calls during each flood, at least.
 const CALLS: usize = 60;
 /// Connections that a flood holds open at a time, per thread: together they exceed a manager's capacity.
@@ -91,7 +92,7 @@ fn flood(
     let (over, made) = (AtomicBool::new(false), AtomicU64::new(0));
     let before = manager.counters()?;
     let joins = manager.log.joins_but_of(&[agv(THERE), agv(newcomer)]);
-    let (mut late, mut calls, mut new) = (0, 0, None);
+    let (mut late, mut calls, mut longest, mut new) = (0, 0, Duration::ZERO, None);
     std::thread::scope(|scope| -> Result<()> {
         let attackers = [(); 2].map(|()| scope.spawn(|| attacker(&over, &made)));
         let peer = connected(manager, THERE);
@@ -99,7 +100,9 @@ fn flood(
             if attackers.iter().any(|attacker| attacker.is_finished()) {
                 break;
             }
+            let began = Instant::now();
             late += u64::from(peer.as_ref().is_none_or(|peer| call(peer).is_err()));
+            longest = longest.max(began.elapsed());
             calls += 1;
             if calls == 10 {
                 new = Some(linux.vehicle(newcomer, None)?);
@@ -107,6 +110,7 @@ fn flood(
             std::thread::sleep(Duration::from_millis(5));
         }
         let out = !wait_for(|| connected(manager, newcomer).is_some());
+        eprintln!("{name}: the longest of {calls} calls took {longest:.1?}");
         if late > 0 || out {
             eprintln!("{name}: {late} of {calls} calls came too late; the newcomer stayed out: {out}");
         }
