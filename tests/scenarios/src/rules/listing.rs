@@ -5,7 +5,7 @@ use cara_core::error::Error;
 
 use super::{met, pair, paper_services};
 use crate::scenario::scenarios;
-use crate::{Service, Spec, World, millis, number, numbers, position, secs, variable};
+use crate::{Gate, Service, Spec, World, millis, number, numbers, position, secs, variable};
 
 scenarios![
     the_listing_runs_line_by_line: "29–39, 43, 45–46", Rough, [], ["WhoHasSent", "Joined", "RequestsRun"];
@@ -21,8 +21,9 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     assert_eq!(manager.number_of_s_units(), 0);
     let (pos_info, go_to) = paper_services();
-    // So long that a request which waited for its end would not have returned before.
-    let go_to = go_to.takes(secs(2));
+    // A request that waited for its end would not return.
+    let gate = Gate::default();
+    let go_to = go_to.waits_at(&gate);
     let agv = world.add(Spec::agv("agv", 7).service(&pos_info).service(&go_to));
     while manager.number_of_s_units() < 1 {
         manager.broadcast();
@@ -39,6 +40,7 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     manager.request("agv", "go_to", &pos).expect("it is accepted");
     assert!(go_to.log().ended().is_empty(), "it returns at once");
     assert_eq!(variable(&pos, "position"), [1, 2]);
+    gate.open();
     world.wait("go_to has run", || go_to.log().ended().len() == 1, secs(10));
     let mut reported = position();
     assert_eq!(world.ask(&manager, "agv", "pos_info", &mut reported), Ok(()));

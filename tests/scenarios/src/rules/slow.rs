@@ -5,7 +5,7 @@ use cara_core::services::session::RequestOptions;
 
 use super::{met, pair};
 use crate::scenario::scenarios;
-use crate::{Seen, Service, Spec, World, number, secs};
+use crate::{Gate, Seen, Service, Spec, World, number, secs};
 
 scenarios![
     a_slow_handler_delays_no_other_peer: "handlers run outside", Light, [ThirdUnit], ["RequestsRun"];
@@ -20,7 +20,8 @@ scenarios![
 const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(30)), ..RequestOptions::new() };
 
 fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
-    let slow = Service::numbered("slow").takes(secs(3));
+    let gate = Gate::default();
+    let slow = Service::numbered("slow").waits_at(&gate);
     let quick = Service::numbered("quick");
     let manager = world.add(Spec::manager("manager", 1));
     world.add(Spec::agv("one", 1).service(&slow));
@@ -31,6 +32,7 @@ fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
     world.wait("it runs", || slow.log().runs() == 1, secs(10));
     assert_eq!(world.ask(&manager, "two", "quick", &mut number("n", 1)), Ok(()));
     assert!(!long.is_over());
+    gate.open();
     assert!(world.finish(&long).is_ok());
 }
 
@@ -43,7 +45,8 @@ fn a_slow_handler_delays_no_keep_alive(world: &mut dyn World) {
 
 /// Three slow calls and a quick one of the same class: they begin in their order, and the quick one waits for none.
 fn a_quick_call_overtakes_slow_ones_that_began_before_it(world: &mut dyn World) {
-    let (slow, quick) = (Service::numbered("slow").takes(secs(2)), Service::numbered("quick"));
+    let gate = Gate::default();
+    let (slow, quick) = (Service::numbered("slow").waits_at(&gate), Service::numbered("quick"));
     let manager = world.add(Spec::manager("manager", 1));
     world.add(Spec::agv("agv", 7).service(&slow).service(&quick));
     met(world, &manager, "agv", "slow");
@@ -52,6 +55,7 @@ fn a_quick_call_overtakes_slow_ones_that_began_before_it(world: &mut dyn World) 
     world.wait("they run side by side", || slow.log().runs() == 3, secs(10));
     assert_eq!(world.ask(&manager, "agv", "quick", &mut number("n", 1)), Ok(()));
     assert!(slow.log().ended().is_empty() && long.iter().all(|call| !call.is_over()), "it waited for none of them");
+    gate.open();
     assert!(long.iter().all(|call| world.finish(call).is_ok()));
     world.reached("overtook");
 }

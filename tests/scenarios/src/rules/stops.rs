@@ -4,11 +4,10 @@ use cara_core::config::Priority;
 use cara_core::error::Error;
 use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
-use cara_core::time::Duration;
 
 use super::met;
 use crate::scenario::scenarios;
-use crate::{Fault, Service, Spec, Unit, World, millis, number, secs};
+use crate::{Fault, Gate, Service, Spec, Unit, World, millis, number, secs};
 
 scenarios![
     a_stop_of_all_stays_until_it_is_reset: "stop and reset", Light, [], ["RequestsRun"];
@@ -31,14 +30,14 @@ struct Vehicle {
 }
 
 impl Vehicle {
-    /// `reset_takes` is how long the handler of the reset runs.
-    fn new(world: &mut dyn World, reset_takes: Duration) -> Self {
+    /// The handler of the reset waits at this gate, if there is one.
+    fn new(world: &mut dyn World, gate: Option<&Gate>) -> Self {
         // So long that nothing ends by time.
         let moved = MOVED.map(|name| Service::new(&format!("{name}(n: int[1])")).lease(secs(60)));
         let stop = Service::new("stop()").stops_all().priority(Priority::Emergency);
-        let reset = Service::new("reset()").resets_all().takes(reset_takes);
+        let reset = Service::new("reset()").resets_all();
         // A board's emergency waits for nothing.
-        let reset = if reset_takes == Duration::ZERO { reset.priority(Priority::Emergency) } else { reset };
+        let reset = if let Some(gate) = gate { reset.waits_at(gate) } else { reset.priority(Priority::Emergency) };
         let manager = world.add(Spec::manager("manager", 1));
         let services = [&moved[0], &moved[1], &stop, &reset];
         let agv = world.add(services.into_iter().fold(Spec::agv("agv", 7), Spec::service));
@@ -77,7 +76,7 @@ impl Vehicle {
 }
 
 fn a_stop_of_all_stays_until_it_is_reset(world: &mut dyn World) {
-    let vehicle = Vehicle::new(world, Duration::ZERO);
+    let vehicle = Vehicle::new(world, None);
     vehicle.drives_and_lifts(world);
     assert_eq!(vehicle.ask(world, "stop"), Ok(()));
     assert_eq!(vehicle.live(), [false; 2]);
@@ -95,12 +94,14 @@ fn a_stop_of_all_stays_until_it_is_reset(world: &mut dyn World) {
 }
 
 fn a_reset_that_was_asked_for_before_a_stop_undoes_nothing(world: &mut dyn World) {
-    let vehicle = Vehicle::new(world, secs(1));
+    let gate = Gate::default();
+    let vehicle = Vehicle::new(world, Some(&gate));
     assert_eq!(vehicle.ask(world, "stop"), Ok(()));
     let runs = vehicle.reset.log().runs();
     let early = vehicle.manager.begin("agv", "reset", &number("n", 1), PATIENT);
     world.wait("its handler runs", || vehicle.reset.log().runs() == runs + 1, secs(20));
     assert_eq!(vehicle.ask(world, "stop"), Ok(()));
+    gate.open();
     assert_eq!(world.finish(&early).map(drop), INHIBITED);
     vehicle.is_stopped(world);
     vehicle.is_reset(world);
@@ -109,7 +110,7 @@ fn a_reset_that_was_asked_for_before_a_stop_undoes_nothing(world: &mut dyn World
 
 /// The stop and the reset go ahead as datagrams while the stream is held up.
 fn a_call_from_before_a_stop_never_begins(world: &mut dyn World) {
-    let vehicle = Vehicle::new(world, Duration::ZERO);
+    let vehicle = Vehicle::new(world, None);
     vehicle.drives_and_lifts(world);
     world.fault(Fault::FreezeStreams(&vehicle.manager, &vehicle.agv, secs(2)));
     let early = vehicle.manager.begin("agv", "drive", &number("n", 1), PATIENT);
