@@ -131,7 +131,7 @@ fn every_counter_of_the_api_is_in_the_text_with_its_value() {
     let own = Identity::m_unit(name, 1).unwrap();
     let others = [1, 2, 3].map(|id| Identity::s_unit("agv", id).unwrap());
     let manager = CommunicationSystem::builder(name, 1).unwrap().interfaces(Interfaces::Loopback);
-    let manager = keyed(manager, fleet, &own, &others).build().unwrap();
+    let manager = keyed(manager, fleet, &own, &others).constraints(keyed::M_UNIT).build().unwrap();
     manager.start().unwrap();
     let agvs: Vec<_> = others
         .iter()
@@ -187,7 +187,7 @@ fn the_clock_of_a_node_is_in_the_text_if_the_node_tells_it() {
     let own = Identity::m_unit("manager", 1).unwrap();
     let others = [1, 2].map(|id| Identity::s_unit("agv", id).unwrap());
     let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::Loopback);
-    let manager = keyed(manager, fleet, &own, &others).build().unwrap();
+    let manager = keyed(manager, fleet, &own, &others).constraints(keyed::M_UNIT).build().unwrap();
     manager.start().unwrap();
     assert!(!manager.metrics().contains("cara_clock"));
     let _agvs = others.each_ref().map(|other| {

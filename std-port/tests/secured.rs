@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::keys::{FleetKeys, Store, location};
 use cara_std::{
-    BuildError, Builder, CloseReason, CommunicationSystem, Definition, Fleet, Identity, Interfaces, MUnit, Parameters,
-    ParametersView, Refusal, SUnit, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
+    BuildError, Builder, CloseReason, CommunicationSystem, Constraints, Definition, Fleet, Identity, Interfaces, MUnit,
+    Parameters, ParametersView, Refusal, SUnit, Served, ServiceError, ServiceOptions, StartError, Unit, UnitEvent,
 };
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -46,7 +46,9 @@ fn keys(fleet: Fleet, vehicles: &[u32]) -> FleetKeys {
 /// Without a control socket, which would tell of it beside the network.
 fn manager(fleet: Fleet) -> Builder<(), MUnit> {
     let builder = CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0);
-    builder.interfaces(Interfaces::Loopback).control(cara_std::control::Control::Off)
+    // A call ends after longer than a thread waits for its turn on a busy machine.
+    let constraints = Constraints { request_timeout: PATIENCE.into(), ..Constraints::M_UNIT };
+    builder.interfaces(Interfaces::Loopback).control(cara_std::control::Control::Off).constraints(constraints)
 }
 
 fn vehicle(fleet: Fleet, id: u32) -> Builder<(), SUnit> {

@@ -88,7 +88,7 @@ fn a_handler_that_panics_harms_nobody_else() {
 fn a_slow_handler_delays_nobody_else() {
     let fleet = fleet();
     let constraints =
-        cara_std::Constraints { keep_alive: cara_std::Duration::from_millis(800), ..cara_std::Constraints::M_UNIT };
+        cara_std::Constraints { keep_alive: cara_std::Duration::from_millis(800), ..crate::keyed::M_UNIT };
     let manager = system(fleet).constraints(constraints).build().unwrap();
     let gate = Arc::new(Gate::default());
     manager.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();

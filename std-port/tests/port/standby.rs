@@ -17,7 +17,7 @@ use cara_std::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::support::{PATIENCE, counter, fleet, number, system, unit, until, value, within};
+use crate::support::{PATIENCE, counter, fleet, number, system, system_by_default, unit, until, value, within};
 
 const PART: &str = "CARA_TEST_STANDBY";
 /// How often the manager that commands is killed; a measurement sets more.
@@ -89,7 +89,7 @@ impl Drop for Manager {
 fn as_child() {
     let part = std::env::var(PART).expect("the part to play");
     let [fleet, is_on_host, state] = part.splitn(3, ' ').collect::<Vec<_>>().try_into().unwrap();
-    let manager = system(fleet.parse().unwrap()).interfaces(interfaces(is_on_host == "true"));
+    let manager = system_by_default("manager", 1, fleet.parse().unwrap()).interfaces(interfaces(is_on_host == "true"));
     let manager = manager.control(Control::Off).standby().state_folder(state).build().unwrap();
     let events = manager.events();
     manager.start().unwrap();
@@ -252,8 +252,11 @@ fn a_standby_needs_keys_and_starts_beside_a_manager() {
     let plain = system(fleet).control(Control::Off).insecure().standby().build();
     assert!(matches!(plain, Err(BuildError::StandbyWithoutKeys)), "{plain:?}");
     let socket = folder.path().join("sockets/manager");
-    let build =
-        |name: &str| system(fleet).control(Control::Path(socket.clone())).state_folder(folder.path().join(name));
+    let build = |name: &str| {
+        system_by_default("manager", 1, fleet)
+            .control(Control::Path(socket.clone()))
+            .state_folder(folder.path().join(name))
+    };
     let manager = build("manager").build().unwrap();
     manager.start().unwrap();
     let standby = build("standby").standby().build().unwrap();

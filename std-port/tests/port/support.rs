@@ -10,7 +10,7 @@ use cara_std::{
     SUnit, Served, ServiceError, Unit,
 };
 
-use crate::keyed::keyed;
+use crate::keyed::{M_UNIT, S_UNIT, keyed};
 
 /// Longest wait for anything that is to happen.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -69,6 +69,11 @@ pub(crate) fn system(fleet: u32) -> Builder<(), MUnit> {
 }
 
 pub(crate) fn system_named(name: &str, id: u32, fleet: u32) -> Builder<(), MUnit> {
+    system_by_default(name, id, fleet).constraints(M_UNIT)
+}
+
+/// With the limits that it has by itself, which are others for a standby.
+pub(crate) fn system_by_default(name: &str, id: u32, fleet: u32) -> Builder<(), MUnit> {
     let builder = CommunicationSystem::builder(name, id).unwrap().interfaces(Interfaces::Loopback);
     let others = [m_units(), s_units()].concat();
     keyed(builder, fleet, &Identity::m_unit(name, id).unwrap(), &others)
@@ -85,7 +90,7 @@ pub(crate) fn unit_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> 
     assert!(s_units().contains(&own), "the managers have no key for {own}: name it in s_units");
     let builder = Unit::builder(name, id, manager.0, manager.1).unwrap().interfaces(Interfaces::Loopback);
     let manager = Identity::m_unit(manager.0, manager.1).unwrap();
-    keyed(builder, fleet, &own, &[m_units(), vec![manager]].concat())
+    keyed(builder, fleet, &own, &[m_units(), vec![manager]].concat()).constraints(S_UNIT)
 }
 
 /// All m_units of these tests.
