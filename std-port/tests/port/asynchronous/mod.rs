@@ -13,7 +13,9 @@ use std::time::{Duration, Instant};
 
 use cara_std::{CallError, Constraints, Error, Parameters, Peer, RequestOptions, ServiceError};
 
-use crate::support::{Gate, ask, counter, fleet, held, meet, number, pair, service, system, unit, until, value};
+use crate::support::{
+    Gate, PATIENCE, ask, counter, fleet, held, meet, number, pair, service, system, unit, until, value,
+};
 
 fn runtime() -> tokio::runtime::Runtime {
     tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_time().build().unwrap()
@@ -137,24 +139,40 @@ fn a_future_waits_for_the_interval_within_its_deadline() {
     let (manager, agv) = pair();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
-    // Longer than a thread waits for its turn, or the third call would not come too soon.
     let interval = cara_std::Duration::from_millis(800);
-    peer.set_constraints(Constraints { minimum_interval: interval, ..peer.constraints() }).unwrap();
+    let set = |minimum_interval| {
+        peer.set_constraints(Constraints { minimum_interval, ..peer.constraints() }).unwrap();
+    };
+    set(interval);
+    let sent = || counter(&peer.counters(), "RequestsSent");
     runtime().block_on(async {
         let began = Instant::now();
         assert_eq!(echo(&peer, 1).await, Ok(1));
         assert_eq!(echo(&peer, 2).await, Ok(2));
         assert!(began.elapsed() >= interval.into(), "{:?}", began.elapsed());
+        // Longer than a thread waits for its turn, or the third call would not come too soon.
+        set(cara_std::Duration::from_secs(60));
         let mut parameters = number(3);
         let refused = peer.call("echo", &mut parameters).with(within_millis(20)).await.map_err(Error::from);
         assert!(matches!(refused, Err(Error::TooSoon { .. })), "{refused:?}");
-        // Dropped while it waits, it is never sent.
-        let mut pending = peer.call("echo", &mut parameters).with(patient()).into_future();
-        assert_eq!(once(&mut pending).await, None);
-        drop(pending);
-        tokio::time::sleep(Duration::from_millis(1_200)).await;
+        assert_eq!((sent(), counter(&agv.manager().unwrap().counters(), "RequestsRun")), (2, 2));
+        // Dropped while it waits, it is never sent. It does not wait if the machine has stood still for the interval.
+        let mut has_waited = false;
+        while !has_waited {
+            assert!(began.elapsed() < 3 * PATIENCE, "not in time: a call waits for the interval");
+            set(cara_std::Duration::ZERO);
+            let last = Instant::now();
+            assert_eq!(echo(&peer, 4).await, Ok(4));
+            set(interval);
+            let before = sent();
+            let mut pending = peer.call("echo", &mut parameters).with(patient()).into_future();
+            let polled = once(&mut pending).await;
+            has_waited = last.elapsed() < interval.into();
+            drop(pending);
+            tokio::time::sleep(Duration::from_millis(1_200)).await;
+            assert!(!has_waited || (polled.is_none() && sent() == before), "{polled:?} {} {before}", sent());
+        }
     });
-    assert_eq!(counter(&agv.manager().unwrap().counters(), "RequestsRun"), 2);
 }
 
 #[test]
