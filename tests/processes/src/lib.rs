@@ -81,15 +81,25 @@ impl Process {
 
     /// Waits for a line that contains `text`, behind the one that the last call found.
     pub fn expect(&mut self, text: &str, within: Duration) -> Result<Line> {
-        let found = self.output.wait(self.passed, text, within);
-        let (index, line) = found.ok_or_else(|| self.missing(text, within))?;
+        self.expect_any(&[text], within)
+    }
+
+    /// As [`expect`](Self::expect), for a line that contains any of these.
+    pub fn expect_any(&mut self, texts: &[&str], within: Duration) -> Result<Line> {
+        let found = self.output.wait(self.passed, texts, within);
+        let (index, line) = found.ok_or_else(|| self.missing(&texts.join("` or `"), within))?;
         self.passed = index + 1;
         Ok(line)
     }
 
     /// Waits for a line that contains `text`, among all of them; those that have come count.
     pub fn seen(&self, text: &str, within: Duration) -> Result<Line> {
-        self.output.wait(0, text, within).map(|(_, line)| line).ok_or_else(|| self.missing(text, within))
+        self.seen_behind(0, text, within)
+    }
+
+    /// As [`seen`](Self::seen), among those behind the first `count`.
+    pub fn seen_behind(&self, count: usize, text: &str, within: Duration) -> Result<Line> {
+        self.output.wait(count, &[text], within).map(|(_, line)| line).ok_or_else(|| self.missing(text, within))
     }
 
     /// Whether a line that contains `text` has come.
@@ -220,13 +230,14 @@ impl Output {
         self.changed.notify_all();
     }
 
-    fn wait(&self, from: usize, text: &str, within: Duration) -> Option<(usize, Line)> {
+    fn wait(&self, from: usize, texts: &[&str], within: Duration) -> Option<(usize, Line)> {
         let deadline = Instant::now() + within;
         let mut state = self.lock();
         let mut looked = from;
         loop {
             let fresh = state.lines.iter().enumerate().skip(looked);
-            if let Some((index, line)) = fresh.into_iter().find(|(_, line)| line.text.contains(text)) {
+            let mut fresh = fresh.filter(|(_, line)| texts.iter().any(|text| line.text.contains(*text)));
+            if let Some((index, line)) = fresh.next() {
                 return Some((index, line.clone()));
             }
             looked = looked.max(state.lines.len());

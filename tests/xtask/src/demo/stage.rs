@@ -9,7 +9,13 @@ use cara_processes::{Line, Process, random_fleet};
 use tempfile::TempDir;
 
 /// How long anything may take that takes a second at most when the machine has nothing else to do.
-pub(super) const STEP: Duration = Duration::from_secs(10);
+pub(super) const STEP: Duration = Duration::from_secs(60);
+/// How long a vehicle may take to set out or to arrive before it is sent once more.
+pub(super) const TRY: Duration = Duration::from_secs(10);
+/// Between two of them, and between two questions.
+const PAUSE: Duration = Duration::from_millis(200);
+/// What an AGV prints when the lease has ended for which it drove.
+pub(super) const EXPIRED: &str = "lease of go_to expired";
 
 /// The fleet's nodes, as `cara keys` takes them.
 const NODES: [&str; 4] = ["AGV_manager/1@m_unit", "agv-1/11", "agv-2/12", "agv-3/13"];
@@ -70,6 +76,53 @@ impl Stage {
         let answer = manager.expect(wanted, STEP).with_context(|| format!("after the command `{command}`"))?;
         println!("{:>6.1} s  {command:<42} {}", self.seconds(), answer.text);
         Ok(answer.text)
+    }
+
+    /// As [`command`](Self::command), for what may be asked again: until its answer contains `wanted`.
+    pub(super) fn until(&self, manager: &mut Process, command: &str, wanted: &str) -> Result<String> {
+        let deadline = Instant::now() + STEP;
+        loop {
+            manager.send(command)?;
+            let answer = manager.expect_any(&["= ", "! "], STEP)?;
+            println!("{:>6.1} s  {command:<42} {}", self.seconds(), answer.text);
+            if answer.text.contains(wanted) {
+                return Ok(answer.text);
+            }
+            ensure!(Instant::now() < deadline, "`{command}` is not answered by `{wanted}`");
+            std::thread::sleep(PAUSE);
+        }
+    }
+
+    /// Sends an AGV somewhere until `is_done`: on a busy machine its lease may end on the way, or the call may come too late to
+    /// begin.
+    pub(super) fn sends(
+        &self,
+        manager: &mut Process,
+        agv: &mut Process,
+        go_to: &str,
+        is_done: impl Fn(&Self, &mut Process) -> Result<bool>,
+    ) -> Result<()> {
+        let deadline = Instant::now() + STEP;
+        loop {
+            let before = agv.lines().len();
+            self.until(manager, go_to, "= accepted")?;
+            if is_done(self, agv)? {
+                return Ok(());
+            }
+            ensure!(Instant::now() < deadline, "again and again the order `{go_to}` has ended before its time");
+            // One that has stopped says why as well, which is not to be taken for the end of the next order.
+            if agv.lines()[before..].iter().any(|line| line.text.starts_with("stopped at")) {
+                let _ = agv.seen_behind(before, EXPIRED, TRY);
+            }
+            std::thread::sleep(PAUSE);
+        }
+    }
+
+    /// Whether an AGV arrives where it was sent, and has not stopped on the way.
+    pub(super) fn arrives(&self, agv: &mut Process, place: &str) -> Result<bool> {
+        let Ok(line) = agv.expect_any(&["arrived at", "stopped at"], TRY) else { return Ok(false) };
+        self.heard(&line, agv);
+        Ok(line.text.contains(&format!("arrived at {place}")))
     }
 
     pub(super) fn title(&self, title: &str) {
