@@ -3,7 +3,7 @@
 use std::sync::PoisonError;
 use std::time::{Duration, Instant};
 
-use cara_std::{CallError, CommunicationSystem, Error, Parameters, Peer};
+use cara_std::{CallError, CommunicationSystem, Error, Parameters, Peer, RequestOptions};
 
 use super::driver::Command;
 use super::known::State;
@@ -15,6 +15,9 @@ use cara_apps::warehouse::{BrakeClient, FAULT, WorkshopClient};
 const MECHANIC_AGAIN: Duration = Duration::from_secs(10);
 /// A reset that came to nothing is tried again.
 const RESET_AGAIN: Duration = Duration::from_secs(1);
+/// How long the answers to a stop of all are waited for: a busy machine is late with them. How soon a vehicle stands is measured
+/// in the vehicle.
+const STOP_TOLD: Duration = Duration::from_secs(20);
 
 impl Manager<'_> {
     /// Stops all vehicles at the same time, whatever else is on its way to them.
@@ -22,7 +25,8 @@ impl Manager<'_> {
         let system = self.post.system.clone();
         std::thread::spawn(move || {
             let began = Instant::now();
-            let outcomes = system.call_all("stop", &Parameters::new()).wait();
+            let patient = RequestOptions { timeout: Some(STOP_TOLD.into()), ..RequestOptions::new() };
+            let outcomes = system.call_all("stop", &Parameters::new()).with(patient).wait();
             let took = began.elapsed();
             let stopped = outcomes.iter().filter(|(_, outcome)| outcome.is_ok()).count();
             // One that is switched off, or just now, slows down by itself.
