@@ -7,7 +7,7 @@ use cara_processes::Process;
 use cara_std::{CallError, Error, Renew, StartError};
 
 use super::Stop;
-use super::inject::{EmulatedBoard, OFF, ON, RENEWED, STANDS, TRIES, pause};
+use super::inject::{EmulatedBoard, OFF, ON, RENEWED, STANDS, pause, tries};
 use crate::board::LONG;
 use crate::manager::{self, ANNOUNCE, INSIST, Manager, sends};
 
@@ -51,7 +51,7 @@ impl EmulatedBoard {
     /// It moves the vehicle, and stops it; the line behind that.
     fn commands(&self, manager: &Manager) -> Result<usize> {
         let line = self.board.line();
-        for _ in 0..TRIES {
+        for () in tries() {
             let agv = manager.meet(&self.who)?;
             match sends(&agv, [-9_000, 0], Renew::Process) {
                 Ok(true) => {

@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use cara_std::{Heart, LeaseEnd, Peer, Renew, RequestOptions, UnitEvent};
 
 use super::Stop;
-use super::inject::{EmulatedBoard, LEFT, OFF, ON, PHASES, STANDS, TRIES, pause};
+use super::inject::{BUSY, EmulatedBoard, LEFT, OFF, ON, PHASES, STANDS, pause, tries};
 use super::kind::POLL;
 use super::orders::{CREEP, arguments};
 use crate::board::LONG;
@@ -25,7 +25,7 @@ impl EmulatedBoard {
     /// turn the motors: the board has one pin for them.
     pub(super) fn loop_hangs(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;
-        for _ in 0..TRIES {
+        for () in tries() {
             let (agv, ends) = (manager.meet(&self.who)?, AtomicBool::new(false));
             let (held, is_held) = sync_channel(1);
             let line = self.board.line();
@@ -44,7 +44,7 @@ impl EmulatedBoard {
             self.stands(&agv, line, behind)?;
             return Ok(stop);
         }
-        bail!("in {TRIES} tries no lease was renewed in time")
+        bail!("for {BUSY:?} no lease was renewed in time")
     }
 
     /// Drives, beats once more behind the answer to the announcement, and comes round no more. `None` where this machine was too busy.
@@ -84,7 +84,7 @@ impl EmulatedBoard {
     /// The manager drops the guard of a call that its process would renew.
     pub(super) fn guard_is_dropped(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;
-        for _ in 0..TRIES {
+        for () in tries() {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();
             let wanted = RequestOptions::renewing(Renew::Process);
@@ -105,7 +105,7 @@ impl EmulatedBoard {
                 return Ok(stop);
             }
         }
-        bail!("in {TRIES} tries no lease was renewed in time, or no datagram that releases came first")
+        bail!("for {BUSY:?} no lease was renewed in time, or no datagram that releases came first")
     }
 }
 

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 use std::rc::Rc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::agv::GO_TO_LEASE;
@@ -22,8 +22,8 @@ pub(super) const PHASES: u64 = 250;
 pub(super) const STANDS: Duration = Duration::from_millis(300);
 /// How often a manager renews that has its turns.
 pub(super) const RENEWED: Duration = Duration::from_millis(100);
-/// Times that a drive is started again because this machine was too busy to renew a lease in time.
-pub(super) const TRIES: u32 = 5;
+/// For so long a drive is started again because this machine was too busy to renew a lease in time.
+pub(super) const BUSY: Duration = LONG.saturating_mul(2);
 /// What the board logs.
 pub(super) const ON: &str = "motors on";
 pub(super) const OFF: &str = "motors off:";
@@ -38,6 +38,12 @@ pub(super) struct EmulatedBoard {
     pub(super) who: Who,
     /// The constants that the image has logged.
     constants: String,
+}
+
+/// A try after the other, as long as the machine may be too busy.
+pub(super) fn tries() -> impl Iterator<Item = ()> {
+    let end = Instant::now() + BUSY;
+    std::iter::from_fn(move || (Instant::now() < end).then_some(()))
 }
 
 /// A vehicle that drives, and whose fault has been announced.
@@ -227,7 +233,7 @@ impl EmulatedBoard {
 
     /// Sends the vehicle on its way, and announces a fault at some moment.
     pub(super) fn drive(&self, manager: &Manager, dice: &mut fastrand::Rng) -> Result<Drive> {
-        for _ in 0..TRIES {
+        for () in tries() {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();
             if !sends(&agv, [9_000, 0], Renew::Process)? {
@@ -240,7 +246,7 @@ impl EmulatedBoard {
                 return Ok(Drive { agv, line });
             }
         }
-        anyhow::bail!("in {TRIES} tries no lease was renewed in time")
+        anyhow::bail!("for {BUSY:?} no lease was renewed in time")
     }
 
     fn cut(&self, failing: Failing) -> Result<()> {

@@ -11,7 +11,7 @@ use cara_processes::Process;
 use cara_std::{Definition, LeaseWatch, ParametersView, Served, ServiceOptions, Unit};
 use rustix::time::{ClockId, clock_gettime};
 
-use super::inject::{STANDS, TRIES, pause};
+use super::inject::{BUSY, STANDS, pause, tries};
 use super::kind::{Bound, Failing, Kind};
 use super::{Stop, Target, shared};
 use crate::board::{FLEET, LONG, Who};
@@ -86,14 +86,14 @@ fn second_manager(dice: &mut fastrand::Rng) -> Result<u64> {
     std::thread::sleep(STANDS);
     let offs = vehicle.lines().iter().filter(|line| line.text.starts_with(OFF)).count();
     // A busy host may let the second one's lease end; the first one must not be what moves the vehicle then.
-    let running = second.has("driving");
+    let running = second.seen("driving", LONG).is_ok();
     ensure!(running && offs <= 2, "the first manager came back: {:?}", vehicle.lines());
     Ok(took)
 }
 
 /// A vehicle that drives, and its manager, beside which a second one has not started.
 fn beside_a_second_manager() -> Result<(Process, Process)> {
-    for _ in 0..TRIES {
+    for () in tries() {
         let (mut vehicle, first) = (vehicle()?, manager()?);
         vehicle.expect(ON, LONG)?;
         let ended = manager()?.wait(LONG)?;
@@ -102,7 +102,7 @@ fn beside_a_second_manager() -> Result<(Process, Process)> {
             return Ok((vehicle, first));
         }
     }
-    bail!("in {TRIES} tries the vehicle stopped though its manager was there")
+    bail!("for {BUSY:?} the vehicle stopped again and again though its manager was there")
 }
 
 /// From the fault until both the motors' loop and the safe hook have stopped the vehicle for the `nth` time, in microseconds;

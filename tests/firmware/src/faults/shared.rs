@@ -13,14 +13,12 @@ use cara_std::{
     CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Served, ServiceOptions,
 };
 
-use super::inject::{STANDS, pause};
+use super::inject::{BUSY, STANDS, pause, tries};
 use super::processes::{OFF, ON, SAFE, motors, now, start, stopped};
 use crate::board::{FLEET, LONG};
 use crate::manager::{at, outcome, patiently, sets_out};
 
 const VEHICLE: (&str, u32) = ("crane", 3);
-/// A motion that ended before the fault, as the host may be too busy to renew its lease, is begun again so often.
-const TRIES: u32 = 5;
 /// Both callers may move and stop it.
 const RIGHTS: &str = "\
 [[allow]]
@@ -36,7 +34,7 @@ verbs = \"list\"
 /// The second one's call is refused, and the motion goes on until the first one wants it no more.
 pub(super) fn held(dice: &mut fastrand::Rng) -> Result<u64> {
     let (vehicle, one, two) = stage()?;
-    for _ in 0..TRIES {
+    for () in tries() {
         let (mut seen, one, two) = (lines(&vehicle, OFF), peer(&one)?, peer(&two)?);
         moves(&vehicle, &one)?;
         pause(dice);
@@ -52,7 +50,7 @@ pub(super) fn held(dice: &mut fastrand::Rng) -> Result<u64> {
         seen += 1;
         return stopped(&vehicle, fault, seen, false);
     }
-    bail!("in {TRIES} tries no lease was renewed in time")
+    bail!("for {BUSY:?} no lease was renewed in time")
 }
 
 /// The second one stops it and may not reset it; the first one moves it no more.

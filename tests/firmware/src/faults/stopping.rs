@@ -7,7 +7,7 @@ use cara_apps::agv::{BUMPER, BUMPER_IS_PRESSED};
 use cara_std::{Error, Parameters, Peer, Priority, RequestOptions, ServiceError};
 
 use super::Stop;
-use super::inject::{Drive, EmulatedBoard, OFF, TRIES};
+use super::inject::{BUSY, Drive, EmulatedBoard, OFF, tries};
 use crate::manager::{Manager, at, fault, outcome, patiently, reset};
 
 /// Callers that keep the board busy.
@@ -22,7 +22,7 @@ impl EmulatedBoard {
     /// The manager's other calls fill the link and the board while it stops the vehicle.
     pub(super) fn is_stopped(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;
-        for _ in 0..TRIES {
+        for () in tries() {
             let Drive { agv, line } = self.drive(&manager, dice)?;
             let is_late = self.is_stopped_in_a_flood(&agv, line)?;
             let (behind, stop) = self.stopped(line)?;
@@ -34,7 +34,7 @@ impl EmulatedBoard {
                 return Ok(stop);
             }
         }
-        bail!("in {TRIES} tries no lease was renewed in time, or no datagram that stops came first")
+        bail!("for {BUSY:?} no lease was renewed in time, or no datagram that stops came first")
     }
 
     /// Whether this machine was too busy to renew the lease until then.
