@@ -6,6 +6,7 @@ pub mod faults;
 pub mod files;
 pub mod network;
 pub mod switch;
+pub mod ticker;
 
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Write};
