@@ -21,6 +21,8 @@ pub(crate) const AGVS: [&str; 5] = ["agv-1", "agv-2", "agv-3", "agv-4", "agv-5"]
 /// Where those drive that do not wait for the page: along x first, then along y, through the aisles of the [map].
 /// Each command has one of the few connections to the manager.
 const TARGETS: [(&str, [u32; 2]); 2] = [("agv-2", [24, 13]), ("agv-3", [12, 13])];
+/// How often commands that have ended are given again.
+const MOST_AGAIN: usize = 5;
 
 const BOX: &str = "name = 'box'
 id = 20
@@ -46,6 +48,8 @@ pub(crate) struct Stage {
     pub(crate) ports: Ports,
     /// Calls that are held from outside of the page.
     held: Vec<Process>,
+    /// How often one was made again.
+    again: usize,
 }
 
 impl Stage {
@@ -70,6 +74,7 @@ impl Stage {
             web: None,
             ports: Ports::choose()?,
             held: Vec::new(),
+            again: 0,
         };
         stage.start_manager()?;
         for (name, id) in AGVS.iter().zip(11..) {
@@ -99,12 +104,28 @@ impl Stage {
 
     /// Has some vehicles drive, kept by commands until they have arrived.
     pub(crate) fn drive(&mut self) -> Result<()> {
-        for (name, [x, y]) in TARGETS {
-            let call = format!("go_to(position: [{x}, {y}])");
-            let held = self.process(name, "cara", &["call", "--hold", "--timeout", "30s", name, &call])?;
+        for target in TARGETS {
+            let held = self.hold(target)?;
             self.held.push(held);
         }
         Ok(())
+    }
+
+    /// Has them drive on where their lease has ended, as on a host that stood still for longer.
+    pub(crate) fn drive_on(&mut self) -> Result<()> {
+        for (number, target) in TARGETS.into_iter().enumerate() {
+            let has_stopped = self.held[number].wait(Duration::ZERO).is_ok_and(|status| !status.success());
+            if has_stopped && self.again < MOST_AGAIN {
+                self.again += 1;
+                self.held[number] = self.hold(target)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn hold(&self, (name, [x, y]): (&str, [u32; 2])) -> Result<Process> {
+        let call = format!("go_to(position: [{x}, {y}])");
+        self.process(name, "cara", &["call", "--hold", "--timeout", "30s", name, &call])
     }
 
     /// The page's server; its address with the key. It was told of the proxies, and is reached without them as well.
