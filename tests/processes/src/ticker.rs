@@ -1,11 +1,28 @@
 //! A thread that looks at the clock and does nothing else: where it has no turn, the host holds the process up, and what a test
 //! measures there is the host.
 
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Between two looks.
 const TICK: Duration = Duration::from_millis(10);
+/// How often a test begins at most.
+const TRIES: usize = 5;
+
+/// Runs a test in which something has to go on in time; again where it fails and the host gave this process no turn for so long,
+/// since that may have ended it. What fails without that, or each time, fails.
+pub fn unless_held_up(so_long: Duration, test: impl Fn()) {
+    for _ in 1..TRIES {
+        let ticker = Ticker::start();
+        match catch_unwind(AssertUnwindSafe(&test)) {
+            Ok(()) => return,
+            Err(failed) if ticker.longest() < so_long => resume_unwind(failed),
+            Err(_) => {}
+        }
+    }
+    test();
+}
 
 /// For how long this process had no turn since this was started; dropping it ends it.
 pub struct Ticker {
@@ -57,7 +74,8 @@ fn look(gaps: &Mutex<Gaps>) -> MutexGuard<'_, Gaps> {
 
 #[cfg(test)]
 mod tests {
-    use super::{TICK, Ticker};
+    use super::{TICK, TRIES, Ticker, unless_held_up};
+    use std::cell::Cell;
     use std::time::Duration;
 
     #[test]
@@ -70,5 +88,24 @@ mod tests {
         drop(held_up);
         assert!(ticker.longest() >= HELD_UP - TICK);
         assert!(ticker.together() >= before + HELD_UP - TICK);
+    }
+
+    #[test]
+    fn a_test_that_was_held_up_begins_again() {
+        let runs = Cell::new(0);
+        unless_held_up(Duration::ZERO, || {
+            runs.set(runs.get() + 1);
+            assert_eq!(runs.get(), TRIES, "it fails until then");
+        });
+    }
+
+    #[test]
+    #[should_panic = "it fails once"]
+    fn a_test_that_was_not_held_up_fails_at_once() {
+        let runs = Cell::new(0);
+        unless_held_up(Duration::MAX, || {
+            runs.set(runs.get() + 1);
+            assert!(runs.get() > 1, "it fails once");
+        });
     }
 }

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use cara_processes::ticker::unless_held_up;
 use cara_std::{
     Definition, Error, LeaseWatch, Parameters, ParametersView, Renew, RequestOptions, Served, ServiceError,
     ServiceOptions, Unit,
@@ -82,74 +83,84 @@ fn until(mut done: impl FnMut() -> bool) {
 
 #[test]
 fn what_is_held_goes_on_until_it_has_finished() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let mut held = driver.held(&stage);
-    let order = driver.order.lock().unwrap().clone().unwrap();
-    assert!(driver.unit.end_order(&order));
-    held.expect("finished");
-    assert_eq!(held.end(), 0);
-    assert_eq!(driver.made_safe(), 0, "what has finished needs no safe hook");
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let mut held = driver.held(&stage);
+        let order = driver.order.lock().unwrap().clone().unwrap();
+        assert!(driver.unit.end_order(&order));
+        held.expect("finished");
+        assert_eq!(held.end(), 0);
+        assert_eq!(driver.made_safe(), 0, "what has finished needs no safe hook");
+    });
 }
 
 #[test]
 fn who_goes_away_stops_what_is_held() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let held = driver.held(&stage);
-    held.interrupt();
-    until(|| driver.made_safe() == 1);
-    assert!(!driver.lease.is_live());
-    held.end();
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let held = driver.held(&stage);
+        held.interrupt();
+        until(|| driver.made_safe() == 1);
+        assert!(!driver.lease.is_live());
+        held.end();
+    });
 }
 
 /// A stopped process keeps its connection open, and nothing but the missing signs of life tells the manager.
 #[test]
 fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let held = driver.held(&stage);
-    held.freeze();
-    until(|| driver.made_safe() == 1);
-    assert!(!driver.lease.is_live());
-    held.thaw();
-    assert_eq!(held.end(), 1, "it goes on as one that has lost what it held");
-    assert_eq!(driver.made_safe(), 1);
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let held = driver.held(&stage);
+        held.freeze();
+        until(|| driver.made_safe() == 1);
+        assert!(!driver.lease.is_live());
+        held.thaw();
+        assert_eq!(held.end(), 1, "it goes on as one that has lost what it held");
+        assert_eq!(driver.made_safe(), 1);
+    });
 }
 
 /// The manager has events all the time, and still detects at once that the lease is no longer held.
 #[test]
 fn who_goes_away_is_noticed_among_many_events() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let held = driver.held(&stage);
-    let (unit, busy) = (driver.unit.clone(), Arc::new(AtomicBool::new(true)));
-    let continues = busy.clone();
-    let events = std::thread::spawn(move || {
-        let functions = unit.my_function_list();
-        let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
-        while continues.load(Ordering::SeqCst) {
-            functions.add_service(&Definition::parse("news()").unwrap(), ServiceOptions::new(), nothing).unwrap();
-            unit.publish_my_function_list().unwrap();
-            std::thread::sleep(Duration::from_millis(5));
-            functions.remove("news").unwrap();
-        }
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let held = driver.held(&stage);
+        let (unit, busy) = (driver.unit.clone(), Arc::new(AtomicBool::new(true)));
+        let continues = busy.clone();
+        let events = std::thread::spawn(move || {
+            let functions = unit.my_function_list();
+            let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+            while continues.load(Ordering::SeqCst) {
+                functions.add_service(&Definition::parse("news()").unwrap(), ServiceOptions::new(), nothing).unwrap();
+                unit.publish_my_function_list().unwrap();
+                std::thread::sleep(Duration::from_millis(5));
+                functions.remove("news").unwrap();
+            }
+        });
+        held.interrupt();
+        until(|| driver.made_safe() == 1);
+        busy.store(false, Ordering::SeqCst);
+        events.join().unwrap();
+        held.end();
     });
-    held.interrupt();
-    until(|| driver.made_safe() == 1);
-    busy.store(false, Ordering::SeqCst);
-    events.join().unwrap();
-    held.end();
 }
 
 #[test]
 fn a_lost_vehicle_ends_the_holding() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let mut held = driver.held(&stage);
-    driver.unit.stop();
-    held.expect("it stopped there");
-    assert_eq!(held.end(), 1);
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let mut held = driver.held(&stage);
+        driver.unit.stop();
+        held.expect("it stopped there");
+        assert_eq!(held.end(), 1);
+    });
 }
 
 #[test]
@@ -171,38 +182,42 @@ fn a_call_that_its_own_lease_has_ended_says_so() {
 
 #[test]
 fn a_newer_holding_takes_over() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let (older, newer) = (driver.held(&stage), driver.held(&stage));
-    assert_eq!(older.end(), 1);
-    assert!(driver.lease.is_live());
-    newer.interrupt();
-    until(|| driver.made_safe() == 1);
-    newer.end();
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let (older, newer) = (driver.held(&stage), driver.held(&stage));
+        assert_eq!(older.end(), 1);
+        assert!(driver.lease.is_live());
+        newer.interrupt();
+        until(|| driver.made_safe() == 1);
+        newer.end();
+    });
 }
 
 #[test]
 fn what_the_program_of_a_manager_moves_is_held_unless_it_is_taken_over() {
-    let stage = Stage::empty();
-    let manager = stage.manager().build().unwrap();
-    manager.start().unwrap();
-    let driver = Driver::join(&stage);
-    let peer = manager.s_unit("driver").unwrap();
-    let wanted = RequestOptions::renewing(Renew::Process);
-    let program = || peer.call("drive", &mut Parameters::new()).with(wanted).wait();
-    assert_eq!(program(), Ok(()));
-    stage.ends(1, &["call", "driver", "drive"]).says("driver/99: Held: ").says("is held by unit 1:");
-    stage.ends(1, &["call", "driver", "--hold", "--detached", "drive"]).says("is held by unit 1:");
-    assert_eq!(stage.ends(1, &["call", "driver", "drive", "--json"]).json()["error"]["error"], "Held");
-    assert_eq!(driver.made_safe(), 0);
-    let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--take-over", "drive"]));
-    held.expect("drive()");
-    assert_eq!(program(), Err(Error::Held { by: 1, operator: true }.into()));
-    assert!(driver.lease.is_live());
-    held.interrupt();
-    until(|| driver.made_safe() == 1);
-    held.end();
-    until(|| program() == Ok(()));
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::empty();
+        let manager = stage.manager().build().unwrap();
+        manager.start().unwrap();
+        let driver = Driver::join(&stage);
+        let peer = manager.s_unit("driver").unwrap();
+        let wanted = RequestOptions::renewing(Renew::Process);
+        let program = || peer.call("drive", &mut Parameters::new()).with(wanted).wait();
+        assert_eq!(program(), Ok(()));
+        stage.ends(1, &["call", "driver", "drive"]).says("driver/99: Held: ").says("is held by unit 1:");
+        stage.ends(1, &["call", "driver", "--hold", "--detached", "drive"]).says("is held by unit 1:");
+        assert_eq!(stage.ends(1, &["call", "driver", "drive", "--json"]).json()["error"]["error"], "Held");
+        assert_eq!(driver.made_safe(), 0);
+        let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--take-over", "drive"]));
+        held.expect("drive()");
+        assert_eq!(program(), Err(Error::Held { by: 1, operator: true }.into()));
+        assert!(driver.lease.is_live());
+        held.interrupt();
+        until(|| driver.made_safe() == 1);
+        held.end();
+        until(|| program() == Ok(()));
+    });
 }
 
 #[test]
@@ -222,65 +237,73 @@ fn ctrl_c_ends_it_also_where_the_shell_ignores_it() {
 
 #[test]
 fn what_is_held_ends_with_standard_input() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let mut held = driver.held(&stage);
-    held.type_in("anything\n");
-    std::thread::sleep(LEASE);
-    assert!(driver.lease.is_live(), "what is typed ends nothing");
-    held.type_no_more();
-    until(|| driver.made_safe() == 1);
-    assert_eq!(held.end(), 1);
-    // Nothing begins where it has ended before.
-    stage.ends(2, &["call", "driver", "--hold", "drive"]).says("--detached");
-    let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
-    let a_file = std::fs::File::open(env!("CARGO_BIN_EXE_cara")).unwrap();
-    assert_eq!(command.stdin(a_file).output().unwrap().status.code(), Some(2));
-    assert_eq!(driver.made_safe(), 1);
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let mut held = driver.held(&stage);
+        held.type_in("anything\n");
+        std::thread::sleep(LEASE);
+        assert!(driver.lease.is_live(), "what is typed ends nothing");
+        held.type_no_more();
+        until(|| driver.made_safe() == 1);
+        assert_eq!(held.end(), 1);
+        // Nothing begins where it has ended before.
+        stage.ends(2, &["call", "driver", "--hold", "drive"]).says("--detached");
+        let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
+        let a_file = std::fs::File::open(env!("CARGO_BIN_EXE_cara")).unwrap();
+        assert_eq!(command.stdin(a_file).output().unwrap().status.code(), Some(2));
+        assert_eq!(driver.made_safe(), 1);
+    });
 }
 
 #[test]
 fn what_is_held_ends_when_what_reads_its_output_has_gone() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let mut held = driver.held(&stage);
-    held.read_no_more();
-    until(|| driver.made_safe() == 1);
-    assert_eq!(held.end(), 1);
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let mut held = driver.held(&stage);
+        held.read_no_more();
+        until(|| driver.made_safe() == 1);
+        assert_eq!(held.end(), 1);
+    });
 }
 
 /// A terminal that hangs up without a signal, as where a shell has ended before or ignores it.
 #[test]
 fn what_is_held_ends_when_its_terminal_hangs_up() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let (ours, theirs) = crate::terminal::pair();
-    let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
-    let end = || std::process::Stdio::from(theirs.try_clone().unwrap());
-    let mut held = command.stdin(end()).stdout(end()).stderr(end()).spawn().unwrap();
-    drop((command, theirs));
-    until(|| driver.lease.is_live());
-    std::thread::sleep(LEASE);
-    assert!(driver.lease.is_live());
-    drop(ours);
-    until(|| driver.made_safe() == 1);
-    assert_eq!(held.wait().unwrap().code(), Some(1));
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let (ours, theirs) = crate::terminal::pair();
+        let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
+        let end = || std::process::Stdio::from(theirs.try_clone().unwrap());
+        let mut held = command.stdin(end()).stdout(end()).stderr(end()).spawn().unwrap();
+        drop((command, theirs));
+        until(|| driver.lease.is_live());
+        std::thread::sleep(LEASE);
+        assert!(driver.lease.is_live());
+        drop(ours);
+        until(|| driver.made_safe() == 1);
+        assert_eq!(held.wait().unwrap().code(), Some(1));
+    });
 }
 
 #[test]
 fn what_is_held_detached_goes_on_until_its_command_ends() {
-    let stage = Stage::with(&[]);
-    let driver = Driver::join(&stage);
-    let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--detached", "drive"]));
-    held.expect("drive()");
-    held.type_no_more();
-    held.read_no_more();
-    let start = Instant::now();
-    while start.elapsed() < 2 * LEASE {
-        assert!(driver.lease.is_live() || start.elapsed() > PATIENCE, "it has ended");
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    assert_eq!(driver.made_safe(), 0);
-    held.kill();
-    until(|| driver.made_safe() == 1);
+    unless_held_up(LEASE / 3, || {
+        let stage = Stage::with(&[]);
+        let driver = Driver::join(&stage);
+        let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--detached", "drive"]));
+        held.expect("drive()");
+        held.type_no_more();
+        held.read_no_more();
+        let start = Instant::now();
+        while start.elapsed() < 2 * LEASE {
+            assert!(driver.lease.is_live() || start.elapsed() > PATIENCE, "it has ended");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        assert_eq!(driver.made_safe(), 0);
+        held.kill();
+        until(|| driver.made_safe() == 1);
+    });
 }
