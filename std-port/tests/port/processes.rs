@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use cara_processes::ticker::unless_held_up;
 use cara_std::control::Control;
 use cara_std::{
     CloseReason, Definition, Error, LeaseEnd, OrderOutcome, Parameters, ParametersView, Peer, Refusal, Renew,
@@ -16,7 +17,7 @@ use cara_std::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, unless_stalled, until, within};
+use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
 
 const PART: &str = "CARA_TEST_PART";
 
@@ -286,11 +287,10 @@ fn a_second_manager_starts_only_where_the_first_does_not_answer() {
 fn a_vehicle_stops_once_when_its_manager_is_killed() {
     let length = Duration::from_millis(1_500);
     // A renewal passes several threads, which are late one after the other.
-    unless_stalled(length / 8, || goes_until_its_manager_is_killed(length));
+    unless_held_up(length / 8, || goes_until_its_manager_is_killed(length));
 }
 
-/// `None` if the lease has ended before.
-fn goes_until_its_manager_is_killed(length: Duration) -> Option<()> {
+fn goes_until_its_manager_is_killed(length: Duration) {
     let fleet = fleet();
     let stops = Arc::new(AtomicUsize::new(0));
     let stopped = stops.clone();
@@ -303,15 +303,11 @@ fn goes_until_its_manager_is_killed(length: Duration) -> Option<()> {
     agv.publish_my_function_list().unwrap();
     agv.start().unwrap();
     let mut manager = Process::manager(fleet);
-    let mut goes_on = within(PATIENCE, || lease.is_live());
+    until("it moves", || lease.is_live());
     let began = Instant::now();
-    while goes_on && began.elapsed() < 2 * length {
+    while began.elapsed() < 2 * length {
         std::thread::sleep(Duration::from_millis(5));
-        goes_on = lease.is_live();
-    }
-    // Also behind the whole span, whatever was looked at in it.
-    if !goes_on || !lease.is_live() {
-        return None;
+        assert!(lease.is_live(), "the lease is renewed");
     }
     manager.kill();
     until("it stops", || stops.load(Ordering::SeqCst) == 1);
@@ -319,5 +315,4 @@ fn goes_until_its_manager_is_killed(length: Duration) -> Option<()> {
     until("it knows", || !agv.is_connected());
     agv.stop();
     assert_eq!(stops.load(Ordering::SeqCst), 1);
-    Some(())
 }

@@ -2,7 +2,6 @@
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::sync::Arc;
-use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use cara_std::{
@@ -35,32 +34,6 @@ pub(crate) fn within(span: Duration, mut condition: impl FnMut() -> bool) -> boo
         std::thread::sleep(Duration::from_millis(1));
     }
     true
-}
-
-/// Tries what has to be in time until it holds. That it does not is excused, for a while, where a thread that only sleeps was late by
-/// more than `gap` meanwhile: then it was the machine.
-pub(crate) fn unless_stalled<R>(gap: Duration, mut attempt: impl FnMut() -> Option<R>) -> R {
-    let end = Instant::now() + 6 * PATIENCE;
-    loop {
-        let (over, is_over) = channel::<()>();
-        let mut last = Instant::now();
-        let canary = std::thread::spawn(move || {
-            let mut longest = Duration::ZERO;
-            while is_over.recv_timeout(Duration::from_millis(5)) == Err(RecvTimeoutError::Timeout) {
-                longest = longest.max(last.elapsed());
-                last = Instant::now();
-            }
-            longest.max(last.elapsed())
-        });
-        let held = attempt();
-        drop(over);
-        let longest = canary.join().unwrap();
-        if let Some(held) = held {
-            return held;
-        }
-        assert!(longest > gap, "it does not hold, and no thread was late by more than {longest:?}");
-        assert!(Instant::now() < end, "not once in time: of this machine a thread is late by {longest:?}");
-    }
 }
 
 /// The manager of a fleet, to be given a state or built.

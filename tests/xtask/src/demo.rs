@@ -4,11 +4,11 @@
 
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
+use cara_processes::ticker::Ticker;
 
 use crate::{binaries, workspace};
 
@@ -160,11 +160,10 @@ fn drive(stage: &Stage, manager: &mut Process, agv: &mut Process, [x, y]: [i64; 
 
 /// The AGV stops within the time that it may drive on after `lose`, on its way. Where.
 fn stops(stage: &Stage, agv: &mut Process, lose: impl FnOnce() -> Result<Instant>) -> Result<String> {
-    let (stopped, held_up, _) = held_up_in(|| {
-        let lost = lose()?;
-        anyhow::Ok((lost, agv.expect("stopped at", STEP)?))
-    });
-    let (lost, stopped) = stopped?;
+    let ticker = Ticker::start();
+    let lost = lose()?;
+    let stopped = agv.expect("stopped at", STEP)?;
+    let held_up = ticker.together();
     stage.heard(&stopped, agv);
     let after = stopped.at.saturating_duration_since(lost);
     let most = DRIVES_ON + held_up;
@@ -175,28 +174,6 @@ fn stops(stage: &Stage, agv: &mut Process, lose: impl FnOnce() -> Result<Instant
     let place = place(&stopped.text)?;
     stage.show(&format!("agv-1 stopped {} ms after that, at {place}", after.as_millis()));
     Ok(place)
-}
-
-/// How long, while `run` runs, the machine kept a thread waiting that had something to do: altogether, and at most at a time.
-fn held_up_in<R>(run: impl FnOnce() -> R) -> (R, Duration, Duration) {
-    const NAP: Duration = Duration::from_millis(10);
-    let over = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let watch = scope.spawn(|| {
-            let (mut held_up, mut longest) = (Duration::ZERO, Duration::ZERO);
-            while !over.load(Ordering::Relaxed) {
-                let began = Instant::now();
-                std::thread::sleep(NAP);
-                let late = began.elapsed().saturating_sub(NAP);
-                (held_up, longest) = (held_up + late, longest.max(late));
-            }
-            (held_up, longest)
-        });
-        let result = run();
-        over.store(true, Ordering::Relaxed);
-        let (held_up, longest) = watch.join().unwrap_or_default();
-        (result, held_up, longest)
-    })
 }
 
 /// The place in one of an AGV's lines.
