@@ -34,6 +34,11 @@ impl Step {
             Self::Command { line, .. } | Self::Interrupt { line } | Self::File { line, .. } => *line,
         }
     }
+
+    /// Whether it builds packages that it names: those of the checkout.
+    pub(crate) fn builds_packages(&self) -> bool {
+        matches!(self, Self::Command { text, .. } if text.starts_with("cargo build ") && text.contains(" --package "))
+    }
 }
 
 /// The blocks of a guide that ask for something, in its order.

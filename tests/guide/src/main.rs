@@ -24,12 +24,18 @@ struct Arguments {
     /// Where its commands begin: the root of a checkout.
     #[arg(long, default_value = ".")]
     root: PathBuf,
+    /// The checkout is built: what the guide builds there is left out.
+    #[arg(long)]
+    built: bool,
 }
 
 fn main() -> Result<()> {
-    let Arguments { guide, root } = Arguments::parse();
+    let Arguments { guide, root, built } = Arguments::parse();
     let text = std::fs::read_to_string(&guide).with_context(|| format!("cannot read {}", guide.display()))?;
-    let blocks = document::blocks(&text).with_context(|| guide.display().to_string())?;
+    let mut blocks = document::blocks(&text).with_context(|| guide.display().to_string())?;
+    if built {
+        blocks.iter_mut().for_each(|block| block.steps.retain(|step| !step.builds_packages()));
+    }
     ensure!(!blocks.is_empty(), "{} has no commands", guide.display());
     let start = Instant::now();
     let commands = follow(&blocks, &root.canonicalize()?)?;

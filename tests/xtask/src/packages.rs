@@ -1,5 +1,5 @@
 //! The crates as their users get them: each is packaged, each package builds by itself, and so does a program that has nothing but the
-//! packages. Then the oldest versions of dependencies that the manifests allow.
+//! packages. Then the oldest versions of dependencies that the manifests allow, and the guide with the build that it begins with.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,7 @@ use std::time::Instant;
 use anyhow::{Context, Result, ensure};
 
 use crate::command::Run;
-use crate::workspace;
+use crate::{binaries, workspace};
 
 /// What the program of a user prints.
 const ANSWER: &str = "80 %";
@@ -19,7 +19,8 @@ pub(crate) fn check() -> Result<()> {
     let named: Vec<&str> = names.iter().flat_map(|name| ["--package", name]).collect();
     Run::cargo().args(["package", "--locked"]).args(&named).stream()?;
     build_program(&names)?;
-    check_oldest(&named)
+    check_oldest(&named)?;
+    binaries::debug("cara-guide")?.args(["docs/guide.md"]).stream()
 }
 
 /// The crates that are not marked otherwise.
