@@ -278,6 +278,8 @@ mod tests {
     use std::sync::atomic::AtomicUsize;
     use std::sync::mpsc::channel;
 
+    use cara_processes::ticker::unless_held_up;
+
     use super::*;
     use crate::testing::until;
 
@@ -294,7 +296,7 @@ mod tests {
     };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
-        begin_by(safe, clock.now() + length).expect("the order before has ended")
+        safe.begin(clock.now() + length, &CLAIM, 0).expect("the order before has ended")
     }
 
     /// As a caller does: again while the hook of the order before has not run, as on a slow machine.
@@ -326,7 +328,8 @@ mod tests {
             AHEAD.fetch_add(7_200_000_000, Ordering::SeqCst);
             assert!(!lease.lease.is_live(clock.now()));
             until(|| runs.load(Ordering::SeqCst) == round);
-            assert!(safe.expire(clock.now(), order, LeaseEnd::Expired) && safe.has_run());
+            assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
+            until(|| safe.has_run());
         }
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 3);
@@ -344,7 +347,7 @@ mod tests {
         let safe = SafeHook::start(parts).unwrap();
         let order = begin(&safe, clock, Duration::from_secs(3_600));
         assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
-        until(|| runs.load(Ordering::SeqCst) == 1);
+        until(|| runs.load(Ordering::SeqCst) == 1 && safe.has_run());
         let order = begin(&safe, clock, Duration::from_secs(3_600));
         assert!(safe.finish(clock.now(), order));
         AHEAD.fetch_add(7_200_000_000, Ordering::SeqCst);
@@ -360,31 +363,42 @@ mod tests {
     fn an_order_whose_time_passes_while_it_waits_for_the_hook_does_not_begin() {
         static AHEAD: AtomicU64 = AtomicU64::new(0);
         let clock = Clock::moved_by(&AHEAD);
-        let (runs, (continues, may_go_on)) = (Arc::new(AtomicUsize::new(0)), channel::<()>());
-        let (counted, may_go_on) = (runs.clone(), Mutex::new(may_go_on));
-        let hook = Arc::new(move || {
-            counted.fetch_add(1, Ordering::SeqCst);
-            let _ = lock(&may_go_on).recv();
-        });
-        let parts = Parts { lease: Arc::default(), clock, hook, then: None, late: Arc::default() };
-        let safe = SafeHook::start(parts).unwrap();
-        for (millis, begins) in [(40, false), (3_600_000, true)] {
-            let order = begin(&safe, clock, Duration::from_secs(3_600));
-            let before = runs.load(Ordering::SeqCst);
-            assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
-            until(|| runs.load(Ordering::SeqCst) == before + 1);
-            let end = clock.now() + Duration::from_millis(millis);
-            std::thread::scope(|scope| {
-                let waits = scope.spawn(|| begin_by(&safe, end));
-                // Less than a hook may take.
-                AHEAD.fetch_add(50_000, Ordering::SeqCst);
-                continues.send(()).unwrap();
-                let order = waits.join().unwrap();
-                assert_eq!(order.err(), (!begins).then_some(Error::Expired));
-                assert_eq!(safe.shared.lease().is_live(clock.now()), begins);
+        // The call waits for so long at most.
+        unless_held_up(LATE.into(), || {
+            let (runs, (continues, may_go_on)) = (Arc::new(AtomicUsize::new(0)), channel::<()>());
+            let (counted, may_go_on) = (runs.clone(), Mutex::new(may_go_on));
+            let hook = Arc::new(move || {
+                counted.fetch_add(1, Ordering::SeqCst);
+                let _ = lock(&may_go_on).recv();
             });
-        }
-        safe.end();
+            let parts = Parts { lease: Arc::default(), clock, hook, then: None, late: Arc::default() };
+            let safe = SafeHook::start(parts).unwrap();
+            for (millis, begins) in [(40, false), (3_600_000, true)] {
+                let order = begin(&safe, clock, Duration::from_secs(3_600));
+                let before = runs.load(Ordering::SeqCst);
+                assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
+                until(|| runs.load(Ordering::SeqCst) == before + 1);
+                let end = clock.now() + Duration::from_millis(millis);
+                std::thread::scope(|scope| {
+                    let (asks, asked) = channel();
+                    let safe = &safe;
+                    let waits = scope.spawn(move || {
+                        asks.send(()).unwrap();
+                        safe.begin(end, &CLAIM, 0)
+                    });
+                    asked.recv().unwrap();
+                    std::thread::sleep(std::time::Duration::from_millis(20));
+                    assert!(!waits.is_finished(), "it waits for the hook");
+                    // Less than a hook may take.
+                    AHEAD.fetch_add(50_000, Ordering::SeqCst);
+                    continues.send(()).unwrap();
+                    let order = waits.join().unwrap();
+                    assert_eq!(order.err(), (!begins).then_some(Error::Expired));
+                    assert_eq!(safe.shared.lease().is_live(clock.now()), begins);
+                });
+            }
+            safe.end();
+        });
     }
 
     #[test]

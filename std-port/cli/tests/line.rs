@@ -212,7 +212,7 @@ fn text(length: usize) -> Parameters<5_000> {
 
 #[test]
 fn a_vehicle_on_a_bad_line_joins_is_called_and_drives() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let fleet = Fleet::new(115_200, 3_000, false);
         for length in [0, 100, 4_000] {
             let mut parameters = text(length);
@@ -228,7 +228,7 @@ fn a_vehicle_on_a_bad_line_joins_is_called_and_drives() {
 
 #[test]
 fn a_vehicle_whose_line_is_pulled_stops_with_its_lease_and_comes_back() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let fleet = Fleet::new(115_200, 0, true);
         fleet.drive();
         assert_eq!(fleet.stops.load(Ordering::SeqCst), 0);

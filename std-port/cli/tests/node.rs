@@ -471,6 +471,7 @@ fn a_program_that_hangs_keeps_no_other_call_waiting() {
     assert!(children_of(&node).is_empty(), "{:?}", children_of(&node));
 }
 
+const LEASE: Duration = Duration::from_millis(1_500);
 /// Begins to drive, and returns.
 const GO: &str = "echo going >> motion; echo '{\"m\": 1}'";
 
@@ -478,7 +479,8 @@ const GO: &str = "echo going >> motion; echo '{\"m\": 1}'";
 fn leased(script: &str) -> Node {
     let go = shell("go", script);
     Node::start(&format!(
-        "{go}lease = \"1500ms\"\nat_lease_end = [\"sh\", \"-c\", \"sleep 0.2; echo stopped >> motion\"]\n"
+        "{go}lease = \"{}ms\"\nat_lease_end = [\"sh\", \"-c\", \"sleep 0.2; echo stopped >> motion\"]\n",
+        LEASE.as_millis()
     ))
 }
 
@@ -488,12 +490,12 @@ fn motion(node: &Node) -> String {
 
 #[test]
 fn the_end_of_a_lease_runs_what_makes_safe() {
-    unless_held_up(Duration::from_millis(500), || {
+    unless_held_up(LEASE, || {
         let node = leased(GO);
         let (unit, manager) = node.vehicle("agv", 7);
         assert_eq!(call(&manager, "go", 1), Ok(1));
         // Its caller is there, so that it goes on for longer than the lease.
-        std::thread::sleep(Duration::from_secs(3));
+        std::thread::sleep(2 * LEASE);
         assert_eq!(motion(&node), "going\n");
         manager.release("go").unwrap();
         until("the release stops it", || motion(&node) == "going\nstopped\n");

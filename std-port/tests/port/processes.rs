@@ -17,7 +17,7 @@ use cara_std::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
+use crate::support::{PATIENCE, ask, fleet, has_begun, number, service, system, unit, until};
 
 const PART: &str = "CARA_TEST_PART";
 
@@ -102,13 +102,8 @@ fn as_child() {
         _ => {
             let manager = system(fleet).control(Control::Off).build().unwrap();
             manager.start().unwrap();
-            until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
-            // On a slow machine the call may come when its lease would be over.
-            until("it begins", || {
-                let vehicles = manager.nodes_offering("go_to");
-                let goes = |to: &Peer| to.call("go_to", &mut number(1)).renewing(Renew::Process).wait().is_ok();
-                vehicles.first().is_some_and(goes)
-            });
+            let goes = |to: &Peer| has_begun(to, "go_to", Renew::Process);
+            until("a vehicle goes", || manager.nodes_offering("go_to").first().is_some_and(goes));
             until_input_ends();
         }
     }
@@ -286,8 +281,7 @@ fn a_second_manager_starts_only_where_the_first_does_not_answer() {
 #[test]
 fn a_vehicle_stops_once_when_its_manager_is_killed() {
     let length = Duration::from_millis(1_500);
-    // A renewal passes several threads, which are late one after the other.
-    unless_held_up(length / 8, || goes_until_its_manager_is_killed(length));
+    unless_held_up(length, || goes_until_its_manager_is_killed(length));
 }
 
 fn goes_until_its_manager_is_killed(length: Duration) {

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Builder, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer, RequestOptions,
-    SUnit, Served, ServiceError, Unit,
+    Builder, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer, Renew,
+    RequestOptions, SUnit, Served, ServiceError, Unit,
 };
 
 use crate::keyed::{M_UNIT, S_UNIT, keyed};
@@ -153,6 +153,15 @@ pub(crate) fn ask<T: Send + 'static>(peer: &Peer<T>, function: &str, number_in: 
     let mut parameters = number(number_in);
     let patient = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::default() };
     peer.call(function, &mut parameters).with(patient).wait().map(|()| value(&parameters)).map_err(Error::from)
+}
+
+/// Calls a function that moves something by a number. `false` where it is not safe yet, or where the call comes when its lease
+/// would be over, as on a busy machine.
+pub(crate) fn has_begun<T: Send + 'static>(peer: &Peer<T>, function: &str, renew: Renew) -> bool {
+    let wanted = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::renewing(renew) };
+    let asked = peer.call(function, &mut number(1)).with(wanted).wait().map_err(Error::from);
+    assert!(matches!(asked, Ok(()) | Err(Error::Expired | Error::Busy)), "{asked:?}");
+    asked.is_ok()
 }
 
 /// A counter of the peer's link, or of a unit's discovery.

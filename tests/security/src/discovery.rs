@@ -179,23 +179,25 @@ impl Forger {
         }
     }
 
-    /// Says all of it, and again while less than half was looked at: a kernel drops what it has no room for until its unit has had a
-    /// turn. What the unit has counted then.
+    /// Says all of it until half of that was looked at, what the unit has counted then: a kernel drops what it has no room for until
+    /// its unit has had a turn.
     fn say_heard(
         &self,
         said: &[Vec<u8>],
         to: Option<SocketAddr>,
-        before: &Counters,
         counters: impl Fn() -> Result<Counters>,
     ) -> Result<Counters> {
         let end = Instant::now() + PATIENCE;
         loop {
+            let before = counters()?;
             self.say(said, to);
             std::thread::sleep(Duration::from_millis(300));
             let after = counters()?;
-            if dropped(before, &after) >= said.len() as u64 / 2 || Instant::now() >= end {
+            let dropped = dropped(&before, &after);
+            if dropped >= said.len() as u64 / 2 {
                 return Ok(after);
             }
+            ensure!(Instant::now() < end, "of {} datagrams only {dropped} were looked at", said.len());
         }
     }
 }
@@ -226,8 +228,8 @@ fn spoof_manager(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>,
     let said: Vec<_> =
         who.iter().map(|who| Ok(said_of(&linux.ground, who, 1, forger.port()?))).collect::<Result<Vec<_>>>()?.concat();
     let before = manager.counters()?;
-    let after = forger.say_heard(&said, None, &before, || manager.counters())?;
-    report.add(spoofed(manager.name(), &said, &before, &after)?);
+    let after = forger.say_heard(&said, None, || manager.counters())?;
+    report.add(spoofed(manager.name(), &said, &before, &after));
     Ok(())
 }
 
@@ -238,17 +240,15 @@ fn dropped(before: &Counters, after: &Counters) -> u64 {
     sum(after, &DROPPED) - sum(before, &DROPPED)
 }
 
-fn spoofed(target: &str, said: &[Vec<u8>], before: &Counters, after: &Counters) -> Result<Row> {
-    let dropped = dropped(before, after);
-    ensure!(dropped >= said.len() as u64 / 2, "of {} datagrams only {dropped} were looked at", said.len());
-    Ok(Row {
+fn spoofed(target: &str, said: &[Vec<u8>], before: &Counters, after: &Counters) -> Row {
+    Row {
         attack: "spoofed who-has and announces of every identity".to_owned(),
         target: target.to_owned(),
-        attempts: dropped.min(said.len() as u64),
+        attempts: dropped(before, after).min(said.len() as u64),
         successes: sum(after, &BELIEVED) - sum(before, &BELIEVED),
         noticed: risen(before, after),
         control: false,
-    })
+    }
 }
 
 /// A vehicle searches, and every identity except its manager answers: it dials none of them.
@@ -265,8 +265,8 @@ fn spoof_vehicle(report: &mut Report, linux: &Linux, who: &[Identity]) -> Result
         said.extend(stolen.encode(linux.ground.fleet, &thief, Some(&agv(1)), &mut out).map(<[u8]>::to_vec));
     }
     let before = named(unit.counters());
-    let after = forger.say_heard(&said, Some(from), &before, || Ok(named(unit.counters())))?;
-    let mut row = spoofed("Linux s_unit", &said, &before, &after)?;
+    let after = forger.say_heard(&said, Some(from), || Ok(named(unit.counters())))?;
+    let mut row = spoofed("Linux s_unit", &said, &before, &after);
     forger.listener.set_nonblocking(true)?;
     row.successes += u64::from(forger.listener.accept().is_ok()) + log.all().joins as u64;
     report.add(row);

@@ -16,7 +16,7 @@ use clap::Parser;
 use serde_json::Value;
 
 use browser::{Browser, DESKTOP, TABLET};
-use stage::{AGVS, PATIENCE, Stage};
+use stage::{AGVS, PATIENCE, Stage, excuse};
 
 /// Clicks through `cara web` in a headless Chromium.
 #[derive(Parser)]
@@ -39,8 +39,9 @@ struct Options {
 /// Pages beside the first one, which have all other connections that Chromium makes to a server.
 const PAGES: usize = 5;
 
-/// What the page says where a lease has ended by itself, and where one that has just ended is in the way of a call.
-const STOPPED: [&str; 4] = ["It stopped there", "Unattended", "Busy", "NotReady"];
+/// What the page says where a lease has ended by itself, also before the vehicle drove, and where one that has just ended is in the
+/// way of a call.
+const STOPPED: [&str; 5] = ["It stopped there", "Unattended", "Expired", "Busy", "NotReady"];
 /// How often a call is made again: not so often that a vehicle comes far whose lease is not kept.
 const AGAIN: usize = 5;
 
@@ -139,9 +140,16 @@ async fn driving(browser: &Browser, stage: &mut Stage, what: &str, expression: &
     browser.wait(what, expression).await
 }
 
+/// Calls what a form offers. The ticker tells from then on whether the host may have ended it.
+async fn call(browser: &Browser, form: &str) -> Result<Ticker> {
+    let ticker = Ticker::start();
+    browser.click(&format!("{form} button.primary")).await?;
+    Ok(ticker)
+}
+
 /// Waits until an expression is true in the page, while a form holds what it called. A host that stands still for longer than the
-/// lease ends it, which is right: then it is called again.
-async fn keep_held(browser: &Browser, form: &str, what: &str, expression: &str) -> Result<()> {
+/// lease ends it, which is right: then it is called again. What ends without that is an error.
+async fn keep_held(browser: &Browser, form: &str, ticker: &mut Ticker, what: &str, expression: &str) -> Result<()> {
     let stopped = STOPPED.map(|text| shown(&format!("{form} .outcome"), text)).join(" || ");
     let ended =
         format!("document.querySelector('{form} button.primary').textContent.startsWith('Call ') && ({stopped})");
@@ -151,27 +159,29 @@ async fn keep_held(browser: &Browser, form: &str, what: &str, expression: &str) 
             return Ok(());
         }
         if browser.run(&format!("return Boolean({ended})")).await? == true {
-            println!("it has stopped, and is called again");
-            browser.click(&format!("{form} button.primary")).await?;
+            excuse(ticker, form)?;
+            *ticker = call(browser, form).await?;
         }
     }
     browser.wait(what, expression).await
 }
 
 /// Releases what a form holds. A click that comes when it has just ended calls again.
-async fn release(browser: &Browser, form: &str) -> Result<()> {
+async fn release(browser: &Browser, form: &str, ticker: &mut Ticker) -> Result<()> {
     let note = format!(
         "const button = document.querySelector('{form} button.primary');
         button.addEventListener('click', () => {{ window.clicked = button.textContent; }}, {{ capture: true, once: true }})"
     );
     let held = shown(&format!("{form} .outcome"), "held, as long as this page is shown");
     for _ in 0..AGAIN {
-        keep_held(browser, form, "it is held", &held).await?;
+        keep_held(browser, form, ticker, "it is held", &held).await?;
         browser.run(&note).await?;
-        browser.click(&format!("{form} button.primary")).await?;
+        let clicked = call(browser, form).await?;
         if browser.run("return window.clicked").await? == "Release" {
             break;
         }
+        excuse(ticker, form)?;
+        *ticker = clicked;
     }
     browser.says(&format!("{form} .outcome"), "released").await
 }
@@ -236,11 +246,11 @@ async fn command(browser: &Browser) -> Result<()> {
     browser.wait("the mistake is gone", &format!("document.querySelector('{form} .error').textContent === ''")).await?;
     browser.click(&format!("{form} details summary")).await?;
     browser.click(&format!("{form} .options label:nth-child(3) input")).await?;
-    browser.click(&format!("{form} button.primary")).await?;
+    let mut ticker = call(browser, &form).await?;
     let held = shown(&format!("{form} .outcome"), "held, as long as this page is shown");
-    keep_held(browser, &form, "it is held", &held).await?;
+    keep_held(browser, &form, &mut ticker, "it is held", &held).await?;
     let has_left = format!("{} && !{}.startsWith('0.00, 0.00')", place("agv-1"), place("agv-1"));
-    keep_held(browser, &form, "agv-1 moves", &has_left).await?;
+    keep_held(browser, &form, &mut ticker, "agv-1 moves", &has_left).await?;
     let form = open(browser, "pos_info").await?;
     for nth in [1, 2] {
         browser.fill(&format!("{form} .inputs input:nth-child({nth})"), "0").await?;
@@ -248,12 +258,12 @@ async fn command(browser: &Browser) -> Result<()> {
     browser.click(&format!("{form} button.primary")).await?;
     browser.says(&format!("{form} .outcome"), "position = [").await?;
     let form = open(browser, "go_to").await?;
-    release(browser, &form).await?;
+    release(browser, &form, &mut ticker).await?;
     // The node refuses what the form cannot know.
     browser.fill(&x, "99999999").await?;
-    browser.click(&format!("{form} button.primary")).await?;
+    let mut ticker = call(browser, &form).await?;
     let refused = shown(&format!("{form} .outcome.bad"), "Service (Failed, code 1)");
-    keep_held(browser, &form, "the node refuses", &refused).await
+    keep_held(browser, &form, &mut ticker, "the node refuses", &refused).await
 }
 
 /// Which manager has which vehicle; one that does not answer is not known, and its name is text.
@@ -306,9 +316,9 @@ async fn open(browser: &Browser, function: &str) -> Result<String> {
 async fn pictures(browser: &Browser) -> Result<()> {
     let form = open(browser, "go_to").await?;
     browser.fill(&format!("{form} .inputs input:nth-child(1)"), "6").await?;
-    browser.click(&format!("{form} button.primary")).await?;
+    let mut ticker = call(browser, &form).await?;
     let y_of = |agv: &str| format!("Number({}.split(',')[1])", place(agv));
-    keep_held(browser, &form, "agv-1 is in its aisle", &format!("{} > 3", y_of("agv-1"))).await?;
+    keep_held(browser, &form, &mut ticker, "agv-1 is in its aisle", &format!("{} > 3", y_of("agv-1"))).await?;
     let script = "document.querySelectorAll('details.function').forEach((one) => { one.open = one.id === 'form-go_to'; one.querySelector('details').open = false; });
         document.activeElement.blur(); scrollTo(0, 0)";
     browser.run(script).await?;
@@ -318,7 +328,7 @@ async fn pictures(browser: &Browser) -> Result<()> {
         tokio::time::sleep(Duration::from_millis(600)).await;
         browser.shoot(theme).await?;
     }
-    release(browser, &form).await
+    release(browser, &form, &mut ticker).await
 }
 
 async fn tablet(browser: &Browser) -> Result<()> {

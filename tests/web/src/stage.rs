@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use cara_processes::Process;
+use cara_processes::ticker::Ticker;
 use cara_test_keys::KeyFolder;
 use tempfile::TempDir;
 
@@ -21,8 +22,13 @@ pub(crate) const AGVS: [&str; 5] = ["agv-1", "agv-2", "agv-3", "agv-4", "agv-5"]
 /// Where those drive that do not wait for the page: along x first, then along y, through the aisles of the [map].
 /// Each command has one of the few connections to the manager.
 const TARGETS: [(&str, [u32; 2]); 2] = [("agv-2", [24, 13]), ("agv-3", [12, 13])];
+/// What a command says whose lease has ended, or ended before the vehicle drove.
+const STOPPED: [&str; 3] = ["it stopped there", "gave no sign of life", ": Expired:"];
 /// How often commands that have ended are given again.
 const MOST_AGAIN: usize = 5;
+/// An eighth of the lease of the vehicles' `go_to`, which is 400 ms in `cara-apps`: a host that holds a process up for so long may
+/// let it end.
+const HELD_UP: Duration = Duration::from_millis(400 / 8);
 
 const BOX: &str = "name = 'box'
 id = 20
@@ -46,8 +52,8 @@ pub(crate) struct Stage {
     agvs: Vec<Process>,
     web: Option<Process>,
     pub(crate) ports: Ports,
-    /// Calls that are held from outside of the page.
-    held: Vec<Process>,
+    /// Calls that are held from outside of the page, and how long the host held this process up since each began.
+    held: Vec<(Process, Ticker)>,
     /// How often one was made again.
     again: usize,
 }
@@ -89,11 +95,15 @@ impl Stage {
 
     /// A program with the keys, the fleet and the control sockets of this test.
     fn process(&self, name: &str, program: &str, arguments: &[&str]) -> Result<Process> {
+        self.process_by(&[], name, program, arguments)
+    }
+
+    /// The same, which another program starts.
+    fn process_by(&self, starter: &[&str], name: &str, program: &str, arguments: &[&str]) -> Result<Process> {
         let keys = format!("CARA_KEYS={}", self.keys.path().display());
         let control = format!("CARA_CONTROL_DIR={}", self.folder.path().display());
         let (program, fleet) = (self.programs.join(program).display().to_string(), self.fleet.to_string());
-        let (before, behind) = ([&*keys, &*control, &*program], ["--fleet", &*fleet]);
-        let all = before.iter().chain(arguments).chain(&behind).copied();
+        let all = [&[&*keys, &*control][..], starter, &[&*program], arguments, &["--fleet", &*fleet]].concat();
         Process::start(name, Path::new("env"), all)
     }
 
@@ -111,11 +121,14 @@ impl Stage {
         Ok(())
     }
 
-    /// Has them drive on where their lease has ended, as on a host that stood still for longer.
+    /// Has them drive on where their lease has ended since the host held this process up.
     pub(crate) fn drive_on(&mut self) -> Result<()> {
         for (number, target) in TARGETS.into_iter().enumerate() {
-            let has_stopped = self.held[number].wait(Duration::ZERO).is_ok_and(|status| !status.success());
-            if has_stopped && self.again < MOST_AGAIN {
+            let (held, ticker) = &mut self.held[number];
+            if held.wait(Duration::ZERO).is_ok_and(|status| !status.success()) {
+                held.expect_any(&STOPPED, PATIENCE)?;
+                excuse(ticker, target.0)?;
+                ensure!(self.again < MOST_AGAIN, "vehicles have stopped again and again");
                 self.again += 1;
                 self.held[number] = self.hold(target)?;
             }
@@ -123,9 +136,13 @@ impl Stage {
         Ok(())
     }
 
-    fn hold(&self, (name, [x, y]): (&str, [u32; 2])) -> Result<Process> {
+    fn hold(&self, (name, [x, y]): (&str, [u32; 2])) -> Result<(Process, Ticker)> {
         let call = format!("go_to(position: [{x}, {y}])");
-        self.process(name, "cara", &["call", "--hold", "--timeout", "30s", name, &call])
+        let arguments = ["call", "--hold", "--timeout", "30s", name, &call];
+        let ticker = Ticker::start();
+        // Why it ended stands in its standard error.
+        let held = self.process_by(&["sh", "-c", r#"exec "$0" "$@" 2>&1"#], name, "cara", &arguments)?;
+        Ok((held, ticker))
     }
 
     /// The page's server; its address with the key. It was told of the proxies, and is reached without them as well.
@@ -191,6 +208,14 @@ impl Stage {
     pub(crate) fn kill_a_vehicle(&mut self) -> Result<()> {
         self.agvs.last_mut().context("there is one")?.kill().map(drop)
     }
+}
+
+/// An error unless the host held this process up so long, since a ticker began, that it may have ended a lease.
+pub(crate) fn excuse(ticker: &Ticker, what: &str) -> Result<()> {
+    let longest = ticker.longest();
+    ensure!(longest >= HELD_UP, "{what} has stopped though the host did not hold this process up: {longest:?} at most");
+    println!("{what} has stopped while the host held this process up for {longest:?}, and is called again");
+    Ok(())
 }
 
 fn kill(process: &mut Option<Process>) -> Result<()> {

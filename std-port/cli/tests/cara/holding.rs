@@ -1,6 +1,6 @@
 //! `cara call --hold`: the operator keeps the lease, and gives it up by going away.
 
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -62,7 +62,7 @@ impl Driver {
         running.expect("drive()");
         let start = Instant::now();
         while start.elapsed() < 2 * LEASE {
-            assert!(self.lease.is_live() || start.elapsed() > PATIENCE, "the lease was not renewed");
+            assert!(self.lease.is_live(), "the lease was not renewed");
             std::thread::sleep(Duration::from_millis(10));
         }
         running
@@ -83,7 +83,7 @@ fn until(mut done: impl FnMut() -> bool) {
 
 #[test]
 fn what_is_held_goes_on_until_it_has_finished() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let mut held = driver.held(&stage);
@@ -97,7 +97,7 @@ fn what_is_held_goes_on_until_it_has_finished() {
 
 #[test]
 fn who_goes_away_stops_what_is_held() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let held = driver.held(&stage);
@@ -111,7 +111,7 @@ fn who_goes_away_stops_what_is_held() {
 /// A stopped process keeps its connection open, and nothing but the missing signs of life tells the manager.
 #[test]
 fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let held = driver.held(&stage);
@@ -127,16 +127,17 @@ fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
 /// The manager has events all the time, and still detects at once that the lease is no longer held.
 #[test]
 fn who_goes_away_is_noticed_among_many_events() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let held = driver.held(&stage);
-        let (unit, busy) = (driver.unit.clone(), Arc::new(AtomicBool::new(true)));
-        let continues = busy.clone();
+        // It ends with this test, also where that fails.
+        let (unit, busy) = (driver.unit.clone(), Arc::new(()));
+        let wanted = Arc::downgrade(&busy);
         let events = std::thread::spawn(move || {
             let functions = unit.my_function_list();
             let nothing = |_: &Served, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
-            while continues.load(Ordering::SeqCst) {
+            while wanted.strong_count() > 0 {
                 functions.add_service(&Definition::parse("news()").unwrap(), ServiceOptions::new(), nothing).unwrap();
                 unit.publish_my_function_list().unwrap();
                 std::thread::sleep(Duration::from_millis(5));
@@ -145,7 +146,7 @@ fn who_goes_away_is_noticed_among_many_events() {
         });
         held.interrupt();
         until(|| driver.made_safe() == 1);
-        busy.store(false, Ordering::SeqCst);
+        drop(busy);
         events.join().unwrap();
         held.end();
     });
@@ -153,7 +154,7 @@ fn who_goes_away_is_noticed_among_many_events() {
 
 #[test]
 fn a_lost_vehicle_ends_the_holding() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let mut held = driver.held(&stage);
@@ -182,7 +183,7 @@ fn a_call_that_its_own_lease_has_ended_says_so() {
 
 #[test]
 fn a_newer_holding_takes_over() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let (older, newer) = (driver.held(&stage), driver.held(&stage));
@@ -196,7 +197,7 @@ fn a_newer_holding_takes_over() {
 
 #[test]
 fn what_the_program_of_a_manager_moves_is_held_unless_it_is_taken_over() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::empty();
         let manager = stage.manager().build().unwrap();
         manager.start().unwrap();
@@ -237,7 +238,7 @@ fn ctrl_c_ends_it_also_where_the_shell_ignores_it() {
 
 #[test]
 fn what_is_held_ends_with_standard_input() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let mut held = driver.held(&stage);
@@ -258,7 +259,7 @@ fn what_is_held_ends_with_standard_input() {
 
 #[test]
 fn what_is_held_ends_when_what_reads_its_output_has_gone() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let mut held = driver.held(&stage);
@@ -271,7 +272,7 @@ fn what_is_held_ends_when_what_reads_its_output_has_gone() {
 /// A terminal that hangs up without a signal, as where a shell has ended before or ignores it.
 #[test]
 fn what_is_held_ends_when_its_terminal_hangs_up() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let (ours, theirs) = crate::terminal::pair();
@@ -290,7 +291,7 @@ fn what_is_held_ends_when_its_terminal_hangs_up() {
 
 #[test]
 fn what_is_held_detached_goes_on_until_its_command_ends() {
-    unless_held_up(LEASE / 3, || {
+    unless_held_up(LEASE, || {
         let stage = Stage::with(&[]);
         let driver = Driver::join(&stage);
         let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--detached", "drive"]));
@@ -299,7 +300,7 @@ fn what_is_held_detached_goes_on_until_its_command_ends() {
         held.read_no_more();
         let start = Instant::now();
         while start.elapsed() < 2 * LEASE {
-            assert!(driver.lease.is_live() || start.elapsed() > PATIENCE, "it has ended");
+            assert!(driver.lease.is_live(), "it has ended");
             std::thread::sleep(Duration::from_millis(10));
         }
         assert_eq!(driver.made_safe(), 0);

@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use cara_std::{Heart, LeaseEnd, Peer, Renew, RequestOptions, UnitEvent};
 
 use super::Stop;
-use super::inject::{BUSY, EmulatedBoard, LEFT, OFF, ON, PHASES, STANDS, pause, tries};
+use super::inject::{BUSY, EmulatedBoard, LEFT, OFF, ON, PHASES, STANDS, UNHEARD, pause, tries};
 use super::kind::POLL;
 use super::orders::{CREEP, arguments};
 use crate::board::LONG;
@@ -84,6 +84,7 @@ impl EmulatedBoard {
     /// The manager drops the guard of a call that its process would renew.
     pub(super) fn guard_is_dropped(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;
+        let mut unheard = 0;
         for () in tries() {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();
@@ -104,8 +105,10 @@ impl EmulatedBoard {
             if stop.heard > 0 {
                 return Ok(stop);
             }
+            unheard += 1;
+            ensure!(unheard < UNHEARD, "{UNHEARD} times no datagram that releases came first");
         }
-        bail!("for {BUSY:?} no lease was renewed in time, or no datagram that releases came first")
+        bail!("for {BUSY:?} no lease was renewed in time")
     }
 }
 

@@ -24,6 +24,8 @@ pub(super) const STANDS: Duration = Duration::from_millis(300);
 pub(super) const RENEWED: Duration = Duration::from_millis(100);
 /// For so long a drive is started again because this machine was too busy to renew a lease in time.
 pub(super) const BUSY: Duration = LONG.saturating_mul(2);
+/// How often a stop may come in the stream although its datagram has left first.
+pub(super) const UNHEARD: u32 = 5;
 /// What the board logs.
 pub(super) const ON: &str = "motors on";
 pub(super) const OFF: &str = "motors off:";

@@ -7,7 +7,7 @@ use cara_apps::agv::{BUMPER, BUMPER_IS_PRESSED};
 use cara_std::{Error, Parameters, Peer, Priority, RequestOptions, ServiceError};
 
 use super::Stop;
-use super::inject::{BUSY, Drive, EmulatedBoard, OFF, tries};
+use super::inject::{BUSY, Drive, EmulatedBoard, OFF, UNHEARD, tries};
 use crate::manager::{Manager, at, fault, outcome, patiently, reset};
 
 /// Callers that keep the board busy.
@@ -22,6 +22,7 @@ impl EmulatedBoard {
     /// The manager's other calls fill the link and the board while it stops the vehicle.
     pub(super) fn is_stopped(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;
+        let mut unheard = 0;
         for () in tries() {
             let Drive { agv, line } = self.drive(&manager, dice)?;
             let is_late = self.is_stopped_in_a_flood(&agv, line)?;
@@ -33,8 +34,10 @@ impl EmulatedBoard {
             if !is_late && stop.heard > 0 {
                 return Ok(stop);
             }
+            unheard += u32::from(!is_late);
+            ensure!(unheard < UNHEARD, "{UNHEARD} times no datagram that stops came first");
         }
-        bail!("for {BUSY:?} no lease was renewed in time, or no datagram that stops came first")
+        bail!("for {BUSY:?} no lease was renewed in time")
     }
 
     /// Whether this machine was too busy to renew the lease until then.

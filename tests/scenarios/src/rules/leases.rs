@@ -41,6 +41,8 @@ fn long(world: &dyn World) -> Duration {
     if world.is_virtual() { lease(world) } else { secs(60) }
 }
 
+/// How often a lease is begun that a busy machine does not renew in time.
+const TRIES: u32 = 5;
 /// What may come on top of the lease: one poll, in virtual time nothing.
 const SLACK: Duration = Duration::from_millis(1);
 
@@ -70,22 +72,27 @@ fn driving(world: &mut dyn World) -> (Service, Unit, Unit) {
 fn a_lease_lives_while_it_is_renewed(world: &mut dyn World) {
     let service = Service::new("drive(n: int[1])").lease(lease(world));
     let (manager, agv) = pair(world, &service);
-    let (round, mut last, mut longest) = (millis(100), world.now(), Duration::ZERO);
-    drive(world, &manager);
-    let (until, mut lives) = (world.now() + lease(world).times(3), agv.lease_is_live("drive"));
-    while lives && world.now() < until {
-        world.run_for(round);
+    let round = millis(100);
+    for _ in 0..TRIES {
+        let stops = service.log().stops().len();
+        let (mut last, mut longest) = (world.now(), Duration::ZERO);
+        drive(world, &manager);
+        let (until, mut lives) = (world.now() + lease(world).times(3), agv.lease_is_live("drive"));
+        while lives && world.now() < until {
+            world.run_for(round);
+            longest = longest.max(world.now().since(last));
+            last = world.now();
+            lives = agv.lease_is_live("drive");
+        }
+        if lives {
+            assert_eq!(service.log().stops().len(), stops);
+            return;
+        }
+        // On a busy machine a renewal may come so late that the motion has ended, which is as it should be.
         longest = longest.max(world.now().since(last));
-        last = world.now();
-        lives = agv.lease_is_live("drive");
+        assert!(!world.is_virtual() && longest > round.times(2), "the longest round took {} ms", longest.as_millis());
     }
-    // On a busy machine a renewal may come so late that the motion has ended, which is as it should be.
-    if !lives && !world.is_virtual() && longest.max(world.now().since(last)) > round.times(2) {
-        return;
-    }
-    assert!(lives, "the longest round took {} ms", longest.as_millis());
-    assert_eq!(service.log().stops(), []);
-    drop(manager);
+    panic!("{TRIES} times the machine was too busy to renew a lease");
 }
 
 /// Injects a fault at a random instant and measures the time until the safe hook; nothing may start again.

@@ -54,7 +54,7 @@ fn a_quick_call_overtakes_slow_ones_that_began_before_it(world: &mut dyn World) 
     let long: Vec<_> = (0..3).map(|n| manager.begin("agv", "slow", &number("n", n), PATIENT)).collect();
     world.wait("they run side by side", || slow.log().runs() == 3, secs(10));
     assert_eq!(world.ask(&manager, "agv", "quick", &mut number("n", 1)), Ok(()));
-    assert!(slow.log().ended().is_empty() && long.iter().all(|call| !call.is_over()), "it waited for none of them");
+    assert!(long.iter().all(|call| !call.is_over()), "it waited for none of them");
     gate.open();
     assert!(long.iter().all(|call| world.finish(call).is_ok()));
     world.reached("overtook");

@@ -2,20 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use cara_processes::Process;
 use cara_processes::ticker::Ticker;
 
-use super::stage::{STEP, Stage, TRY};
+use super::stage::{HELD_UP, STEP, Stage, TRY};
 use crate::workspace;
 
 const SOURCE: &str = "examples/linux/src/bin/agv_manager/main.rs";
 /// The paper's listing has this many lines.
 const LINES: u32 = 24;
-/// An eighth of the lease of `go_to`: a machine that keeps a thread waiting for longer may let it end on the way.
-const HELD_UP: Duration = Duration::from_millis(50);
 /// What an AGV offers.
 const FUNCTIONS: [&str; 4] =
     ["pos_info(position: int[2]) -> (position: int[2])", "go_to(position: int[2])", "battery()", "stop()"];

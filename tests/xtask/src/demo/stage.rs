@@ -5,6 +5,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
+use cara_processes::ticker::Ticker;
 use cara_processes::{Line, Process, random_fleet};
 use tempfile::TempDir;
 
@@ -14,6 +15,8 @@ pub(super) const STEP: Duration = Duration::from_secs(60);
 pub(super) const TRY: Duration = Duration::from_secs(10);
 /// Between two of them, and between two questions.
 const PAUSE: Duration = Duration::from_millis(200);
+/// An eighth of the lease of `go_to`: a machine that keeps a thread waiting for longer may let it end on the way.
+pub(super) const HELD_UP: Duration = Duration::from_millis(50);
 /// What an AGV prints when the lease has ended for which it drove.
 pub(super) const EXPIRED: &str = "lease of go_to expired";
 
@@ -78,7 +81,8 @@ impl Stage {
         Ok(answer.text)
     }
 
-    /// As [`command`](Self::command), for what may be asked again: until its answer contains `wanted`.
+    /// As [`command`](Self::command), again where that fails, and for `units`, whose number may change. Any other wrong answer
+    /// stays wrong.
     pub(super) fn until(&self, manager: &mut Process, command: &str, wanted: &str) -> Result<String> {
         let deadline = Instant::now() + STEP;
         loop {
@@ -88,7 +92,12 @@ impl Stage {
             if answer.text.contains(wanted) {
                 return Ok(answer.text);
             }
-            ensure!(Instant::now() < deadline, "`{command}` is not answered by `{wanted}`");
+            let may_change = command == "units" || answer.text.starts_with("! ");
+            ensure!(
+                may_change && Instant::now() < deadline,
+                "`{command}` is answered by `{}` and not by `{wanted}`",
+                answer.text
+            );
             std::thread::sleep(PAUSE);
         }
     }
@@ -104,15 +113,21 @@ impl Stage {
     ) -> Result<()> {
         let deadline = Instant::now() + STEP;
         loop {
+            let ticker = Ticker::start();
             let before = agv.lines().len();
             self.until(manager, go_to, "= accepted")?;
             if is_done(self, agv)? {
                 return Ok(());
             }
+            let longest = ticker.longest();
+            ensure!(
+                longest > HELD_UP,
+                "the order `{go_to}` ended early though the host did not hold this process up: {longest:?} at most"
+            );
             ensure!(Instant::now() < deadline, "again and again the order `{go_to}` has ended before its time");
-            // One that has stopped says why as well, which is not to be taken for the end of the next order.
+            // One that has stopped says that its lease has ended, which is not to be taken for the end of the next order.
             if agv.lines()[before..].iter().any(|line| line.text.starts_with("stopped at")) {
-                let _ = agv.seen_behind(before, EXPIRED, TRY);
+                agv.seen_behind(before, EXPIRED, STEP).context("it stopped for another reason than its lease")?;
             }
             std::thread::sleep(PAUSE);
         }
