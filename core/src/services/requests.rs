@@ -283,6 +283,16 @@ mod tests {
         assert!(open(&mut requests, 10).unwrap().is_some());
     }
 
+    #[test]
+    fn a_number_that_only_an_earlier_link_has_reached_is_not_kept() {
+        let (mut earlier, mut requests) = (table(1), table(1));
+        let numbers = [(); 3].map(|()| earlier.make());
+        requests.make();
+        assert_eq!(requests.made(Some(numbers[0])).number(), 1);
+        assert_eq!(requests.made(Some(numbers[2])).number(), 2);
+        assert_eq!(requests.made(None).number(), 3);
+    }
+
     /// `docs/safety.md`, what a stop waits for: the caller's table of calls.
     #[test]
     fn a_full_table_has_slots_left_for_emergencies() {

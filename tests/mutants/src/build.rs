@@ -12,7 +12,11 @@ use serde_json::Value;
 
 /// What judges, the quickest first: package, program, and the tests of it. Faults that come seldom need many seeds.
 const JUDGES: [(&str, &str, &[&str]); 7] = [
-    ("cara-core", "cara_core", &["services::lease", "distribution::latch", "distribution::claim", "services::heart"]),
+    (
+        "cara-core",
+        "cara_core",
+        &["services::lease", "distribution::latch", "distribution::claim", "services::heart", "time::"],
+    ),
     ("cara-sim", "orders", &["five_vehicles"]),
     ("cara-sim", "chaos", &["whatever"]),
     ("cara-core", "cara_core", &["services::"]),
