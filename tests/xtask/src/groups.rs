@@ -166,7 +166,7 @@ pub(crate) const GROUPS: [Group; 43] = [
         budget: 120,
         quick: Some(90),
         by_default: true,
-        waits: false,
+        waits: true,
         run: |extent| scenarios(extent).into(),
     },
     Group {
@@ -540,7 +540,7 @@ fn guide() -> Result<()> {
 /// A kernel that lets nobody count fails nothing: it says nothing about CARA.
 fn counts() -> Result<()> {
     match counted_by_perf() {
-        Ok(()) => binaries::debug("cara-bench")?.args(["counts"]).stream(),
+        Ok(()) => binaries::release("cara-bench")?.args(["counts"]).stream(),
         Err(reason) => {
             println!("nothing was counted: {reason}");
             Ok(())
