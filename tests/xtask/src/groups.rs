@@ -118,7 +118,7 @@ pub(crate) const GROUPS: [Group; 43] = [
     Group {
         name: "build",
         what: "every test of the workspace builds; apart, so that the time of `unit` is that of its tests",
-        budget: 380,
+        budget: 280,
         quick: Some(120),
         by_default: true,
         waits: false,
@@ -208,7 +208,7 @@ pub(crate) const GROUPS: [Group; 43] = [
     Group {
         name: "counts",
         what: "a blocking round trip takes no more system calls, switches and wake-ups at either end than it may",
-        budget: 12,
+        budget: 90,
         quick: None,
         by_default: true,
         waits: false,
@@ -235,7 +235,7 @@ pub(crate) const GROUPS: [Group; 43] = [
     Group {
         name: "guide",
         what: "every command of the guide does what it says",
-        budget: 175,
+        budget: 110,
         quick: None,
         by_default: true,
         waits: true,
