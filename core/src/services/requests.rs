@@ -284,6 +284,31 @@ mod tests {
     }
 
     #[test]
+    fn a_call_in_a_reserved_slot_is_found_by_its_own_id_and_its_release_by_none() {
+        let mut requests = table(1);
+        let first = open(&mut requests, 90).unwrap().unwrap();
+        let stops = [20, 21].map(|deadline| {
+            let deadline = Instant::from_micros(deadline);
+            requests.open(Slot(1), Generation(0), deadline, Priority::Emergency, true, true).unwrap().unwrap()
+        });
+        assert!(stops.iter().all(|stop| requests.waiting_for(*stop).is_some_and(|found| found.id == *stop)));
+        let closed = requests.close(first).unwrap();
+        assert_eq!(requests.in_flight(), 2);
+        requests.keep_unsent_release(closed);
+        assert_eq!(
+            (requests.in_flight(), requests.waiting_for(first).is_none()),
+            (3, true),
+            "its slot is its own again"
+        );
+    }
+
+    #[test]
+    fn no_slots_are_no_more_slots() {
+        let mut requests = table(2);
+        assert_eq!((requests.grow(vec![].into_boxed_slice()).len(), requests.slots()), (0, 2));
+    }
+
+    #[test]
     fn a_number_that_only_an_earlier_link_has_reached_is_not_kept() {
         let (mut earlier, mut requests) = (table(1), table(1));
         let numbers = [(); 3].map(|()| earlier.make());

@@ -45,6 +45,15 @@ fn each_hello_has_its_outcome() {
 }
 
 #[test]
+fn a_node_without_a_key_is_counted_and_found() {
+    let mut node = depot();
+    let agv = s_unit("agv", 1).identity;
+    node.refuse_without_key(at(10), address(9, 40_000), &agv);
+    let found: Vec<_> = node.findings().map(|finding| (finding.refusal, finding.identity.clone())).collect();
+    assert_eq!((node.counters.value(NodeCounter::RefusedKey), found), (1, [(Refusal::NoKey, Some(agv))].into()));
+}
+
+#[test]
 fn an_s_unit_takes_its_manager_only() {
     let cases = [
         (hello_of(&m_unit("depot", 5)), Admission::Accept),

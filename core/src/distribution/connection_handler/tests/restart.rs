@@ -36,6 +36,35 @@ fn an_old_link_that_answers_stays_and_the_newcomer_is_a_duplicate() {
 }
 
 #[test]
+fn a_refused_newcomer_leaves_a_dial_that_is_another_link() {
+    let mut node = challenged();
+    let place = node.table.find(&s_unit("agv", 1).identity).unwrap();
+    node.table.node_mut(place).unwrap().dialing = Some(LinkId(3));
+    node.challenge_answered(at(1_100), LinkId(0));
+    assert_eq!(due(&mut node, at(1_100)), [notify(1, Directive::Refuse(Refusal::DuplicateIdentity))]);
+    assert_eq!(node.table.node(place).unwrap().dialing, Some(LinkId(3)));
+}
+
+#[test]
+fn who_joins_first_or_in_the_same_life_has_not_restarted() {
+    let mut node = depot();
+    let agv = s_unit("agv", 1);
+    let place = |node: &Node<InMemory>| node.table.find(&agv.identity).unwrap();
+    join(&mut node, at(1), 0, &agv);
+    let known = place(&node);
+    node.table.node_mut(known).unwrap().newest = Some((hello_of(&agv).epoch, 5));
+    node.left(at(2), LinkId(0), CloseReason::Reset);
+    join(&mut node, at(3), 1, &agv);
+    assert_eq!(node.counters.value(NodeCounter::Restarted), 0);
+    // What it has announced before stays the newest.
+    assert_eq!(node.table.node(place(&node)).unwrap().newest, Some((hello_of(&agv).epoch, 5)));
+    node.left(at(4), LinkId(1), CloseReason::Reset);
+    assert_eq!(node.admit(at(5), LinkId(2), address(1, 40_000), &reborn(&agv)), Admission::Accept);
+    assert_eq!(node.counters.value(NodeCounter::Restarted), 1);
+    assert_eq!(node.table.node(place(&node)).unwrap().newest, Some((Epoch(999), 0)));
+}
+
+#[test]
 fn an_old_link_that_is_silent_is_superseded_in_time() {
     let mut node = challenged();
     let commands = run(&mut node, at(2_000), &mut Outbox::default());
