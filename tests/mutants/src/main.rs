@@ -70,8 +70,7 @@ fn main() -> Result<ExitCode> {
     if let Some(file) = sources.keys().next().filter(|_| known.iter().all(|(state, _)| state != CONSTANT)) {
         keep_const.iter().try_for_each(|name| note(CONSTANT, file, &format!("{file}: {name}")))?;
     }
-    for number in 0..mutants.len() {
-        let mutant = &mut mutants[number];
+    for (number, mutant) in mutants.iter_mut().enumerate() {
         if mutant.state != State::Wanted || number % shards != index {
             continue;
         }
