@@ -68,8 +68,6 @@ fn of_two_loops_one_hangs() {
             std::thread::sleep(Duration::from_millis(5));
             goes_on = both_move();
         }
-        // Once more at the end: the loop above may have slept through it.
-        goes_on = goes_on && both_move();
         hangs.store(true, Ordering::SeqCst);
         let has_ended = !goes_on || within(PATIENCE, || !drive.is_live());
         if goes_on {

@@ -10,15 +10,14 @@ const TICK: Duration = Duration::from_millis(10);
 /// How often a test begins at most.
 const TRIES: usize = 5;
 
-/// Runs a test in which a lease is renewed in time; again where it fails and the host gave this process no turn for an eighth of
-/// that lease, or longer. A renewal is sent each quarter of it and passes several threads, which are late one after the other: so
-/// much for each of them may end the lease. What fails without that, or each time, fails.
+/// Runs a test in which a lease is renewed in time; again where it fails and the host [may have ended](Ticker::may_have_ended) that
+/// lease. What fails without that, or each time, fails.
 pub fn unless_held_up(lease: Duration, test: impl Fn()) {
     for _ in 1..TRIES {
         let ticker = Ticker::start();
         match catch_unwind(AssertUnwindSafe(&test)) {
             Ok(()) => return,
-            Err(failed) if ticker.longest() < lease / 8 => resume_unwind(failed),
+            Err(failed) if !ticker.may_have_ended(lease) => resume_unwind(failed),
             Err(_) => {}
         }
     }
@@ -50,6 +49,12 @@ impl Ticker {
             }
         });
         Self { gaps }
+    }
+
+    /// Whether a lease may have ended because this process had no turn for an eighth of it, or longer. A renewal is sent each quarter
+    /// of it and passes several threads, which are late one after the other.
+    pub fn may_have_ended(&self, lease: Duration) -> bool {
+        self.longest() >= lease / 8
     }
 
     /// The longest time without a turn.

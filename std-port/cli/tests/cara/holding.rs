@@ -73,6 +73,14 @@ impl Driver {
     }
 }
 
+/// Runs a test in which the lease of a vehicle is renewed in time.
+fn while_renewed(test: impl Fn(&Stage, &Driver)) {
+    unless_held_up(LEASE, || {
+        let stage = Stage::with(&[]);
+        test(&stage, &Driver::join(&stage));
+    });
+}
+
 fn until(mut done: impl FnMut() -> bool) {
     let start = Instant::now();
     while !done() {
@@ -83,10 +91,8 @@ fn until(mut done: impl FnMut() -> bool) {
 
 #[test]
 fn what_is_held_goes_on_until_it_has_finished() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let mut held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let mut held = driver.held(stage);
         let order = driver.order.lock().unwrap().clone().unwrap();
         assert!(driver.unit.end_order(&order));
         held.expect("finished");
@@ -97,10 +103,8 @@ fn what_is_held_goes_on_until_it_has_finished() {
 
 #[test]
 fn who_goes_away_stops_what_is_held() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let held = driver.held(stage);
         held.interrupt();
         until(|| driver.made_safe() == 1);
         assert!(!driver.lease.is_live());
@@ -111,10 +115,8 @@ fn who_goes_away_stops_what_is_held() {
 /// A stopped process keeps its connection open, and nothing but the missing signs of life tells the manager.
 #[test]
 fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let held = driver.held(stage);
         held.freeze();
         until(|| driver.made_safe() == 1);
         assert!(!driver.lease.is_live());
@@ -127,10 +129,8 @@ fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
 /// The manager has events all the time, and still detects at once that the lease is no longer held.
 #[test]
 fn who_goes_away_is_noticed_among_many_events() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let held = driver.held(stage);
         // It ends with this test, also where that fails.
         let (unit, busy) = (driver.unit.clone(), Arc::new(()));
         let wanted = Arc::downgrade(&busy);
@@ -154,10 +154,8 @@ fn who_goes_away_is_noticed_among_many_events() {
 
 #[test]
 fn a_lost_vehicle_ends_the_holding() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let mut held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let mut held = driver.held(stage);
         driver.unit.stop();
         held.expect("it stopped there");
         assert_eq!(held.end(), 1);
@@ -183,10 +181,8 @@ fn a_call_that_its_own_lease_has_ended_says_so() {
 
 #[test]
 fn a_newer_holding_takes_over() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let (older, newer) = (driver.held(&stage), driver.held(&stage));
+    while_renewed(|stage, driver| {
+        let (older, newer) = (driver.held(stage), driver.held(stage));
         assert_eq!(older.end(), 1);
         assert!(driver.lease.is_live());
         newer.interrupt();
@@ -238,10 +234,8 @@ fn ctrl_c_ends_it_also_where_the_shell_ignores_it() {
 
 #[test]
 fn what_is_held_ends_with_standard_input() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let mut held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let mut held = driver.held(stage);
         held.type_in("anything\n");
         std::thread::sleep(LEASE);
         assert!(driver.lease.is_live(), "what is typed ends nothing");
@@ -259,10 +253,8 @@ fn what_is_held_ends_with_standard_input() {
 
 #[test]
 fn what_is_held_ends_when_what_reads_its_output_has_gone() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
-        let mut held = driver.held(&stage);
+    while_renewed(|stage, driver| {
+        let mut held = driver.held(stage);
         held.read_no_more();
         until(|| driver.made_safe() == 1);
         assert_eq!(held.end(), 1);
@@ -272,9 +264,7 @@ fn what_is_held_ends_when_what_reads_its_output_has_gone() {
 /// A terminal that hangs up without a signal, as where a shell has ended before or ignores it.
 #[test]
 fn what_is_held_ends_when_its_terminal_hangs_up() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
+    while_renewed(|stage, driver| {
         let (ours, theirs) = crate::terminal::pair();
         let mut command = stage.command(&["call", "driver", "--hold", "drive"]);
         let end = || std::process::Stdio::from(theirs.try_clone().unwrap());
@@ -291,9 +281,7 @@ fn what_is_held_ends_when_its_terminal_hangs_up() {
 
 #[test]
 fn what_is_held_detached_goes_on_until_its_command_ends() {
-    unless_held_up(LEASE, || {
-        let stage = Stage::with(&[]);
-        let driver = Driver::join(&stage);
+    while_renewed(|stage, driver| {
         let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--detached", "drive"]));
         held.expect("drive()");
         held.type_no_more();
