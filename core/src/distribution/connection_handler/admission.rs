@@ -1,6 +1,8 @@
 //! Which links are admitted: one per node, of the right fleet, role and manager, up to the constraint; and how to tell a
 //! restarted node from another one with the same identity. Claims decide between two managers (docs/concepts.md).
 
+use core::cmp::Ordering;
+
 use super::claims::claim_of;
 use super::known::{Known, Newcomer, NodeState};
 use super::timetable::Task;
@@ -38,8 +40,7 @@ impl<P: Port> Node<P> {
         }
         // Check the identity before the maximum of nodes: a node that restarts gets its old slot, even in a full table.
         let Hello { epoch, claim, limits, .. } = *hello;
-        let is_higher = claim_of(claim.as_ref()) > self.obeyed(&hello.identity);
-        let newcomer = Newcomer { link, epoch, claim, is_higher, limits, address: from, decided: false };
+        let newcomer = Newcomer { link, epoch, claim, limits, address: from, decided: false };
         let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
         match old {
             Some((_, old)) if old == link => Admission::Accept,
@@ -158,9 +159,17 @@ impl<P: Port> Node<P> {
         let known = self.table.node(place)?;
         let (old, newcomer) = (known.link()?, known.newcomer.as_ref()?);
         let until = if newcomer.decided { now } else { now + CHALLENGE_TIMEOUT };
-        let directive = if newcomer.is_higher { Directive::Yield } else { Directive::Challenge };
+        let is_higher = claim_of(newcomer.claim.as_ref()) > self.obeyed(&known.identity);
+        let directive = if is_higher { Directive::Yield } else { Directive::Challenge };
         self.table.schedule(place, until, Task::Supersede);
         Some(Command::Notify(old, directive))
+    }
+
+    /// Lets a link give way to a manager that has answered with a higher claim.
+    pub(super) fn yield_to_offer(&self, place: usize) -> Option<Command<P::Endpoint>> {
+        let known = self.table.node(place)?;
+        known.offered.filter(|(offered, _)| *offered > self.obeyed(&known.identity))?;
+        Some(Command::Notify(known.link()?, Directive::Yield))
     }
 
     /// The challenged link is alive: the newcomer is refused.
@@ -177,10 +186,11 @@ impl<P: Port> Node<P> {
         let newcomer = known.newcomer.take()?;
         known.dialing.take_if(|dialing| *dialing == newcomer.link);
         let (same_life, identity) = (known.epoch == newcomer.epoch, known.identity.clone());
-        let refusal = match (same_life, newcomer.is_higher) {
-            (true, _) => Refusal::AlreadyConnected,
-            (false, true) => Refusal::Driving,
-            (false, false) => Refusal::DuplicateIdentity,
+        let refusal = match claim_of(newcomer.claim.as_ref()).cmp(&self.obeyed(&identity)) {
+            _ if same_life => Refusal::AlreadyConnected,
+            Ordering::Greater => Refusal::Driving,
+            Ordering::Equal => Refusal::DuplicateIdentity,
+            Ordering::Less => Refusal::Fenced,
         };
         self.table.set_link(newcomer.link, None);
         self.refuse(now, newcomer.address, &identity, refusal);

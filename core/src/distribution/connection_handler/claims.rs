@@ -474,13 +474,18 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// A connected manager has raised its claim.
-    pub(crate) fn claim_raised(&mut self, manager: &Identity, claim: &ClaimReport) {
+    /// A connected manager has raised its claim. Returns whether it need not give way any more: no other one has shown a higher one.
+    pub(crate) fn claim_raised(&mut self, manager: &Identity, claim: &ClaimReport) -> bool {
+        let before = self.obeyed(manager);
         self.obey(manager, Some(claim));
         if self.moving.is_underway() {
             // What is being stored is no longer the claim that is obeyed.
             self.claims.questions.next = Instant::START;
         }
+        let obeyed = self.obeyed(manager);
+        let Some(known) = self.node(manager).filter(|_| obeyed > before) else { return false };
+        let waits = known.newcomer.as_ref().map(|newcomer| claim_of(newcomer.claim.as_ref()));
+        waits.max(known.offered.map(|(offered, _)| offered)) <= Some(obeyed)
     }
 
     /// A connected manager misses keep-alives and was last heard at `heard`; in the far future, it is heard again.

@@ -56,8 +56,6 @@ pub(super) struct Newcomer<E> {
     pub(super) link: LinkId,
     pub(super) epoch: Epoch,
     pub(super) claim: Option<ClaimReport>,
-    /// It has a higher claim than the connected one.
-    pub(super) is_higher: bool,
     pub(super) limits: Limits,
     pub(super) address: E,
     /// It replaces the older link even if that answers.

@@ -369,9 +369,7 @@ impl<P: Port> Node<P> {
                     self.table.node(place).and_then(Known::link).map(|new| Command::Notify(new, Directive::Admit))
                 }
                 Task::Refuse => self.refuse_newcomer(now, place),
-                Task::Yield => {
-                    self.table.node(place).and_then(Known::link).map(|old| Command::Notify(old, Directive::Yield))
-                }
+                Task::Yield => self.yield_to_offer(place),
             };
             if command.is_some() {
                 return command;

@@ -427,7 +427,7 @@ impl<P: Port> Session<P> {
 
     /// Asks the hub whether to admit a peer that has said, or proven, who it is.
     pub(super) fn consult(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        let Some(remote) = &self.wire.remote else { return None };
+        let remote = self.wire.remote.as_ref().filter(|_| self.wire.phase == Phase::Deciding)?;
         let (now, link, from, hello) = (cx.now, self.wire.link.id(), self.wire.peer_address, &remote.hello);
         let mut admission = Admission::Wait;
         cx.hub.enter(&mut |hub| admission = hub.node.admit(now, link, from, hello));
@@ -456,7 +456,8 @@ impl<P: Port> Session<P> {
                     self.challenge(cx);
                 }
             }
-            Directive::Admit => return self.admitted(cx),
+            // Its claim may be the lower one by now: the link that it waited for may have raised its own.
+            Directive::Admit => return self.consult(cx),
             Directive::Refuse(refusal) => self.wire.refuse(cx, refusal),
             Directive::Close(reason) => self.wire.close(cx, reason),
         }
@@ -465,9 +466,6 @@ impl<P: Port> Session<P> {
 
     /// The hub has admitted the peer: the link goes live and published functions are sent.
     fn admitted(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        if self.wire.phase != Phase::Deciding {
-            return None;
-        }
         self.accept(cx);
         if self.wire.phase != Phase::Live {
             return None;

@@ -32,18 +32,14 @@ pub(super) struct Obedience {
 }
 
 impl Obedience {
+    const STAYS: (Instant, Instant) = (Instant::FAR_FUTURE, Instant::FAR_FUTURE);
+
     pub(super) const fn new() -> Self {
-        Self {
-            may_move: None,
-            waits: false,
-            gives_way: (Instant::FAR_FUTURE, Instant::FAR_FUTURE),
-            is_cut_off: false,
-            has_news: false,
-        }
+        Self { may_move: None, waits: false, gives_way: Self::STAYS, is_cut_off: false, has_news: false }
     }
 
     pub(super) fn gives_way(&self) -> bool {
-        self.gives_way.0 != Instant::FAR_FUTURE
+        self.gives_way != Self::STAYS
     }
 
     pub(super) fn send_claim<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>) {
@@ -58,7 +54,11 @@ impl Obedience {
     /// The peer has raised its claim.
     pub(super) fn claim_arrived<P: Port>(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, report: &ClaimReport) {
         let Some(peer) = wire.remote.as_ref().map(|remote| &remote.hello.identity) else { return };
-        cx.hub.enter(&mut |hub| hub.node.claim_raised(peer, report));
+        let mut stays = false;
+        cx.hub.enter(&mut |hub| stays = hub.node.claim_raised(peer, report));
+        if stays {
+            self.gives_way = Self::STAYS;
+        }
         self.may_move = None;
     }
 

@@ -126,6 +126,31 @@ fn a_vehicle_obeys_the_highest_claim_and_refuses_lower_ones() {
     }
 }
 
+#[test]
+fn a_connected_manager_raises_its_claim_and_cannot_lower_it() {
+    let manager = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    let mut node = vehicle(claim(5));
+    assert_eq!(admit(&mut node, 0, &of_claim(claim(6))), Admission::Accept);
+    for said in [claim(8), claim(7), Claim::NONE, claim(8)] {
+        node.claim_raised(&manager, &report(said, 0).unwrap());
+        assert_eq!(node.claim(), claim(8), "{said:?}");
+    }
+}
+
+/// Two managers of one identity have answered, and the link of one was faster.
+#[test]
+fn a_vehicle_asks_again_who_has_offered_a_higher_claim_than_it_obeys() {
+    for (offered, expected) in [(claim(6), vec![address(9, 7_001)]), (claim(4), vec![])] {
+        let mut node = node(s_unit("agv", 1));
+        let announce = announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0);
+        node.answered(at(900), address(9, 7_001), &Announce { claim: report(offered, 0), ..announce });
+        assert_eq!(admit(&mut node, 0, &of_claim(claim(5))), Admission::Accept);
+        let mut outbox = Outbox::default();
+        run(&mut node, at(2_000), &mut outbox);
+        assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), expected, "{offered:?}");
+    }
+}
+
 /// It is stored before the first moving call under it, not when the manager joins.
 #[test]
 fn a_claim_is_stored_before_the_first_moving_call() {
@@ -181,6 +206,23 @@ fn a_fence_costs_a_manager_that_vehicle_and_nothing_else() {
     }
     for obeyed in [None, report(Claim::NONE, 0), report(claim(4), 0), report(claim(5), 0)] {
         assert_eq!(admit(&mut managed(5), 1, &agv(2, obeyed)), Admission::Accept);
+    }
+}
+
+#[test]
+fn a_manager_takes_no_claim_below_its_own_and_has_a_rival_until_it_has_none_above() {
+    let mut node = managed(5);
+    // Its keys are other ones.
+    let renewed = TaggedClaim { tag: [9; CODE_BYTES], ..tagged(claim(5)) };
+    for (set, has) in [(renewed, renewed), (tagged(claim(4)), renewed)] {
+        node.set_claim(set);
+        assert_eq!(node.hello(at(1_000), LinkId(9), 1).claim.map(|report| report.tagged), Some(has));
+    }
+    assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 0))), FENCED);
+    watch(&mut node, at(1_000), at(1_100));
+    for (set, has_rival) in [(claim(6), true), (claim(7), false)] {
+        node.set_claim(tagged(set));
+        assert_eq!((node.claim(), node.has_rival()), (set, has_rival));
     }
 }
 
@@ -425,7 +467,14 @@ fn a_manager_that_takes_over_raises_until_it_was_the_highest_once() {
 /// A connected s_unit asks another boot of its manager, and yields to a higher claim only.
 #[test]
 fn a_connected_vehicle_gives_way_to_a_higher_claim_that_is_proven() {
-    for (heard, gives_way) in [(None, false), (report(claim(5), 0), false), (report(claim(6), 0), true)] {
+    let manager = Identity::m_unit(MANAGER, MANAGER_ID).unwrap();
+    let cases = [
+        (None, false, false),
+        (report(claim(5), 0), false, false),
+        (report(claim(6), 0), false, true),
+        (report(claim(6), 0), true, false),
+    ];
+    for (heard, is_raised, gives_way) in cases {
         let mut node = node(s_unit("agv", 1));
         assert_eq!(admit(&mut node, 0, &of_claim(claim(5))), Admission::Accept);
         let newer = NodeConfig { epoch: Epoch(99), ..m_unit(MANAGER, MANAGER_ID) };
@@ -447,6 +496,11 @@ fn a_connected_vehicle_gives_way_to_a_higher_claim_that_is_proven() {
         assert_eq!(due(&mut node, at(5_202)), []);
         let announce = Announce { claim: heard, ..announce_of(&newer, 1, asked.nonce) };
         node.hear(at(5_203), address(9, 7_001), &announce_bytes(&announce));
+        if is_raised {
+            let raised = [Claim { claimant: 5, ..claim(5) }, claim(6), claim(6)];
+            let stays = raised.map(|said| node.claim_raised(&manager, &report(said, 0).unwrap()));
+            assert_eq!(stays, [false, true, false], "below the other one; not below; not raised");
+        }
         let expected = if gives_way { vec![notify(0, Directive::Yield)] } else { vec![] };
         assert_eq!(due(&mut node, at(5_204)), expected);
         if gives_way {
@@ -478,4 +532,17 @@ fn a_newcomer_with_a_higher_claim_waits_or_is_told_that_the_vehicle_drives() {
     alive.challenge_answered(at(1_100), LinkId(0));
     assert_eq!(due(&mut alive, at(1_100)), [notify(1, Directive::Refuse(Refusal::Driving))]);
     assert_eq!(alive.obeyed(&manager), claim(5));
+    // The present manager raises its claim meanwhile, below the other one and then above it.
+    let mut raised = joined();
+    let stays = [Claim { claimant: 5, ..claim(5) }, claim(7)]
+        .map(|said| raised.claim_raised(&manager, &report(said, 0).unwrap()));
+    assert_eq!(stays, [false, true]);
+    raised.challenge_answered(at(1_100), LinkId(0));
+    assert_eq!(due(&mut raised, at(1_100)), [notify(1, Directive::Refuse(Refusal::Fenced))]);
+    // Before it was asked: it is not to give way.
+    let mut early = node(m_unit("door", 9));
+    assert_eq!(admit(&mut early, 0, &of_claim(claim(5))), Admission::Accept);
+    assert_eq!(admit(&mut early, 1, &Hello { epoch: Epoch(7), ..of_claim(claim(6)) }), Admission::Wait);
+    assert!(early.claim_raised(&manager, &report(claim(7), 0).unwrap()));
+    assert_eq!(due(&mut early, at(1_000)), [notify(0, Directive::Challenge)]);
 }

@@ -240,6 +240,12 @@ fn an_answer_while_its_claim_is_stored_keeps_it_a_standby() {
     failed.node.stand_by(at(failed.now));
     assert!(failed.until_it_leads(5_000, nobody) >= 2_300);
     assert_eq!(failed.leads, [claim(6); 2], "it remembers what it has heard");
+    // Also how long ago that was.
+    let mut failed = Standby::new();
+    failed.run(3_000, manages(report(claim(6), 0)));
+    failed.until_it_leads(5_000, vehicle(3_000, claim(6)));
+    failed.node.stand_by(at(failed.now));
+    failed.until_it_leads(4_000, nobody);
 }
 
 #[test]

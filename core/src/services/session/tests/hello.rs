@@ -111,9 +111,38 @@ fn what_follows_the_hello_waits_for_the_decision() {
     pair.manager.publish();
     pair.settle();
     assert!(pair.agv.session.their_function_list().is_empty());
+    pair.agv.hub.waits = false;
     pair.agv.direct(Directive::Admit);
     pair.settle();
     assert_eq!(pair.agv.session.their_function_list().len(), 1);
+}
+
+/// The link that it has waited for has raised its claim, then ended.
+#[test]
+fn a_newcomer_whose_claim_is_the_lower_one_by_now_is_not_admitted() {
+    let tagged = |term| TaggedClaim { claim: Claim { term, claimant: 1 }, ..TaggedClaim::NONE };
+    let mut pair = Pair::prepared(&Setup::default(), |pair| pair.manager.hub.hub.node.set_claim(tagged(6)));
+    pair.agv.hub.waits = true;
+    pair.settle();
+    pair.agv.hub.waits = false;
+    let manager = pair.manager.hub.hub.node.identity().clone();
+    pair.agv.hub.hub.node.keep_obeyed(Instant::START, &manager, tagged(7));
+    pair.agv.direct(Directive::Admit);
+    pair.settle();
+    let closed = Event::Closed(CloseReason::Refused(Refusal::Fenced));
+    assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
+    assert_eq!(pair.agv.happened, [closed]);
+}
+
+#[test]
+fn a_newcomer_whose_link_has_ended_by_now_is_not_admitted() {
+    let mut pair = Pair::connected(&Setup::default());
+    pair.agv.hub.waits = true;
+    pair.settle();
+    pair.agv.direct(Directive::Close(CloseReason::Reset));
+    pair.agv.hub.waits = false;
+    pair.agv.direct(Directive::Admit);
+    assert_eq!((pair.agv.hub.hub.node.connected(), pair.agv.has(&Event::Joined)), (0, false));
 }
 
 #[test]
