@@ -1,6 +1,6 @@
 //! A latch: after a stop no order begins until a reset that was requested later (docs/concepts.md, "Stop and reset").
 
-use core::sync::atomic::{AtomicU16, AtomicU32, Ordering};
+use core::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, Ordering};
 
 use crate::distribution::message::Latch;
 use crate::time::Instant;
@@ -17,6 +17,8 @@ pub struct LatchWord {
     inhibitor: AtomicU32,
     /// The reason.
     reason: AtomicU16,
+    /// Of a unit: something that was removed from its list was stopped.
+    holds_removed: AtomicBool,
 }
 
 impl LatchWord {
@@ -27,6 +29,7 @@ impl LatchWord {
             cleared: AtomicU32::new(0),
             inhibitor: AtomicU32::new(0),
             reason: AtomicU16::new(0),
+            holds_removed: AtomicBool::new(false),
         }
     }
 
@@ -57,6 +60,22 @@ impl LatchWord {
         let inhibited = self.inhibited.load(Ordering::Acquire);
         if is_behind(now, made, inhibited) {
             self.cleared.store(inhibited, Ordering::Release);
+            self.holds_removed.store(false, Ordering::Release);
+        }
+    }
+
+    /// Copies the latch of something that is removed.
+    pub(crate) fn inherit_removed(&self, removed: &Self) {
+        self.inherit(removed);
+        if removed.is_inhibited() && self.is_inhibited() {
+            self.holds_removed.store(true, Ordering::Release);
+        }
+    }
+
+    /// Of a unit: each thing in its list has been reset, which ends a stop of all. What was removed while it was stopped was not.
+    pub fn reset_by_parts(&self, now: Instant, made: Instant) {
+        if !self.holds_removed.load(Ordering::Acquire) {
+            self.reset(now, made);
         }
     }
 

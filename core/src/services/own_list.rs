@@ -49,7 +49,7 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         match (handler.lease(), replaced.and_then(|function| function.handler.lease())) {
             (Some(lease), Some(replaced)) => lease.inherit(replaced.latch_word()),
             (Some(lease), None) if !self.moves(lease) => lease.inherit(self.stopped()),
-            (None, Some(replaced)) => self.stopped().inherit(replaced.latch_word()),
+            (None, Some(replaced)) => self.stopped().inherit_removed(replaced.latch_word()),
             _ => {}
         }
         self.swap(signature, attributes, handler)
@@ -60,7 +60,7 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
     pub fn remove(&mut self, name: &str) -> Result<(Slot, H), Error> {
         let (slot, handler) = self.take(name)?;
         if let Some(lease) = handler.lease().filter(|lease| !self.moves(lease)) {
-            self.stopped().inherit(lease.latch_word());
+            self.stopped().inherit_removed(lease.latch_word());
         }
         Ok((slot, handler))
     }

@@ -179,7 +179,7 @@ impl<T: Send + 'static> Services<T> {
         let moved = functions.iter().filter(|function| function.attributes.lease.is_some());
         let mut leases = moved.filter_map(|function| function.handler.lease()).peekable();
         if leases.peek().is_some() && leases.all(|lease| !lease.is_inhibited()) {
-            functions.stopped().reset(now, now);
+            functions.stopped().reset_by_parts(now, now);
         }
     }
 

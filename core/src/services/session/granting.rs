@@ -231,9 +231,10 @@ impl Granting {
             latched = latched.or_else(|| service.lease().and_then(Lease::latch));
         });
         Self::each_moved_by(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
-        // Resetting each stopped actuator ends a stop of all, too.
-        if charge.is_none() || !any {
+        if charge.is_none() {
             cx.functions.stopped().reset(cx.now, head.sent_at);
+        } else if !any {
+            cx.functions.stopped().reset_by_parts(cx.now, head.sent_at);
         }
         latched.map_or(Ok(()), |latch| Err(latch.into()))
     }

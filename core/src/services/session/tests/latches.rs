@@ -124,6 +124,58 @@ fn a_stopped_service_that_is_removed_and_added_again_is_stopped() {
 }
 
 #[test]
+fn a_reset_of_another_actuator_leaves_what_was_removed_stopped() {
+    for is_replaced in [false, true] {
+        let (mut pair, _) = vehicle();
+        let lift = pair.agv.offer_leased("lift()", LEASE);
+        let word = pair.agv.functions.function(lift).unwrap().handler.lease.clone().unwrap();
+        word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+        if is_replaced {
+            let without = Handler::new(Run::Now(|_| Ok(())), None);
+            let lift = Definition::parse("lift()").unwrap();
+            pair.agv.functions.replace(&lift, Attributes::NORMAL, without).unwrap();
+        }
+        pair.agv.functions.remove("lift").unwrap();
+        pair.publish();
+        assert_eq!(call(&mut pair, "free_drive"), Ok(()));
+        pair.agv.offer_leased("lift()", LEASE);
+        pair.publish();
+        assert_eq!(call(&mut pair, "lift"), stopped(0));
+        assert_eq!(call(&mut pair, "free"), Ok(()));
+        // From here on nothing that was removed is stopped: resets of each actuator end a stop of all again.
+        let lift = pair.agv.functions.find("lift").unwrap();
+        pair.agv.offer_control("free_lift()", RESET, Some(lift));
+        pair.publish();
+        for function in ["halt", "free_drive", "free_lift"] {
+            assert_eq!(call(&mut pair, function), Ok(()), "{function}");
+        }
+        pair.agv.offer_leased("tilt()", LEASE);
+        pair.publish();
+        assert_eq!(call(&mut pair, "tilt"), Ok(()));
+    }
+}
+
+#[test]
+fn a_stop_of_all_ends_with_the_last_reset_and_not_before() {
+    for shares in [true, false] {
+        let (mut pair, go) = vehicle();
+        let lift = pair.agv.offer_leased("lift()", LEASE);
+        pair.agv.offer_control("free_lift()", RESET, Some(lift));
+        if shares {
+            pair.agv.offer_sharing("dock()", LEASE, go);
+        }
+        pair.publish();
+        assert_eq!((call(&mut pair, "halt"), call(&mut pair, "free_lift")), (Ok(()), Ok(())));
+        if !shares {
+            assert_eq!(call(&mut pair, "free_drive"), Ok(()));
+        }
+        pair.agv.offer_leased("tilt()", LEASE);
+        pair.publish();
+        assert_eq!(call(&mut pair, "tilt"), if shares { stopped(1) } else { Ok(()) });
+    }
+}
+
+#[test]
 fn a_reset_whose_function_is_gone_when_it_is_answered_resets_nothing() {
     for is_removed in [true, false] {
         let (mut pair, go) = vehicle();
