@@ -231,10 +231,14 @@ impl<P: Port> Calling<P> {
     pub(super) fn cancel_but_wait(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId) {
         let Some(&pending) = self.requests.waiting_for(id) else { return };
         Self::send_cancel(wire, cx, &pending);
-        if let Some(class) = pending.leased {
-            // Need not be retried: the cancellation releases as well, and no renewal follows.
-            self.stop_renewing(id);
-            Self::send_release(wire, cx, id, class);
+        let Some(class) = pending.leased else { return };
+        let held = self.stop_renewing(id);
+        if !Self::send_release(wire, cx, id, class) {
+            match held {
+                Some(held) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
+                None => drop(self.keep_release(pending.slot, id)),
+            }
+            wire.due.set(Part::Releases, cx.now + RETRY);
         }
     }
 

@@ -9,6 +9,7 @@ use super::setup::Setup;
 use super::side::{Side, context};
 use super::{none, x};
 use crate::config::{FAILURE_TEXT_BYTES, PROGRESS_INTERVAL, Priority};
+use crate::distribution::connection_handler::Directive;
 use crate::distribution::failure::Failure;
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::Slot;
@@ -247,6 +248,27 @@ fn a_call_that_is_cancelled_is_told_to_its_handler_once_and_its_order_ends() {
 }
 
 #[test]
+fn a_release_without_room_is_sent_later_though_the_answer_is_waited_for() {
+    for renew in [Renew::Process, Renew::Never] {
+        let (mut pair, slot) = moving();
+        let options = RequestOptions { timeout: Some(Duration::from_secs(60)), ..RequestOptions::renewing(renew) };
+        let id = pair.manager.request_with("go", &x(1), &options, true).unwrap();
+        pair.settle();
+        assert!(pair.agv.is_live(slot));
+        // The stream is stuck and full; no datagram arrives.
+        (pair.manager.net.frozen, pair.manager.net.capacity, pair.manager.net.datagrams) = (true, 0, Datagrams::Lost);
+        (0..1_000).for_each(|_| pair.manager.direct(Directive::Challenge));
+        pair.manager.cancel_but_wait(id);
+        (pair.manager.net.frozen, pair.manager.net.capacity) = (false, 1 << 20);
+        pair.run(Duration::from_millis(20));
+        assert_eq!((pair.agv.is_live(slot), pair.agv.stops()), (false, 1), "{renew:?}");
+        pair.agv.answer_held(Ok(&*none()));
+        pair.settle();
+        assert!(pair.manager.outcome(id).unwrap().is_ok());
+    }
+}
+
+#[test]
 fn a_call_that_is_cancelled_stops_at_once_though_its_answer_is_waited_for() {
     let (mut pair, slot) = moving();
     let (id, call) = begin(&mut pair, "go");
@@ -358,6 +380,8 @@ fn a_reset_that_is_given_up_lets_nothing_move() {
     pair.manager.call("stop", &x(1)).unwrap();
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));
+    // Longer than the rounding of a latch's time.
+    pair.run(Duration::from_millis(5));
     let id = pair.manager.call("reset", &x(1)).unwrap();
     pair.settle();
     pair.manager.cancel(id);
