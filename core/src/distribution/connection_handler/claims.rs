@@ -171,6 +171,13 @@ pub(super) struct Questions {
     pub(super) next: Instant,
 }
 
+impl Questions {
+    /// Nothing that was asked until now counts as unanswered.
+    const fn begin_anew(&mut self) {
+        (self.unanswered, self.asked, self.asked_vehicles) = (0, None, false);
+    }
+}
+
 /// The claim of an m_unit, those that it has heard, and those that a vehicle obeys.
 #[derive(Debug)]
 pub(super) struct Claims {
@@ -236,6 +243,13 @@ impl Claims {
             self.reports.note(rival.reported - rival.silent);
         }
         self.questions.next = next;
+    }
+
+    /// A standby that was about to command waits on.
+    pub(super) fn start_no_more(&mut self) {
+        if self.stage == Stage::Starts {
+            (self.stage, self.event) = (Stage::StandsBy, None);
+        }
     }
 
     fn of(&self, manager: &Identity) -> Option<&Obeyed> {
@@ -308,6 +322,10 @@ impl<P: Port> Node<P> {
         }
         self.claims.own = tagged;
         self.claims.rival = self.claims.rival.filter(|rival| rival.claim > tagged.claim);
+        if self.claims.rival.is_none() {
+            // What nobody answered was asked about a claim that is not above this one any more.
+            self.claims.questions.begin_anew();
+        }
     }
 
     /// This m_unit may not claim now, so that a [`ClaimEvent::Raise`] was not done: it comes again, as if for the first time,
@@ -396,6 +414,7 @@ impl<P: Port> Node<P> {
     /// The port could not read its sockets empty: a question that seems unanswered may have been answered.
     pub fn left_unread(&mut self) {
         self.claims.questions.unanswered = 0;
+        self.claims.start_no_more();
     }
 }
 

@@ -48,9 +48,10 @@ impl<P: Port> Node<P> {
     }
 
     /// The port has stored this claim, in answer to [`ClaimEvent::Lead`]: the m_unit commands with it from here on. `false` where it
-    /// still stands by: somebody has answered meanwhile, or a higher claim was heard, above which it claims next.
+    /// still stands by: somebody has answered meanwhile, or may have, as it was not polled for long; or a higher claim was heard,
+    /// above which it claims next.
     pub fn lead(&mut self, now: Instant, tagged: TaggedClaim) -> bool {
-        if self.claims.stage != Stage::Starts {
+        if self.claims.stage != Stage::Starts || self.claims.questions.polled + PERIOD < now {
             return false;
         }
         let is_highest = self.claims.rival.is_none_or(|rival| rival.claim < tagged.claim);
@@ -93,9 +94,8 @@ impl<P: Port> Node<P> {
     fn heard_of_manager(&mut self, now: Instant, claim: Claim, silent: Duration) {
         self.claims.reports.note(now - silent);
         self.claims.meet_rival(now, claim, silent);
-        if silent < self.silence() && self.claims.stage == Stage::Starts {
-            self.claims.stage = Stage::StandsBy;
-            self.claims.event = None;
+        if silent < self.silence() {
+            self.claims.start_no_more();
         }
     }
 
@@ -112,12 +112,12 @@ impl<P: Port> Node<P> {
     ) {
         let silent = self.silent_from();
         let claims = &mut self.claims;
-        let questions = &mut claims.questions;
-        if core::mem::replace(&mut questions.polled, now) + PERIOD < now {
+        if core::mem::replace(&mut claims.questions.polled, now) + PERIOD < now {
             // Answers that arrived during the pause may not have been read yet.
-            (questions.unanswered, questions.asked, claims.event) = (0, None, None);
-            claims.stage = Stage::StandsBy;
+            (claims.questions.unanswered, claims.questions.asked) = (0, None);
+            claims.start_no_more();
         }
+        let questions = &claims.questions;
         if now < questions.next {
             return;
         }

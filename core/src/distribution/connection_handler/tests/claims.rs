@@ -256,6 +256,18 @@ fn a_manager_raises_its_claim_when_nobody_has_heard_the_other_one() {
     assert_eq!(watch(&mut node, at(56_100), at(110_000)).0, vec![], "storing failed, and a minute is not over");
 }
 
+#[test]
+fn questions_before_a_raise_do_not_count_for_the_next() {
+    let mut node = managed(5);
+    assert_eq!(admit(&mut node, 0, &agv(2, report(claim(7), 60_000))), FENCED);
+    assert_eq!(watch(&mut node, at(1_000), at(5_900)).0, vec![ClaimEvent::Raise(claim(7))]);
+    node.set_claim(tagged(claim(8)));
+    assert_eq!(watch(&mut node, at(5_900), at(60_000)).0, vec![]);
+    assert_eq!(admit_at(&mut node, at(60_000), 0, &agv(2, report(claim(9), 60_000))), FENCED);
+    assert_eq!(watch(&mut node, at(60_000), at(63_900)).0, vec![]);
+    assert_eq!(watch(&mut node, at(63_950), at(66_000)).0, vec![ClaimEvent::Raise(claim(9))]);
+}
+
 /// What vehicles said before the port found that it may not claim, they may say no longer: they are asked again first.
 #[test]
 fn a_claim_that_could_not_be_raised_is_raised_on_new_evidence_only() {

@@ -249,6 +249,38 @@ fn an_answer_while_its_claim_is_stored_keeps_it_a_standby() {
 }
 
 #[test]
+fn a_standby_says_above_what_it_starts_until_somebody_answers() {
+    let mut standby = Standby::new();
+    standby.run(3_000, manages(report(claim(6), 0)));
+    assert_eq!(standby.node.starts_above(), None);
+    standby.until_it_leads(5_000, nobody);
+    assert_eq!(standby.node.starts_above(), Some(claim(6)));
+    standby.run(standby.now + 2_000, vehicle(0, claim(9)));
+    assert_eq!(standby.node.starts_above(), Some(claim(9)));
+    standby.run(standby.now + 2_000, manages(report(claim(9), 0)));
+    assert_eq!(standby.node.starts_above(), None);
+}
+
+/// Somebody may have answered meanwhile. The port may say first that the claim is stored, or poll first.
+#[test]
+fn a_claim_that_is_stored_during_a_pause_or_beside_unread_sockets_starts_nothing() {
+    for (pause, polls, is_flooded) in [(3_600_000, false, false), (3_600_000, true, false), (1, false, true)] {
+        let mut standby = Standby::new();
+        standby.run(3_000, manages(report(claim(6), 0)));
+        standby.until_it_leads(5_000, nobody);
+        standby.now += pause;
+        if polls {
+            standby.run(standby.now + 1, nobody);
+        }
+        if is_flooded {
+            standby.node.left_unread();
+        }
+        assert!(!standby.node.lead(at(standby.now), tagged(claim(6).raised(9))) && standby.node.is_standby());
+        standby.until_it_leads(5_000, nobody);
+    }
+}
+
+#[test]
 fn it_takes_no_links_and_one_that_leads_searches_for_its_vehicles() {
     let mut standby = Standby::new();
     let agv = hello_of(&s_unit("agv", 2));
