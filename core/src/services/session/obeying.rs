@@ -60,6 +60,8 @@ impl Obedience {
             self.gives_way = Self::STAYS;
         }
         self.may_move = None;
+        // The hub takes the peer for heard: it is to learn anew of what is not.
+        self.is_cut_off = false;
     }
 
     /// Tells the hub when this unit and the peer last heard each other, once either misses a keep-alive: a standby that asks counts
@@ -93,17 +95,20 @@ impl Obedience {
         self.may_move
     }
 
-    /// A manager with a higher claim wants to command. Returns `true` the first time: then the peer is to show that it is alive.
+    /// A manager with a higher claim wants to command. Returns whether the peer is to show that it is alive, as it has shown each
+    /// time before.
     pub(super) fn give_way<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
-        let is_news = wire.phase == Phase::Live && !self.gives_way();
-        if is_news {
-            // One that says that it hears nothing of this unit cannot answer either.
-            let hears = wire.liveness.missed_for(wire.own_keep_alive()).is_none();
-            let answers_by = if hears { now + CHALLENGE_TIMEOUT } else { now };
-            self.gives_way = (answers_by, now + wire.constraints.handover);
-            wire.due.set(Part::Claims, now + LOOK);
+        let is_asked = wire.challenged && self.gives_way();
+        if wire.phase != Phase::Live || is_asked {
+            return false;
         }
-        is_news
+        // One that says that it hears nothing of this unit cannot answer either.
+        let hears = wire.liveness.missed_for(wire.own_keep_alive()).is_none();
+        let answers_by = if hears { now + CHALLENGE_TIMEOUT } else { now };
+        // Its orders end when they were to end first, however often others ask.
+        self.gives_way = (answers_by, self.gives_way.1.min(now + wire.constraints.handover));
+        wire.due.set(Part::Claims, now + LOOK);
+        true
     }
 
     /// Checks what is waited for. If the link gives way, returns the time limits for the peer to show life and for its orders.

@@ -11,13 +11,9 @@ use super::side::{Side, context};
 use super::{none, text};
 use crate::config::Constraints;
 use crate::distribution::claim::{Claim, TaggedClaim};
-use crate::distribution::connection_handler::{Admission, Command, Directive};
-use crate::distribution::hello::{ClaimReport, Hello};
-use crate::distribution::identity::Epoch;
-use crate::error::{CloseReason, Refusal};
+use crate::error::CloseReason;
 use crate::host::connections::LinkCounter;
 use crate::host::mailman::LinkId;
-use crate::host::secure::Plain;
 use crate::services::Context;
 use crate::time::Duration;
 
@@ -111,53 +107,6 @@ fn a_vehicle_that_its_manager_does_not_hear_counts_from_then() {
     pair.run(Duration::from_millis(500));
     assert_eq!(since(&pair), Some(0));
     assert!(pair.manager.session.is_live() && pair.agv.session.is_live());
-}
-
-/// It cannot answer, so a manager with a higher claim does not wait for that.
-#[test]
-fn a_manager_that_does_not_hear_its_vehicle_is_not_asked_to_show_life() {
-    for (silence, waits) in [(2_000, 100), (0, 400)] {
-        let mut pair = Pair::live();
-        pair.run(Duration::from_secs(10));
-        pair.agv.net.datagrams = Datagrams::Lost;
-        pair.agv.net.frozen = true;
-        pair.run(Duration::from_millis(silence));
-        pair.agv.session.direct(context!(pair.agv), Directive::Yield);
-        let restarted = Event::Closed(CloseReason::PeerRestarted);
-        if silence == 0 {
-            pair.run(Duration::from_millis(200));
-            assert!(!pair.agv.has(&restarted), "it may answer yet");
-        }
-        pair.run(Duration::from_millis(waits));
-        assert!(pair.agv.has(&restarted), "{silence}");
-    }
-}
-
-/// It is to give way to another manager of its identity, which waits.
-#[test]
-fn a_manager_that_raises_its_claim_above_that_of_a_newcomer_stays() {
-    let tagged = |term| TaggedClaim { claim: Claim { term, claimant: 1 }, ..TaggedClaim::NONE };
-    for (raised, stays) in [(5, false), (6, false), (8, true)] {
-        let mut pair = Pair::prepared(&Setup::default(), |pair| pair.manager.hub.hub.node.set_claim(tagged(5)));
-        pair.run(Duration::from_secs(10));
-        let now = pair.agv.now;
-        let claim = Some(ClaimReport { tagged: tagged(7), since: 0 });
-        let hello = Hello { epoch: Epoch(9), claim, ..pair.manager.hub.hub.node.hello(now, LinkId(9), 1) };
-        let from = ([10, 0, 0, 9], 7_000).into();
-        assert_eq!(pair.agv.hub.hub.node.admit(now, LinkId(9), from, &hello), Admission::Wait);
-        let due = |pair: &mut Pair| pair.agv.hub.hub.node.poll(now, &mut pair.agv.net, &Plain);
-        let link = pair.agv.session.wire.link.id();
-        assert_eq!(due(&mut pair), Some(Command::Notify(link, Directive::Yield)));
-        pair.manager.hub.hub.node.set_claim(tagged(raised));
-        pair.manager.session.announce_claim(context!(pair.manager));
-        pair.agv.direct(Directive::Yield);
-        assert!(pair.agv.session.granting.obedience.gives_way());
-        pair.settle();
-        assert_eq!((pair.agv.session.is_live(), pair.agv.session.granting.obedience.gives_way()), (stays, !stays));
-        if stays {
-            assert_eq!(due(&mut pair), Some(Command::Notify(LinkId(9), Directive::Refuse(Refusal::Fenced))));
-        }
-    }
 }
 
 /// The frame may be the last thing that the link brings: nothing is polled between the two.

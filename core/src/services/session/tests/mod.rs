@@ -40,6 +40,7 @@ mod side;
 mod stops;
 #[cfg(feature = "streams")]
 mod streams;
+mod yielding;
 
 use std::boxed::Box;
 use std::string::String;
