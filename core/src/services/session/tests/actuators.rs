@@ -522,3 +522,35 @@ fn what_the_peer_may_call_later_is_told_as_well() {
     pair.publish();
     assert!(state(&pair, park).unwrap().last.is_some());
 }
+
+#[test]
+fn a_reset_whose_caller_has_seen_it_fail_lifts_nothing() {
+    for late in [None, Some(Duration::ZERO), Some(MOMENT)] {
+        let (mut pair, [go, ..]) = vehicle();
+        control(&mut pair, "halt", Ok(()));
+        pair.run(MOMENT);
+        let free = call(&mut pair, "free");
+        match late {
+            Some(late) => pair.agv.now = pair.agv.held[0].deadline + late,
+            None if cfg!(feature = "details") => {
+                pair.manager.cancel(free);
+                pair.settle();
+            }
+            None => continue,
+        }
+        answer_held(&mut pair, Ok(()));
+        assert_eq!(latch(&pair, go), Some(Latch { by: 1, reason: 0 }), "{late:?}");
+    }
+}
+
+#[test]
+fn a_release_ends_what_its_function_moves_and_nothing_else() {
+    let (mut pair, [go, _, lift]) = vehicle();
+    let (driving, lifting) = (call(&mut pair, "go"), call(&mut pair, "lift"));
+    pair.manager.release(lift).unwrap();
+    pair.settle();
+    assert!(pair.agv.is_live(go) && !pair.agv.is_live(lift));
+    pair.run(LEASE.times(4));
+    assert!(pair.agv.is_live(go) && hooks(&pair) == 1);
+    assert!(pair.manager.session.holds(driving) && !pair.manager.session.holds(lifting));
+}

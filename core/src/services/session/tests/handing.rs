@@ -5,6 +5,7 @@ use super::none;
 use super::pair::Pair;
 use super::side::context;
 use crate::config::Priority;
+use crate::distribution::connection_handler::Directive;
 use crate::distribution::function::Attributes;
 use crate::distribution::hello::Manager;
 use crate::distribution::message::HandOverRefusal;
@@ -131,4 +132,13 @@ fn a_manager_that_was_left_moves_nothing_and_what_is_behind_its_call_goes_on() {
     assert_eq!(pair.manager.outcome(go).unwrap().unwrap_err(), Error::Busy);
     assert_eq!(pair.agv.held.len(), 1);
     assert!(!pair.agv.session.awaits_claim());
+}
+
+#[test]
+fn a_manager_that_is_to_give_way_hands_nothing_over() {
+    let mut pair = vehicle();
+    pair.agv.direct(Directive::Yield);
+    assert_eq!(hand_over(&mut pair, &other()), Some(Err(HandOverRefusal::Moves)));
+    let hello = pair.agv.hub.hub.node.hello(pair.agv.now, LinkId(3), 9);
+    assert_eq!(hello.wanted, Some(Manager::new("manager", 1).unwrap()));
 }

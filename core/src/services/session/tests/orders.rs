@@ -424,3 +424,35 @@ fn the_unit_ends_a_lease_not_later_than_the_motor_sees_it_dead() {
         assert_eq!(expirations(&pair), 1, "the motor has stopped, and the unit does not know");
     }
 }
+
+#[test]
+fn an_answered_call_may_hold_until_it_is_given_up() {
+    for renew in [Renew::Process, Renew::Never] {
+        let (mut pair, _) = vehicle();
+        let id = go(&mut pair, Priority::Normal, renew);
+        pair.settle();
+        assert_eq!(pair.manager.session.may_hold(id), renew == Renew::Process);
+        pair.agv.answer_held(Ok(&*none()));
+        pair.settle();
+        assert!(pair.manager.session.may_hold(id), "{renew:?}");
+        assert!(!pair.manager.session.may_hold(CallId(id.0 + 1)));
+        pair.manager.cancel(id);
+        assert!(!pair.manager.session.may_hold(id));
+    }
+}
+
+#[test]
+fn what_fails_stops_at_once_though_its_caller_does_not_hear_of_it() {
+    for (renew, waits) in [(Renew::Process, true), (Renew::Never, true), (Renew::Process, false), (Renew::Never, false)]
+    {
+        let (mut pair, slot) = vehicle();
+        let options = RequestOptions { renew, ..RequestOptions::default() };
+        pair.manager.request_with("go", &none(), &options, waits).unwrap();
+        pair.run(millis(1));
+        assert!(pair.agv.is_live(slot));
+        (pair.agv.net.frozen, pair.agv.net.datagrams) = (true, Datagrams::Lost);
+        pair.agv.answer_held(Err(Error::Busy));
+        pair.settle();
+        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "{renew:?} {waits}");
+    }
+}
