@@ -4,7 +4,7 @@
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use cara_std::{CallError, Error, Parameters, Peer, Renew, RequestOptions};
 
 use super::Stop;
@@ -56,17 +56,35 @@ impl EmulatedBoard {
     /// The caller waits in vain; in every second fault because it hears nothing any more.
     pub(super) fn caller_times_out(&self, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;
-        let agv = manager.meet(&self.who)?;
-        let line = self.board.line();
         let is_deaf = !number.is_multiple_of(2);
+        let deadline = Instant::now() + LONG;
+        loop {
+            let agv = manager.meet(&self.who)?;
+            if let Some(stop) = self.waits_in_vain(&manager, &agv, is_deaf, dice)? {
+                return Ok(stop);
+            }
+            ensure!(Instant::now() < deadline, "each call that began failed before its time-out");
+        }
+    }
+
+    /// `None` if the call began and failed early, as where this host was held up: its end is not that of a time-out.
+    fn waits_in_vain(
+        &self,
+        manager: &Manager,
+        agv: &Peer,
+        is_deaf: bool,
+        dice: &mut fastrand::Rng,
+    ) -> Result<Option<Stop>> {
+        let (board, line) = (&self.board, self.board.line());
         let (outcome, ends) = std::thread::scope(|scope| {
             let call = scope.spawn(|| {
+                let has_begun = || board.lines(line).iter().any(|line| line.contains(BEGINS));
                 let timeout = Some(TIMEOUT);
                 let options = RequestOptions { timeout, ..RequestOptions::renewing(Renew::Process) };
                 loop {
                     match agv.call(CREEP, &mut arguments(1, NEVER)?).with(options).wait() {
                         // It did not begin: the clock of this board runs ahead while it computes a proof.
-                        Err(error) if error != Error::TimedOut && is_of_a_busy_host(&error.error) => {}
+                        Err(error) if error != Error::TimedOut && is_of_a_busy_host(&error.error) && !has_begun() => {}
                         outcome => break outcome,
                     }
                 }
@@ -79,15 +97,19 @@ impl EmulatedBoard {
         });
         let line = ends?;
         let outcome = outcome.ok().context("the call panicked")?;
-        ensure!(matches!(outcome, Err(CallError { error: Error::TimedOut, .. })), "the call came to {outcome:?}");
         let stopped = self.stopped(line);
         if is_deaf {
             self.cable.join()?;
         }
         let (behind, stop) = stopped?;
+        match outcome {
+            Err(CallError { error: Error::TimedOut, .. }) => {}
+            Err(error) if is_of_a_busy_host(&error.error) => return Ok(None),
+            other => bail!("the call came to {other:?}"),
+        }
         let agv = manager.meet(&self.who)?;
         self.stands(&agv, line, behind)?;
-        Ok(stop)
+        Ok(Some(stop))
     }
 
     /// `cara call --hold` is killed while it waits for its answer.
