@@ -272,6 +272,7 @@ entry!(leases, {
     keep((cara_core::distribution::latch::LatchWord::new(), latch.latch(), latch.is_inhibited()));
     latch.inhibit(*unknown(), *unknown());
     latch.reset(*unknown(), *unknown());
+    latch.reset_by_parts(*unknown(), *unknown());
     keep((lease.latch(), lease.is_inhibited(), lease.awaits_hook()));
     keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
