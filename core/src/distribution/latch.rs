@@ -17,7 +17,7 @@ pub struct LatchWord {
     inhibitor: AtomicU32,
     /// The reason.
     reason: AtomicU16,
-    /// Of a unit: something that was removed from its list was stopped.
+    /// Of a unit: an actuator was stopped when its last function was removed.
     holds_removed: AtomicBool,
 }
 
@@ -72,7 +72,7 @@ impl LatchWord {
         }
     }
 
-    /// Of a unit: each thing in its list has been reset, which ends a stop of all. What was removed while it was stopped was not.
+    /// Of a unit: each actuator in its list has been reset, which ends a stop of all unless one was removed while it was stopped.
     pub fn reset_by_parts(&self, now: Instant, made: Instant) {
         if !self.holds_removed.load(Ordering::Acquire) {
             self.reset(now, made);

@@ -323,7 +323,7 @@ impl<P: Port> Node<P> {
         self.claims.own = tagged;
         self.claims.rival = self.claims.rival.filter(|rival| rival.claim > tagged.claim);
         if self.claims.rival.is_none() {
-            // What nobody answered was asked about a claim that is not above this one any more.
+            // The next rival is another one: questions about the last one say nothing about it.
             self.claims.questions.begin_anew();
         }
     }
@@ -493,7 +493,7 @@ impl<P: Port> Node<P> {
         }
     }
 
-    /// A connected manager has raised its claim. Returns whether it need not give way any more: no other one has shown a higher one.
+    /// A connected manager has raised its claim. Returns whether it need not give way any more: nobody has shown a higher claim.
     pub(crate) fn claim_raised(&mut self, manager: &Identity, claim: &ClaimReport) -> bool {
         let before = self.obeyed(manager);
         self.obey(manager, Some(claim));

@@ -60,7 +60,7 @@ impl Obedience {
             self.gives_way = Self::STAYS;
         }
         self.may_move = None;
-        // The hub takes the peer for heard: it is to learn anew of what is not.
+        // The hub now counts the peer as heard, both ways: `note_silence` tells it again if that is not so.
         self.is_cut_off = false;
     }
 
@@ -95,8 +95,8 @@ impl Obedience {
         self.may_move
     }
 
-    /// A manager with a higher claim wants to command. Returns whether the peer is to show that it is alive, as it has shown each
-    /// time before.
+    /// A manager with a higher claim wants to command. Returns whether to ask the peer for a sign of life: each time, unless it
+    /// still owes one.
     pub(super) fn give_way<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
         let is_asked = wire.challenged && self.gives_way();
         if wire.phase != Phase::Live || is_asked {
