@@ -159,7 +159,7 @@ impl<P: Port> Node<P> {
         let known = self.table.node(place)?;
         let (old, newcomer) = (known.link()?, known.newcomer.as_ref()?);
         let until = if newcomer.decided { now } else { now + CHALLENGE_TIMEOUT };
-        let is_higher = claim_of(newcomer.claim.as_ref()) > self.obeyed(&known.identity);
+        let is_higher = newcomer.claim() > self.obeyed(&known.identity);
         let directive = if is_higher { Directive::Yield } else { Directive::Challenge };
         self.table.schedule(place, until, Task::Supersede);
         Some(Command::Notify(old, directive))
@@ -186,7 +186,7 @@ impl<P: Port> Node<P> {
         let newcomer = known.newcomer.take()?;
         known.dialing.take_if(|dialing| *dialing == newcomer.link);
         let (same_life, identity) = (known.epoch == newcomer.epoch, known.identity.clone());
-        let refusal = match claim_of(newcomer.claim.as_ref()).cmp(&self.obeyed(&identity)) {
+        let refusal = match newcomer.claim().cmp(&self.obeyed(&identity)) {
             _ if same_life => Refusal::AlreadyConnected,
             Ordering::Greater => Refusal::Driving,
             Ordering::Equal => Refusal::DuplicateIdentity,

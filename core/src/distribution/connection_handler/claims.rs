@@ -2,6 +2,7 @@
 //! answer to a question of this unit, and of a fence only one whose tag is genuine. Nothing that one peer says ends more than its
 //! own link. The states are in `docs/wire.md`, "Claims".
 
+use super::known::Newcomer;
 use super::{Node, NodeCounter};
 use crate::config::OBEYED_MANAGERS;
 use crate::distribution::authenticator::Authenticator;
@@ -503,7 +504,7 @@ impl<P: Port> Node<P> {
         }
         let obeyed = self.obeyed(manager);
         let Some(known) = self.node(manager).filter(|_| obeyed > before) else { return false };
-        let waits = known.newcomer.as_ref().map(|newcomer| claim_of(newcomer.claim.as_ref()));
+        let waits = known.newcomer.as_ref().map(Newcomer::claim);
         waits.max(known.offered.map(|(offered, _)| offered)) <= Some(obeyed)
     }
 

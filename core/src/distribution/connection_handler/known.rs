@@ -1,5 +1,6 @@
 //! The state of one node.
 
+use super::claims::claim_of;
 use super::table::NONE;
 use super::timetable::Task;
 use crate::distribution::claim::Claim;
@@ -60,6 +61,12 @@ pub(super) struct Newcomer<E> {
     pub(super) address: E,
     /// It replaces the older link even if that answers.
     pub(super) decided: bool,
+}
+
+impl<E> Newcomer<E> {
+    pub(super) fn claim(&self) -> Claim {
+        claim_of(self.claim.as_ref())
+    }
 }
 
 /// Whether a node is connected.
