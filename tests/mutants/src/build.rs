@@ -11,7 +11,7 @@ use anyhow::{Context, Result, ensure};
 use serde_json::Value;
 
 /// What judges, the quickest first: package, program, and the tests of it. Faults that come seldom need many seeds.
-const JUDGES: [(&str, &str, &[&str]); 7] = [
+const JUDGES: [(&str, &str, &[&str]); 8] = [
     (
         "cara-core",
         "cara_core",
@@ -23,6 +23,7 @@ const JUDGES: [(&str, &str, &[&str]); 7] = [
     ("cara-core", "cara_core", &["distribution::connection_handler"]),
     ("cara-sim", "world", &[]),
     ("cara-sim", "standby", &[]),
+    ("cara-sim", "security", &[]),
 ];
 const SEEDS: &str = "24";
 /// Seconds of a processor that one judge may take, many times what it takes without a mutant. A busy machine does not change it.
@@ -64,7 +65,7 @@ pub(crate) fn build(tree: &Path) -> Result<Result<Programs, Vec<Wrong>>> {
         return Ok(Err(wrong));
     }
     let packages = ["-p", "cara-core", "-p", "cara-sim"];
-    let tests = ["--test", "chaos", "--test", "world", "--test", "standby", "--test", "orders"];
+    let tests = ["chaos", "world", "standby", "orders", "security"].map(|test| ["--test", test]).concat();
     let built = cargo(&[&["test", "--no-run", "--lib"], &packages[..], &tests].concat())?;
     let wrong = errors(&built);
     if !wrong.is_empty() {
