@@ -502,10 +502,14 @@ impl<P: Port> Node<P> {
             // What is being stored is no longer the claim that is obeyed.
             self.claims.questions.next = Instant::START;
         }
-        let obeyed = self.obeyed(manager);
-        let Some(known) = self.node(manager).filter(|_| obeyed > before) else { return false };
+        self.obeyed(manager) > before && !self.is_outranked(manager)
+    }
+
+    /// Whether another manager of this identity, which waits or has answered, has a higher claim than the one that is obeyed.
+    pub(crate) fn is_outranked(&self, manager: &Identity) -> bool {
+        let Some(known) = self.node(manager) else { return false };
         let waits = known.newcomer.as_ref().map(Newcomer::claim);
-        waits.max(known.offered.map(|(offered, _)| offered)) <= Some(obeyed)
+        waits.max(known.offered.map(|(offered, _)| offered)) > Some(self.obeyed(manager))
     }
 
     /// A connected manager misses keep-alives and was last heard at `heard`; in the far future, it is heard again.

@@ -26,7 +26,7 @@ pub struct Known<E> {
     pub(super) newest: Option<(Epoch, u32)>,
     /// The higher claim of another manager of this unit's identity, if the node obeys one.
     pub(super) under: Option<Claim>,
-    /// The highest claim with which it has answered while it was away, and the address.
+    /// The highest claim with which it has answered since it last joined, and the address.
     pub(super) offered: Option<(Claim, E)>,
     pub(super) state: NodeState,
     /// An s_unit whose last link to this m_unit ended in no orderly way.

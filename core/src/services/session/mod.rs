@@ -452,9 +452,8 @@ impl<P: Port> Session<P> {
         match directive {
             Directive::Challenge => self.challenge(cx),
             Directive::Yield => {
-                if self.granting.obedience.give_way(&mut self.wire, cx.now) {
-                    self.challenge(cx);
-                }
+                self.granting.obedience.give_way(&self.wire, cx);
+                self.challenge(cx);
             }
             // Its claim may be the lower one by now: the link that it waited for may have raised its own.
             Directive::Admit => return self.consult(cx),
@@ -521,6 +520,7 @@ impl<P: Port> Session<P> {
     /// Asks the peer of a live link for a sign of life.
     fn challenge(&mut self, cx: &mut Context<'_, P>) {
         if self.wire.phase == Phase::Live {
+            self.granting.obedience.note_question(&mut self.wire, cx.now);
             self.wire.challenged = true;
             self.pings.send(&mut self.wire, cx.now);
             self.wire.flush(cx);

@@ -60,8 +60,9 @@ impl Obedience {
             self.gives_way = Self::STAYS;
         }
         self.may_move = None;
-        // The hub now counts the peer as heard, both ways: `note_silence` tells it again if that is not so.
+        // The hub now counts the peer as heard, both ways: it is told again if that is not so.
         self.is_cut_off = false;
+        self.note_silence(wire, cx);
     }
 
     /// Tells the hub when this unit and the peer last heard each other, once either misses a keep-alive: a standby that asks counts
@@ -95,20 +96,33 @@ impl Obedience {
         self.may_move
     }
 
-    /// A manager with a higher claim wants to command. Returns whether to ask the peer for a sign of life: each time, unless it
-    /// still owes one.
-    pub(super) fn give_way<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) -> bool {
-        let is_asked = wire.challenged && self.gives_way();
-        if wire.phase != Phase::Live || is_asked {
-            return false;
+    /// A manager with a higher claim wants to command, unless the peer has raised its own meanwhile. Orders end when they were to
+    /// end first, however often others ask.
+    pub(super) fn give_way<P: Port>(&mut self, wire: &Wire<P>, cx: &mut Context<'_, P>) {
+        let Some(remote) = wire.remote.as_ref().filter(|_| wire.phase == Phase::Live) else { return };
+        let mut is_outranked = false;
+        cx.hub.enter(&mut |hub| is_outranked = hub.node.is_outranked(&remote.hello.identity));
+        if is_outranked {
+            let answers_by = if self.gives_way() { self.gives_way.0 } else { Self::answers_by(wire, cx.now) };
+            self.gives_way = (answers_by, self.gives_way.1.min(cx.now + wire.constraints.handover));
         }
+    }
+
+    /// The peer is asked for a sign of life. If it gives way, its link ends without one, after some time from the first question
+    /// on that it owes an answer to, however often newcomers make the hub ask anew.
+    pub(super) fn note_question<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) {
+        if self.gives_way() && !wire.challenged {
+            self.gives_way.0 = Self::answers_by(wire, now);
+        }
+        if self.gives_way() {
+            wire.due.set(Part::Claims, now + LOOK);
+        }
+    }
+
+    fn answers_by<P: Port>(wire: &Wire<P>, now: Instant) -> Instant {
         // One that says that it hears nothing of this unit cannot answer either.
         let hears = wire.liveness.missed_for(wire.own_keep_alive()).is_none();
-        let answers_by = if hears { now + CHALLENGE_TIMEOUT } else { now };
-        // Its orders end when they were to end first, however often others ask.
-        self.gives_way = (answers_by, self.gives_way.1.min(now + wire.constraints.handover));
-        wire.due.set(Part::Claims, now + LOOK);
-        true
+        if hears { now + CHALLENGE_TIMEOUT } else { now }
     }
 
     /// Checks what is waited for. If the link gives way, returns the time limits for the peer to show life and for its orders.

@@ -122,9 +122,12 @@ impl<P: Port> Session<P> {
         let Some((silent_at, until)) = self.granting.obedience.poll(&mut self.wire, cx) else { return };
         if self.wire.challenged {
             if cx.now >= silent_at {
-                self.wire.close(cx, CloseReason::PeerRestarted);
+                return self.wire.close(cx, CloseReason::PeerRestarted);
             }
-        } else if !self.has_given_way(cx) && cx.now >= until {
+        } else if self.has_given_way(cx) {
+            return;
+        }
+        if cx.now >= until {
             (0..self.granting.granted.len()).for_each(|index| self.granting.cut_lease(&mut self.wire, cx, index));
         }
     }

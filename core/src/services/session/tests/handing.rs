@@ -4,6 +4,7 @@ use super::super::Event;
 use super::none;
 use super::pair::Pair;
 use super::side::context;
+use super::yielding::newcomer;
 use crate::config::Priority;
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::function::Attributes;
@@ -137,6 +138,7 @@ fn a_manager_that_was_left_moves_nothing_and_what_is_behind_its_call_goes_on() {
 #[test]
 fn a_manager_that_is_to_give_way_hands_nothing_over() {
     let mut pair = vehicle();
+    newcomer(&mut pair);
     pair.agv.direct(Directive::Yield);
     assert_eq!(hand_over(&mut pair, &other()), Some(Err(HandOverRefusal::Moves)));
     let hello = pair.agv.hub.hub.node.hello(pair.agv.now, LinkId(3), 9);
