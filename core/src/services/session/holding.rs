@@ -110,15 +110,16 @@ impl<P: Port> Calling<P> {
             let [need, have] = [slowest, beats.period()].map(|span| span.as_millis() as u32);
             return Err(Error::SlowHeart { need, have });
         }
-        let fits = !self.held.is_full() || self.oldest_held(slot, options.operator).is_some();
+        let fits = !self.held.is_full() || self.replaceable(slot, options.operator).is_some();
         if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
     }
 
-    /// The oldest renewed call of a function. An operator's calls and the program's do not replace each other.
-    fn oldest_held(&self, slot: Slot, operator: bool) -> Option<usize> {
-        let is_same = |held: &Held| held.slot == slot && held.operator == operator && held.is_renewed();
-        let of_slot = self.held.iter().enumerate().filter(|(_, held)| is_same(held));
-        of_slot.min_by_key(|(_, held)| held.call).map(|(index, _)| index)
+    /// What gives its place to a new call: a release that has yet to be sent, or else the oldest renewed call of the function. An
+    /// operator's calls and the program's do not replace each other.
+    fn replaceable(&self, slot: Slot, operator: bool) -> Option<usize> {
+        let is_same = |held: &Held| !held.is_renewed() || (held.slot == slot && held.operator == operator);
+        let alike = self.held.iter().enumerate().filter(|(_, held)| is_same(held));
+        alike.min_by_key(|(_, held)| (held.is_renewed(), held.call)).map(|(index, _)| index)
     }
 
     /// Renews the lease of a call from now on; the call itself may not have begun.
@@ -133,10 +134,14 @@ impl<P: Port> Calling<P> {
     ) {
         // Replace the oldest and do not refuse: the new call may be one that stops what the earlier calls started.
         if self.held.is_full()
-            && let Some(oldest) = self.oldest_held(header.slot, header.operator)
+            && let Some(index) = self.replaceable(header.slot, header.operator)
+            && let Some(replaced) = take_at(&mut self.held, index)
         {
-            take_at(&mut self.held, oldest);
-            wire.link.counters.count(LinkCounter::RenewalsStopped);
+            if replaced.is_renewed() {
+                wire.link.counters.count(LinkCounter::RenewalsStopped);
+            } else {
+                let _ = self.keep_release(replaced.slot, replaced.call);
+            }
         }
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + between_renewals(lease));
         let (answered, operator) = (cx.now, header.operator);
@@ -232,12 +237,9 @@ impl<P: Port> Calling<P> {
         let Some(&pending) = self.requests.waiting_for(id) else { return };
         Self::send_cancel(wire, cx, &pending);
         let Some(class) = pending.leased else { return };
-        let held = self.stop_renewing(id);
+        self.stop_renewing(id);
         if !Self::send_release(wire, cx, id, class) {
-            match held {
-                Some(held) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
-                None => drop(self.keep_release(pending.slot, id)),
-            }
+            self.keep_unsent(cx.now, id, pending.slot, class);
             wire.due.set(Part::Releases, cx.now + RETRY);
         }
     }
@@ -261,20 +263,18 @@ impl<P: Port> Calling<P> {
         id: CallId,
         pending: Option<Pending>,
     ) {
-        let answered = self.take_answered(id);
-        let held = self.stop_renewing(id);
-        let waited = pending.and_then(|pending| pending.leased);
-        let class = held.map(|held| held.class).or(waited).or(answered.map(|known| known.class));
-        let Some(class) = class else { return };
+        let answered = self.take_answered(id).map(|known| (known.slot, known.class));
+        let held = self.stop_renewing(id).map(|held| (held.slot, held.class));
+        let waited = pending.and_then(|pending| Some((pending.slot, pending.leased?)));
+        let Some((slot, class)) = held.or(waited).or(answered) else { return };
         // If the link is not live, no release is needed: the callee ends all leases of a link that it loses.
         if wire.phase != Phase::Live || Self::send_release(wire, cx, id, class) {
             return;
         }
-        // Keep the release for a retry in the slot that the call had: without it the motion would last as long as the lease.
-        match (pending, held) {
-            (Some(pending), _) => self.requests.keep_unsent_release(pending),
-            (None, Some(held)) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
-            (None, None) => drop(answered.map(|known| self.keep_release(known.slot, id))),
+        // Keep the release for a retry: without it the motion would last as long as the lease.
+        match pending {
+            Some(pending) => self.requests.keep_unsent_release(pending),
+            None => self.keep_unsent(cx.now, id, slot, class),
         }
         wire.due.set(Part::Releases, cx.now + RETRY);
     }
@@ -292,6 +292,14 @@ impl<P: Port> Calling<P> {
         }
         wire.due.set(Part::Releases, cx.now + RETRY);
         self.keep_release(slot, newest)
+    }
+
+    /// Keeps the release of one call for a retry. In a full table, its function's earlier calls are released with it.
+    fn keep_unsent(&mut self, now: Instant, call: CallId, slot: Slot, class: Priority) {
+        let (operator, lease, renew, next) = (false, 0, Renew::Never, Instant::FAR_FUTURE);
+        if self.held.push(Held { call, slot, operator, class, lease, renew, next, answered: now }).is_err() {
+            let _ = self.keep_release(slot, call);
+        }
     }
 
     /// Keeps a release of a function's calls up to this one for a retry.

@@ -8,7 +8,7 @@ use super::pair::Pair;
 use super::setup::Setup;
 use super::side::{Side, context};
 use super::{none, x};
-use crate::config::{FAILURE_TEXT_BYTES, PROGRESS_INTERVAL, Priority};
+use crate::config::{FAILURE_TEXT_BYTES, LEASES, PROGRESS_INTERVAL, Priority};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::failure::Failure;
 use crate::distribution::function::Attributes;
@@ -47,6 +47,14 @@ impl Side {
 
     fn stops(&self) -> usize {
         self.count(|event| matches!(event, Event::LeaseExpired(_)))
+    }
+
+    /// Does something while the stream is stuck and full. No datagram arrives from here on.
+    fn without_room(&mut self, act: impl FnOnce(&mut Self)) {
+        (self.net.frozen, self.net.capacity, self.net.datagrams) = (true, 0, Datagrams::Lost);
+        (0..1_000).for_each(|_| self.direct(Directive::Challenge));
+        act(self);
+        (self.net.frozen, self.net.capacity) = (false, 1 << 20);
     }
 
     fn watched(&mut self, function: &str) -> CallId {
@@ -255,16 +263,72 @@ fn a_release_without_room_is_sent_later_though_the_answer_is_waited_for() {
         let id = pair.manager.request_with("go", &x(1), &options, true).unwrap();
         pair.settle();
         assert!(pair.agv.is_live(slot));
-        // The stream is stuck and full; no datagram arrives.
-        (pair.manager.net.frozen, pair.manager.net.capacity, pair.manager.net.datagrams) = (true, 0, Datagrams::Lost);
-        (0..1_000).for_each(|_| pair.manager.direct(Directive::Challenge));
-        pair.manager.cancel_but_wait(id);
-        (pair.manager.net.frozen, pair.manager.net.capacity) = (false, 1 << 20);
+        pair.manager.without_room(|manager| manager.cancel_but_wait(id));
         pair.run(Duration::from_millis(20));
         assert_eq!((pair.agv.is_live(slot), pair.agv.stops()), (false, 1), "{renew:?}");
         pair.agv.answer_held(Ok(&*none()));
         pair.settle();
         assert!(pair.manager.outcome(id).unwrap().is_ok());
+    }
+}
+
+/// A vehicle that runs one call of each function, none of which is renewed.
+fn unrenewed(functions: [&str; LEASES]) -> (Pair, [(CallId, Slot); LEASES]) {
+    let (mut pair, _) = moving();
+    let slots = functions.map(|function| pair.agv.offer_held_lease(&std::format!("{function}(x: int)"), LEASE));
+    pair.publish();
+    let options = RequestOptions::renewing(Renew::Never);
+    let calls = functions.map(|function| pair.manager.request_with(function, &x(1), &options, true).unwrap());
+    pair.settle();
+    assert!(slots.iter().all(|slot| pair.agv.is_live(*slot)));
+    (pair, core::array::from_fn(|at| (calls[at], slots[at])))
+}
+
+#[test]
+fn a_release_without_room_is_sent_later_though_the_table_of_leases_is_full() {
+    let (mut pair, calls) = unrenewed(["lift", "tilt", "turn", "dock"]);
+    let others = ["back", "left", "right"];
+    others.iter().for_each(|other| _ = pair.agv.offer_held_lease(&std::format!("{other}(x: int)"), LEASE));
+    pair.publish();
+    pair.manager.net.frozen = true;
+    for function in others.iter().chain(&["go"]) {
+        pair.manager.watched(function);
+    }
+    pair.manager.without_room(|manager| calls.iter().for_each(|(call, _)| manager.cancel_but_wait(*call)));
+    pair.run(Duration::from_millis(20));
+    assert!(calls.iter().all(|(_, slot)| !pair.agv.is_live(*slot)));
+}
+
+/// It is not refused, and no release is lost.
+#[test]
+fn a_renewed_call_finds_a_place_among_releases_without_room() {
+    let (mut pair, calls) = unrenewed(["lift", "tilt", "turn", "dock"]);
+    pair.manager.without_room(|manager| {
+        calls.iter().for_each(|(call, _)| manager.cancel_but_wait(*call));
+        let id = manager.watched("go");
+        assert!(manager.session.holds(id));
+    });
+    pair.run(Duration::from_millis(20));
+    assert!(calls.iter().all(|(_, slot)| !pair.agv.is_live(*slot)));
+}
+
+/// It waits behind the first one, so it has not taken its place.
+#[test]
+fn a_release_without_room_is_of_its_call_alone() {
+    for renew in [Renew::Process, Renew::Never] {
+        let mut pair = Pair::with(&Setup { running: 1, ..Setup::default() });
+        let slot = pair.agv.offer_held_lease("go(x: int)", LEASE);
+        pair.publish();
+        begin(&mut pair, "go");
+        let second = pair.manager.request_with("go", &x(1), &RequestOptions::renewing(renew), true).unwrap();
+        pair.settle();
+        pair.manager.without_room(|manager| manager.cancel_but_wait(second));
+        pair.run(Duration::from_millis(20));
+        assert!(pair.agv.is_live(slot), "{renew:?}");
+        pair.agv.answer_held(Ok(&*none()));
+        pair.settle();
+        assert_eq!((pair.agv.held.len(), pair.agv.is_live(slot)), (0, true), "{renew:?}");
+        assert_eq!(pair.manager.outcome(second).map(|outcome| outcome.is_ok()), Some(false), "{renew:?}");
     }
 }
 
