@@ -75,7 +75,12 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         Ok((stored.slot, stored.handler))
     }
 
-    pub(crate) fn swap(&mut self, signature: Signature<'_>, attributes: Attributes, handler: H) -> Result<Slot, Error> {
+    pub(crate) fn swap(
+        &mut self,
+        signature: Signature<'_>,
+        attributes: Attributes,
+        handler: H,
+    ) -> Result<(Slot, H), Error> {
         let index = self.table.find(signature.name()).ok_or(Error::UnknownFunction)?;
         let freed = self.table.function(index).map_or(0, |old| old.signature.as_bytes().len());
         if signature.as_bytes().len() > self.table.free_bytes().saturating_add(freed) {
@@ -84,7 +89,7 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         let old = self.table.take(index).ok_or(Error::UnknownFunction)?;
         self.table.bump(index);
         self.table.put(index, old.slot, attributes, signature.as_bytes(), handler)?;
-        Ok(old.slot)
+        Ok((old.slot, old.handler))
     }
 
     /// The slot of the function with this name.

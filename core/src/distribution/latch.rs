@@ -9,7 +9,7 @@ use crate::time::Instant;
 /// a stop may interrupt a reset.
 #[derive(Debug, Default)]
 pub struct LatchWord {
-    /// Time of the last stop, as [`odd_millis`]; 0 before the first. Written only by a stop.
+    /// Time of the last stop, as [`odd_millis`]; 0 before the first. A reset does not write it.
     inhibited: AtomicU32,
     /// The value of `inhibited` at the last reset. If the two differ, the latch is set.
     cleared: AtomicU32,
@@ -79,13 +79,19 @@ impl LatchWord {
         }
     }
 
-    /// Copies another latch if it is set, unless this one was reset after that very stop.
+    /// Copies another latch if it is set, unless this one was reset after that very stop. If this one is set already, keeps its
+    /// cause, and the later time of both.
     pub(crate) fn inherit(&self, from: &Self) {
+        let Some(latch) = from.latch() else { return };
+        // Read behind that: a stop that comes meanwhile is the later one.
         let at = from.inhibited.load(Ordering::Acquire);
-        let Some(latch) = from.latch().filter(|_| !self.is_inhibited()) else { return };
-        // This latch is not set, so `inhibited` is the last stop that was reset here. Another time is another stop.
-        if at != self.inhibited.load(Ordering::Acquire) {
-            self.note(latch);
+        if at == self.cleared.load(Ordering::Acquire) {
+            return;
+        }
+        self.note(latch);
+        // Valid for stops within 24 days of each other.
+        let is_later = at.wrapping_sub(self.inhibited.load(Ordering::Acquire)) < 1 << 31;
+        if is_later || !self.is_inhibited() {
             self.inhibited.store(at, Ordering::Release);
         }
     }
@@ -222,6 +228,21 @@ mod tests {
         own.inhibit(at(3_000_000), Latch { by: 0, reason: 1 });
         own.inherit(&unit);
         assert_eq!(own.latch(), Some(Latch { by: 0, reason: 1 }));
+    }
+
+    #[test]
+    fn of_what_is_removed_and_its_unit_the_later_stop_counts() {
+        for (unit, removed) in
+            [(1_000_000, 2_000_000), (2_000_000, 1_000_000), (WRAP * 1_000 - 1, WRAP * 1_000 + 999_999)]
+        {
+            let (unit, early) = (stopped(unit), unit.min(removed));
+            unit.inherit_removed(&stopped(removed));
+            let later = at(early + 5_000_000);
+            unit.reset(later, at(early + 500_000));
+            assert!(unit.is_inhibited(), "{early}");
+            unit.reset(later, at(early + 2_000_000));
+            assert!(!unit.is_inhibited(), "{early}");
+        }
     }
 
     #[test]

@@ -33,7 +33,8 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
     }
 
     /// Replaces the function of this name; [`Error::UnknownFunction`] or [`Error::Full`] leave the list unchanged. Its actuator
-    /// is latched if that of the previous function was.
+    /// is latched if that of the previous function was. If it has none and no other function moves that actuator, functions added
+    /// later are latched, until a reset of all.
     pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
         self.replace_signature(definition.signature(), attributes, handler)
     }
@@ -45,14 +46,16 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         attributes: Attributes,
         handler: H,
     ) -> Result<Slot, Error> {
-        let replaced = self.find(signature.name()).and_then(|slot| self.function(slot));
-        match (handler.lease(), replaced.and_then(|function| function.handler.lease())) {
+        let is_known = handler.lease().is_some_and(|lease| self.moves(lease));
+        let (slot, replaced) = self.swap(signature, attributes, handler)?;
+        let lease = self.function(slot).and_then(|function| function.handler.lease());
+        match (lease, replaced.lease()) {
             (Some(lease), Some(replaced)) => lease.inherit(replaced.latch_word()),
-            (Some(lease), None) if !self.moves(lease) => lease.inherit(self.stopped()),
-            (None, Some(replaced)) => self.stopped().inherit_removed(replaced.latch_word()),
+            (Some(lease), None) if !is_known => lease.inherit(self.stopped()),
+            (None, Some(replaced)) if !self.moves(replaced) => self.stopped().inherit_removed(replaced.latch_word()),
             _ => {}
         }
-        self.swap(signature, attributes, handler)
+        Ok(slot)
     }
 
     /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`]. If its actuator is latched and no other
@@ -65,9 +68,10 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         Ok((slot, handler))
     }
 
-    /// Whether any function in the list has this lease.
+    /// Whether calls of any function in the list move what this lease is of. Those that stop or reset it do not.
     fn moves(&self, lease: &Lease) -> bool {
-        self.iter().filter_map(|function| function.handler.lease()).any(|known| core::ptr::eq(known, lease))
+        let moving = self.iter().filter(|function| function.attributes.lease.is_some());
+        moving.filter_map(|function| function.handler.lease()).any(|known| core::ptr::eq(known, lease))
     }
 }
 

@@ -1,16 +1,18 @@
 //! Only a reset ends a latch: it survives each change of a vehicle's list of functions.
 
 use std::rc::Rc;
+use std::vec;
 
 use super::none;
 use super::pair::Pair;
 use super::setup::{Handler, Run};
 use crate::config::Priority;
 use crate::distribution::function::{Attributes, Definition};
-use crate::distribution::function_list::Slot;
+use crate::distribution::function_list::{Entry, FunctionList, Slot};
 use crate::error::Error;
 use crate::services::lease::{Latch, Lease};
-use crate::time::Duration;
+use crate::storage::Boxed;
+use crate::time::{Duration, Instant};
 
 const LEASE: Duration = Duration::from_millis(500);
 /// Longer than the rounding of a latch's time.
@@ -153,6 +155,51 @@ fn a_reset_of_another_actuator_leaves_what_was_removed_stopped() {
         pair.publish();
         assert_eq!(call(&mut pair, "tilt"), Ok(()));
     }
+}
+
+#[test]
+fn a_function_that_stops_moving_leaves_its_actuator_to_the_others() {
+    let (mut pair, go) = vehicle();
+    pair.agv.offer_sharing("dock()", LEASE, go);
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    let without = || Handler::new(Run::Now(|_| Ok(())), None);
+    let go = Definition::parse("go()").unwrap();
+    pair.agv.functions.replace(&go, Attributes::NORMAL, without()).unwrap();
+    pair.agv.offer_leased("lift()", LEASE);
+    pair.publish();
+    assert_eq!((call(&mut pair, "lift"), call(&mut pair, "dock")), (Ok(()), stopped(0)));
+    let dock = Definition::parse("dock()").unwrap();
+    pair.agv.functions.replace(&dock, Attributes::NORMAL, without()).unwrap();
+    pair.agv.offer_leased("tilt()", LEASE);
+    pair.publish();
+    assert_eq!(call(&mut pair, "tilt"), stopped(0), "nothing else moves what was stopped");
+}
+
+/// What stops or resets an actuator is no reason to take it for one that a stop of all has reached.
+#[test]
+fn what_is_added_beside_its_reset_after_a_stop_of_all_is_stopped() {
+    let (mut pair, _) = vehicle();
+    pair.agv.functions.remove("go").unwrap();
+    assert_eq!(call(&mut pair, "halt"), Ok(()));
+    let reset = pair.agv.functions.find("free_drive").unwrap();
+    pair.agv.offer_sharing("go()", LEASE, reset);
+    pair.publish();
+    assert_eq!(call(&mut pair, "go"), stopped(1));
+    assert_eq!((call(&mut pair, "free"), call(&mut pair, "go")), (Ok(()), Ok(())));
+}
+
+#[test]
+fn what_could_not_be_replaced_leaves_the_unit_as_it_was() {
+    let entries = (0..2).map(|_| Entry::empty()).collect();
+    let mut functions = FunctionList::<Boxed, _>::new(entries, vec![0; 16].into_boxed_slice());
+    let (handler, drive) = fresh();
+    functions.add_signature(Definition::parse("go()").unwrap().signature(), MOVES, handler).unwrap();
+    drive.inhibit(Instant::from_micros(9_000_000), Latch { by: 0, reason: 0 });
+    let longer = Definition::parse("go(where_to: float[2])").unwrap();
+    let without = Handler::new(Run::Now(|_| Ok(())), None);
+    assert!(matches!(functions.replace(&longer, Attributes::NORMAL, without), Err(Error::Full(_))));
+    assert!(!functions.stopped().is_inhibited());
 }
 
 #[test]
