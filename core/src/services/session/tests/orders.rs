@@ -149,6 +149,37 @@ fn answered_calls_of_several_functions_are_released_at_once_however_often_one_of
 }
 
 #[test]
+fn a_call_beyond_the_table_of_orders_is_refused_and_moves_nothing() {
+    let mut pair = Pair::live();
+    let slots: Vec<Slot> = (0..=LEASES).map(|at| pair.agv.offer_leased(&std::format!("go_{at}()"), LEASE)).collect();
+    pair.publish();
+    let call = |pair: &mut Pair, at: usize| {
+        // What is renewed is refused by its caller's own table.
+        let options = RequestOptions { renew: Renew::Never, timeout: Some(TIMEOUT), ..RequestOptions::default() };
+        let id = pair.manager.request_with(&std::format!("go_{at}"), &none(), &options, true).unwrap();
+        pair.settle();
+        pair.manager.outcome(id).unwrap().map(drop)
+    };
+    assert!((0..LEASES).all(|at| call(&mut pair, at).is_ok()));
+    assert_eq!(call(&mut pair, LEASES), Err(Error::Busy));
+    let live: Vec<bool> = slots.iter().map(|slot| pair.agv.is_live(*slot)).collect();
+    assert_eq!(live, [[true; LEASES].as_slice(), &[false]].concat());
+}
+
+#[test]
+fn a_renewal_that_overtakes_its_call_ends_nothing() {
+    let (mut pair, slot) = vehicle();
+    pair.manager.net.frozen = true;
+    let id = go(&mut pair, Priority::Normal, Renew::Process);
+    pair.run(LEASE.divided_by(2));
+    assert!(pair.agv.counter(LinkCounter::RenewalsIgnored) > 0 && pair.manager.session.holds(id));
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert!(pair.agv.is_live(slot) && pair.manager.session.holds(id));
+    assert!(!is_reported(&pair, id, LeaseEnd::Expired));
+}
+
+#[test]
 fn a_newer_call_replaces_an_older_one_for_ever_and_without_the_hook() {
     let (mut pair, slot) = vehicle();
     let (first, old) = started(&mut pair, Priority::Normal);
