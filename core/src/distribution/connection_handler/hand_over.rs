@@ -152,9 +152,8 @@ impl<P: Port> Node<P> {
         let Some(identity) = to.identity().filter(|_| to != from && present == Some(link)) else {
             return Err(HandOverRefusal::Other);
         };
-        // Another link of the same manager would take the place of this one, or a higher claim is to.
-        let is_followed = known.is_some_and(|known| known.newcomer.is_some() || known.task.is_some())
-            || self.target.as_ref().is_some_and(|target| self.is_outranked(target));
+        // Another link of the same manager that waits for this one to end would take its place.
+        let is_followed = known.is_some_and(|known| known.newcomer.is_some() || known.task.is_some());
         if self.moving.is_underway() || is_followed {
             return Err(HandOverRefusal::Underway);
         }

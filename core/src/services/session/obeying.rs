@@ -96,8 +96,8 @@ impl Obedience {
         self.may_move
     }
 
-    /// A manager with a higher claim wants to command, unless the peer has raised its own meanwhile. Orders end when they were to
-    /// end first, however often others ask.
+    /// A manager with a higher claim wants to command, unless the peer has raised its own meanwhile, or the other one is gone. The time
+    /// for orders runs from the first such request.
     pub(super) fn give_way<P: Port>(&mut self, wire: &Wire<P>, cx: &mut Context<'_, P>) {
         let Some(remote) = wire.remote.as_ref().filter(|_| wire.phase == Phase::Live) else { return };
         let mut is_outranked = false;
@@ -108,14 +108,14 @@ impl Obedience {
         }
     }
 
-    /// The peer is asked for a sign of life. If it gives way, its link ends without one, after some time from the first question
-    /// on that it owes an answer to, however often newcomers make the hub ask anew.
+    /// The peer is asked for a sign of life. The link of one that gives way ends without an answer [`CHALLENGE_TIMEOUT`] after the first
+    /// question that is open since it gives way, however often newcomers make the hub ask again.
     pub(super) fn note_question<P: Port>(&mut self, wire: &mut Wire<P>, now: Instant) {
         if self.gives_way() && !wire.challenged {
             self.gives_way.0 = Self::answers_by(wire, now);
         }
         if self.gives_way() {
-            wire.due.set(Part::Claims, now + LOOK);
+            wire.due.hasten(Part::Claims, now + LOOK);
         }
     }
 

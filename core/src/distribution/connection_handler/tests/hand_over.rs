@@ -228,13 +228,6 @@ fn what_stands_against_a_hand_over() {
     let again = followed.admit(at(ASKED), NEW, address(1, 41_000), &hello(&manager(), 3));
     assert_eq!(again, Admission::Wait, "it would take the place of the link that ends");
     assert_eq!(asked(&mut followed, OLD, other()), Err(HandOverRefusal::Underway));
-    let mut outranked = vehicle();
-    outranked.table.node_mut(0).unwrap().offered = Some((claim(4), address(9, 7_001)));
-    assert_eq!(
-        asked(&mut outranked, OLD, other()),
-        Err(HandOverRefusal::Underway),
-        "another manager has a higher claim"
-    );
     let mut full = vehicle();
     (20..23).for_each(|id| full.keep_obeyed(at(0), &Identity::m_unit("old", id).unwrap(), tagged(claim(1))));
     assert_eq!(asked(&mut full, OLD, other()), Err(HandOverRefusal::NotStored), "no place for one more claim");
