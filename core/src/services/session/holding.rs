@@ -100,8 +100,9 @@ impl<P: Port> Calling<P> {
         of_slot.map(|held| (held.answered + held.length()).since(now)).max()
     }
 
-    /// Whether a call of this function could be renewed. [`Error::Full`] if the table is full and has no earlier call of the
-    /// same function and origin to replace; [`Error::SlowHeart`] if the heart's period is longer than half of the lease.
+    /// Whether a call of this function could be renewed. [`Error::Full`] if the table is full and has neither an earlier call of the
+    /// same function and origin nor a release that waits to be sent, to replace; [`Error::SlowHeart`] if the heart's period is longer
+    /// than half of the lease.
     pub(super) fn check_held(&self, lease: Duration, options: &RequestOptions, slot: Slot) -> Result<(), Error> {
         let slowest = lease.divided_by(BEATS_PER_LEASE);
         if let Renew::Heart(beats) = options.renew
@@ -114,12 +115,14 @@ impl<P: Port> Calling<P> {
         if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
     }
 
-    /// What gives its place to a new call: a release that has yet to be sent, or else the oldest renewed call of the function. An
-    /// operator's calls and the program's do not replace each other.
+    /// What gives its place to a new call: the oldest renewed call of the function, where an operator's calls and the program's do not
+    /// replace each other, or else a release that has yet to be sent and can be kept elsewhere.
     fn replaceable(&self, slot: Slot, operator: bool) -> Option<usize> {
-        let is_same = |held: &Held| !held.is_renewed() || (held.slot == slot && held.operator == operator);
-        let alike = self.held.iter().enumerate().filter(|(_, held)| is_same(held));
-        alike.min_by_key(|(_, held)| (held.is_renewed(), held.call)).map(|(index, _)| index)
+        let can_go = |held: &Held| {
+            if held.is_renewed() { held.slot == slot && held.operator == operator } else { self.can_keep(held.slot) }
+        };
+        let replaceable = self.held.iter().enumerate().filter(|(_, held)| can_go(held));
+        replaceable.min_by_key(|(_, held)| (!held.is_renewed(), held.call)).map(|(index, _)| index)
     }
 
     /// Renews the lease of a call from now on; the call itself may not have begun.
@@ -132,7 +135,7 @@ impl<P: Port> Calling<P> {
         lease: Duration,
         renew: Renew,
     ) {
-        // Replace the oldest and do not refuse: the new call may be one that stops what the earlier calls started.
+        // Replace another one and do not refuse: the new call may be one that stops what the earlier calls started.
         if self.held.is_full()
             && let Some(index) = self.replaceable(header.slot, header.operator)
             && let Some(replaced) = take_at(&mut self.held, index)
@@ -140,6 +143,7 @@ impl<P: Port> Calling<P> {
             if replaced.is_renewed() {
                 wire.link.counters.count(LinkCounter::RenewalsStopped);
             } else {
+                // Its function's earlier calls are released with it.
                 let _ = self.keep_release(replaced.slot, replaced.call);
             }
         }
@@ -239,8 +243,7 @@ impl<P: Port> Calling<P> {
         let Some(class) = pending.leased else { return };
         self.stop_renewing(id);
         if !Self::send_release(wire, cx, id, class) {
-            self.keep_unsent(cx.now, id, pending.slot, class);
-            wire.due.set(Part::Releases, cx.now + RETRY);
+            self.keep_unsent(wire, cx.now, id, pending.slot, class);
         }
     }
 
@@ -273,10 +276,12 @@ impl<P: Port> Calling<P> {
         }
         // Keep the release for a retry: without it the motion would last as long as the lease.
         match pending {
-            Some(pending) => self.requests.keep_unsent_release(pending),
-            None => self.keep_unsent(cx.now, id, slot, class),
+            Some(pending) => {
+                self.requests.keep_unsent_release(pending);
+                wire.due.set(Part::Releases, cx.now + RETRY);
+            }
+            None => self.keep_unsent(wire, cx.now, id, slot, class),
         }
-        wire.due.set(Part::Releases, cx.now + RETRY);
     }
 
     /// Releases all calls of a function of the peer.
@@ -295,11 +300,18 @@ impl<P: Port> Calling<P> {
     }
 
     /// Keeps the release of one call for a retry. In a full table, its function's earlier calls are released with it.
-    fn keep_unsent(&mut self, now: Instant, call: CallId, slot: Slot, class: Priority) {
+    fn keep_unsent(&mut self, wire: &mut Wire<P>, now: Instant, call: CallId, slot: Slot, class: Priority) {
         let (operator, lease, renew, next) = (false, 0, Renew::Never, Instant::FAR_FUTURE);
-        if self.held.push(Held { call, slot, operator, class, lease, renew, next, answered: now }).is_err() {
-            let _ = self.keep_release(slot, call);
+        self.held.retain(|held| held.call != call);
+        let held = Held { call, slot, operator, class, lease, renew, next, answered: now };
+        if self.held.push(held).is_err() && self.keep_release(slot, call).is_err() {
+            wire.link.counters.count(LinkCounter::FramesWithheld);
         }
+        wire.due.set(Part::Releases, now + RETRY);
+    }
+
+    fn can_keep(&self, slot: Slot) -> bool {
+        !self.releases.is_full() || self.releases.iter().any(|(known, _)| *known == slot)
     }
 
     /// Keeps a release of a function's calls up to this one for a retry.

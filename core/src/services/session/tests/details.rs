@@ -2,6 +2,7 @@
 
 use std::string::String;
 
+use super::super::due::Part;
 use super::super::{Event, Incoming, RequestOptions};
 use super::net::Datagrams;
 use super::pair::Pair;
@@ -21,7 +22,7 @@ use crate::services::Context;
 use crate::services::heart::Renew;
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
-use crate::time::Duration;
+use crate::time::{Duration, Instant};
 
 const LEASE: Duration = Duration::from_millis(400);
 const GO: &str = "go(x: int) -> (x: int) progress (x: int) fails (at: int[2])";
@@ -54,6 +55,7 @@ impl Side {
         (self.net.frozen, self.net.capacity, self.net.datagrams) = (true, 0, Datagrams::Lost);
         (0..1_000).for_each(|_| self.direct(Directive::Challenge));
         act(self);
+        assert!(self.session.wire.due.at(Part::Releases) < Instant::FAR_FUTURE, "a release found room");
         (self.net.frozen, self.net.capacity) = (false, 1 << 20);
     }
 
@@ -294,6 +296,7 @@ fn a_release_without_room_is_sent_later_though_the_table_of_leases_is_full() {
     for function in others.iter().chain(&["go"]) {
         pair.manager.watched(function);
     }
+    assert!(pair.manager.session.calling.held.is_full());
     pair.manager.without_room(|manager| calls.iter().for_each(|(call, _)| manager.cancel_but_wait(*call)));
     pair.run(Duration::from_millis(20));
     assert!(calls.iter().all(|(_, slot)| !pair.agv.is_live(*slot)));
@@ -305,11 +308,48 @@ fn a_renewed_call_finds_a_place_among_releases_without_room() {
     let (mut pair, calls) = unrenewed(["lift", "tilt", "turn", "dock"]);
     pair.manager.without_room(|manager| {
         calls.iter().for_each(|(call, _)| manager.cancel_but_wait(*call));
+        assert!(manager.session.calling.held.is_full());
         let id = manager.watched("go");
         assert!(manager.session.holds(id));
     });
     pair.run(Duration::from_millis(20));
     assert!(calls.iter().all(|(_, slot)| !pair.agv.is_live(*slot)));
+}
+
+/// A release that can be kept nowhere else keeps its place.
+#[test]
+fn a_renewed_call_is_refused_where_it_would_cost_a_release() {
+    let (mut pair, calls) = unrenewed(["lift", "tilt", "turn", "dock"]);
+    let others =
+        ["back", "left", "right"].map(|other| pair.agv.offer_held_lease(&std::format!("{other}(x: int)"), LEASE));
+    pair.publish();
+    let go = pair.agv.functions.find("go").unwrap();
+    pair.manager.without_room(|manager| {
+        for slot in others.iter().chain(&[go]) {
+            manager.release(*slot).unwrap();
+        }
+        calls.iter().for_each(|(call, _)| manager.cancel_but_wait(*call));
+        let refused = manager.request_with("go", &x(1), &RequestOptions::renewing(Renew::Process), true);
+        assert_eq!(refused, Err(Error::Full(Limit::Leases)));
+    });
+    pair.run(Duration::from_millis(20));
+    assert!(calls.iter().all(|(_, slot)| !pair.agv.is_live(*slot)));
+}
+
+/// As it would be if none of them waited.
+#[test]
+fn a_newer_call_replaces_its_functions_earlier_one_beside_releases_without_room() {
+    let (mut pair, calls) = unrenewed(["lift", "tilt", "turn", "dock"]);
+    let first = pair.manager.watched("go");
+    pair.manager.without_room(|manager| {
+        calls[1..].iter().for_each(|(call, _)| manager.cancel_but_wait(*call));
+        assert!(manager.session.calling.held.is_full());
+        let second = manager.watched("go");
+        assert!(!manager.session.holds(first) && manager.session.holds(second));
+    });
+    pair.run(Duration::from_millis(20));
+    let live = calls.map(|(_, slot)| pair.agv.is_live(slot));
+    assert_eq!(live, [true, false, false, false]);
 }
 
 /// It waits behind the first one, so it has not taken its place.
