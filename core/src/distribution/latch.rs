@@ -9,7 +9,7 @@ use crate::time::Instant;
 /// a stop may interrupt a reset.
 #[derive(Debug, Default)]
 pub struct LatchWord {
-    /// Time of the last stop, as [`odd_millis`]; 0 before the first. A reset does not write it.
+    /// Time of the last stop, as [`odd_millis`]; 0 before the first. Written by a stop and by [`inherit`](Self::inherit), not by a reset.
     inhibited: AtomicU32,
     /// The value of `inhibited` at the last reset. If the two differ, the latch is set.
     cleared: AtomicU32,
@@ -17,7 +17,7 @@ pub struct LatchWord {
     inhibitor: AtomicU32,
     /// The reason.
     reason: AtomicU16,
-    /// Of a unit: an actuator was stopped when its last function was removed.
+    /// Of a unit: an actuator was stopped when its last function was removed or replaced.
     holds_removed: AtomicBool,
 }
 
@@ -83,15 +83,15 @@ impl LatchWord {
     /// cause, and the later time of both.
     pub(crate) fn inherit(&self, from: &Self) {
         let Some(latch) = from.latch() else { return };
-        // Read behind that: a stop that comes meanwhile is the later one.
+        // Load this behind the latch: a stop of `from` in between then counts with its own time.
         let at = from.inhibited.load(Ordering::Acquire);
-        if at == self.cleared.load(Ordering::Acquire) {
+        let own = self.inhibited.load(Ordering::Acquire);
+        if at == own || at == self.cleared.load(Ordering::Acquire) {
             return;
         }
         self.note(latch);
-        // Valid for stops within 24 days of each other.
-        let is_later = at.wrapping_sub(self.inhibited.load(Ordering::Acquire)) < 1 << 31;
-        if is_later || !self.is_inhibited() {
+        // Stops that are more than 24 days apart count as if the later one came first.
+        if at.wrapping_sub(own) < 1 << 31 || !self.is_inhibited() {
             self.inhibited.store(at, Ordering::Release);
         }
     }

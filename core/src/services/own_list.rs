@@ -2,7 +2,7 @@
 //!
 //! A latch (docs/concepts.md, "Stop and reset") belongs to an actuator, or to the unit after a stop of all. It survives every
 //! change of the list: a new service starts latched if the unit is, a replacement inherits the latch, and a removed service
-//! leaves it to the unit. Only a reset ends it.
+//! leaves it to the others of its actuator, those that stop or reset it included, or else to the unit. Only a reset ends it.
 
 use super::lease::{Lease, Service};
 use crate::distribution::function::{Attributes, Definition, Signature};
@@ -23,7 +23,7 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         attributes: Attributes,
         handler: H,
     ) -> Result<Slot, Error> {
-        let is_known = handler.lease().is_some_and(|lease| self.moves(lease));
+        let is_known = handler.lease().is_some_and(|lease| self.lists(lease));
         let slot = self.insert(signature, attributes, handler)?;
         let lease = self.function(slot).and_then(|function| function.handler.lease());
         if let Some(lease) = lease.filter(|_| !is_known) {
@@ -32,9 +32,9 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         Ok(slot)
     }
 
-    /// Replaces the function of this name; [`Error::UnknownFunction`] or [`Error::Full`] leave the list unchanged. Its actuator
-    /// is latched if that of the previous function was. If it has none and no other function moves that actuator, functions added
-    /// later are latched, until a reset of all.
+    /// Replaces the function of this name; [`Error::UnknownFunction`] or [`Error::Full`] leave the list unchanged. If it moves an
+    /// actuator, that is latched if the previous function's was. If it moves none, and the previous one's actuator was latched and
+    /// has no other function in the list, functions added later are latched, until a reset of all.
     pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
         self.replace_signature(definition.signature(), attributes, handler)
     }
@@ -46,32 +46,36 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         attributes: Attributes,
         handler: H,
     ) -> Result<Slot, Error> {
-        let is_known = handler.lease().is_some_and(|lease| self.moves(lease));
+        let previous = self.find(signature.name()).and_then(|slot| self.function(slot));
+        let takes_over =
+            attributes.lease.is_some() && previous.is_some_and(|previous| previous.attributes.lease.is_some());
+        let is_known = handler.lease().is_some_and(|lease| self.lists(lease));
         let (slot, replaced) = self.swap(signature, attributes, handler)?;
         let lease = self.function(slot).and_then(|function| function.handler.lease());
-        match (lease, replaced.lease()) {
+        if let Some(lease) = lease.filter(|_| !is_known && !takes_over) {
+            lease.inherit(self.stopped());
+        }
+        match (lease.filter(|_| attributes.lease.is_some()), replaced.lease()) {
             (Some(lease), Some(replaced)) => lease.inherit(replaced.latch_word()),
-            (Some(lease), None) if !is_known => lease.inherit(self.stopped()),
-            (None, Some(replaced)) if !self.moves(replaced) => self.stopped().inherit_removed(replaced.latch_word()),
+            (None, Some(replaced)) if !self.lists(replaced) => self.stopped().inherit_removed(replaced.latch_word()),
             _ => {}
         }
         Ok(slot)
     }
 
     /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`]. If its actuator is latched and no other
-    /// function moves it, functions added later are latched, until a reset of all.
+    /// function in the list is of it, functions added later are latched, until a reset of all.
     pub fn remove(&mut self, name: &str) -> Result<(Slot, H), Error> {
         let (slot, handler) = self.take(name)?;
-        if let Some(lease) = handler.lease().filter(|lease| !self.moves(lease)) {
+        if let Some(lease) = handler.lease().filter(|lease| !self.lists(lease)) {
             self.stopped().inherit_removed(lease.latch_word());
         }
         Ok((slot, handler))
     }
 
-    /// Whether calls of any function in the list move what this lease is of. Those that stop or reset it do not.
-    fn moves(&self, lease: &Lease) -> bool {
-        let moving = self.iter().filter(|function| function.attributes.lease.is_some());
-        moving.filter_map(|function| function.handler.lease()).any(|known| core::ptr::eq(known, lease))
+    /// Whether any function in the list has this lease: moves, stops or resets what it is of.
+    fn lists(&self, lease: &Lease) -> bool {
+        self.iter().filter_map(|function| function.handler.lease()).any(|known| core::ptr::eq(known, lease))
     }
 }
 

@@ -168,16 +168,14 @@ impl<T: Send + 'static> Services<T> {
     /// What is latched, if anything is.
     pub(crate) fn latched(&self) -> Option<Latch> {
         let functions = self.functions();
-        let moved = functions.iter().filter(|function| function.attributes.lease.is_some());
-        let latched = moved.filter_map(|function| function.handler.lease()).find_map(Lease::latch);
+        let latched = functions.iter().filter_map(|function| function.handler.lease()).find_map(Lease::latch);
         latched.or_else(|| functions.stopped().latch())
     }
 
-    /// A stop of all has ended once its program has reset the last thing that it stopped.
+    /// A stop of all has ended once its program has reset the last actuator in the list.
     pub(super) fn end_stop_of_all(&self, now: Instant) {
         let functions = self.functions();
-        let moved = functions.iter().filter(|function| function.attributes.lease.is_some());
-        let mut leases = moved.filter_map(|function| function.handler.lease()).peekable();
+        let mut leases = functions.iter().filter_map(|function| function.handler.lease()).peekable();
         if leases.peek().is_some() && leases.all(|lease| !lease.is_inhibited()) {
             functions.stopped().reset_by_parts(now, now);
         }

@@ -104,6 +104,24 @@ fn a_vehicle_with_a_folder_of_state_starts_stopped_if_it_was() {
 }
 
 #[test]
+fn a_stop_is_kept_though_only_the_reset_of_what_was_stopped_is_left() {
+    let (fleet, folder) = (fleet(), tempfile::tempdir().unwrap());
+    let agv = unit("agv", 7, fleet).state_folder(folder.path()).build().unwrap();
+    let functions = agv.my_function_list();
+    let drive = functions.actuator(|| {}).unwrap();
+    functions.add_service(&define("go()"), ServiceOptions::new().moves(&drive, LEASE), nothing).unwrap();
+    functions.add_service(&define("free_drive()"), ServiceOptions::new().resets(&drive), nothing).unwrap();
+    drive.inhibit(3);
+    until("it is kept", || is_kept(folder.path()));
+    functions.remove("go").unwrap();
+    // Longer than the time after which what is kept is looked at again.
+    std::thread::sleep(std::time::Duration::from_millis(1_300));
+    assert!(is_kept(folder.path()));
+    drive.reset();
+    until("its end is kept", || !is_kept(folder.path()));
+}
+
+#[test]
 fn a_vehicle_without_one_starts_stopped_if_its_program_says_so_and_its_program_resets_it() {
     let fleet = fleet();
     let manager = system(fleet).build().unwrap();

@@ -197,12 +197,12 @@ impl Granting {
             cx.functions.stopped().inhibit(cx.now, latch);
         }
         // Write all leases first, which takes no lock: a port may wait for a service's lock below, when all motion has ended.
-        Self::each_moved_by(cx, charge, &mut |service| {
+        Self::each_of(cx, charge, &mut |service| {
             if let Some(lease) = service.lease() {
                 lease.inhibit(cx.now, latch);
             }
         });
-        Self::each_moved_by(cx, charge, &mut |service| service.inhibit(cx.now, latch));
+        Self::each_of(cx, charge, &mut |service| service.inhibit(cx.now, latch));
         if self.was_stopped(cx) {
             wire.due.set(Part::Leases, cx.now);
         }
@@ -226,11 +226,11 @@ impl Granting {
         let charge = service.lease();
         let (mut latched, mut any) = (None, false);
         wire.publishing.actuators_due = true;
-        Self::each_moved_by(cx, charge, &mut |service| {
+        Self::each_of(cx, charge, &mut |service| {
             service.reset(cx.now, head.sent_at);
             latched = latched.or_else(|| service.lease().and_then(Lease::latch));
         });
-        Self::each_moved_by(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
+        Self::each_of(cx, None, &mut |service| any |= service.lease().is_some_and(Lease::is_inhibited));
         if charge.is_none() {
             cx.functions.stopped().reset(cx.now, head.sent_at);
         } else if !any {
@@ -239,14 +239,15 @@ impl Granting {
         latched.map_or(Ok(()), |latch| Err(latch.into()))
     }
 
-    /// Calls `act` for each leased service that a stop or reset covers: those of its actuator, or all. Not generic, to save code.
+    /// Calls `act` for each service with a lease that a stop or reset covers: those of its actuator, or all. What only stops or resets
+    /// an actuator counts: a function that moves it, added later, is then stopped or reset already. Not generic, to save code.
     #[inline(never)]
-    fn each_moved_by<P: Port>(cx: &Context<'_, P>, charge: Option<&Lease>, act: &mut dyn FnMut(&dyn Service)) {
+    fn each_of<P: Port>(cx: &Context<'_, P>, charge: Option<&Lease>, act: &mut dyn FnMut(&dyn Service)) {
         // Including functions that this peer cannot see.
         for function in (0..cx.functions.places()).filter_map(|place| cx.functions.function(Slot(place))) {
             let lease = function.handler.lease();
-            let is_meant = charge.is_none() || charge.zip(lease).is_some_and(|(one, other)| core::ptr::eq(one, other));
-            if is_meant && function.attributes.lease.is_some() {
+            let is_meant = |lease: &Lease| charge.is_none_or(|charge| core::ptr::eq(charge, lease));
+            if lease.is_some_and(is_meant) {
                 act(function.handler);
             }
         }
@@ -337,7 +338,7 @@ impl Granting {
     pub(super) fn awaits_hook<P: Port>(cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
         let mut awaits = false;
         let charge = service_of(cx, slot, generation).and_then(Service::lease);
-        Self::each_moved_by(cx, charge, &mut |service| {
+        Self::each_of(cx, charge, &mut |service| {
             awaits |= service.lease().is_some_and(Lease::awaits_hook);
         });
         awaits

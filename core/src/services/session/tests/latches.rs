@@ -173,20 +173,107 @@ fn a_function_that_stops_moving_leaves_its_actuator_to_the_others() {
     pair.agv.functions.replace(&dock, Attributes::NORMAL, without()).unwrap();
     pair.agv.offer_leased("tilt()", LEASE);
     pair.publish();
-    assert_eq!(call(&mut pair, "tilt"), stopped(0), "nothing else moves what was stopped");
+    assert_eq!(call(&mut pair, "tilt"), Ok(()), "its reset is of what was stopped");
+    pair.agv.functions.remove("free_drive").unwrap();
+    pair.agv.offer_leased("turn()", LEASE);
+    pair.publish();
+    assert_eq!(call(&mut pair, "turn"), stopped(0), "nothing is of what was stopped");
 }
 
-/// What stops or resets an actuator is no reason to take it for one that a stop of all has reached.
 #[test]
 fn what_is_added_beside_its_reset_after_a_stop_of_all_is_stopped() {
+    for resets_all in [true, false] {
+        let (mut pair, _) = vehicle();
+        pair.agv.functions.remove("go").unwrap();
+        assert_eq!(call(&mut pair, "halt"), Ok(()));
+        let reset = pair.agv.functions.find("free_drive").unwrap();
+        if resets_all {
+            assert_eq!(call(&mut pair, "free"), Ok(()));
+        }
+        pair.agv.offer_sharing("go()", LEASE, reset);
+        pair.publish();
+        assert_eq!(call(&mut pair, "go"), if resets_all { Ok(()) } else { stopped(1) });
+        assert_eq!((call(&mut pair, "free"), call(&mut pair, "go")), (Ok(()), Ok(())));
+    }
+}
+
+#[test]
+fn a_reset_of_one_actuator_leaves_the_others_stopped_though_nothing_moves_yet() {
     let (mut pair, _) = vehicle();
-    pair.agv.functions.remove("go").unwrap();
-    assert_eq!(call(&mut pair, "halt"), Ok(()));
-    let reset = pair.agv.functions.find("free_drive").unwrap();
-    pair.agv.offer_sharing("go()", LEASE, reset);
+    let lift = pair.agv.offer_leased("lift()", LEASE);
+    let free_lift = pair.agv.offer_control("free_lift()", RESET, Some(lift));
+    for function in ["go", "lift"] {
+        pair.agv.functions.remove(function).unwrap();
+    }
+    assert_eq!((call(&mut pair, "halt"), call(&mut pair, "free_drive")), (Ok(()), Ok(())));
+    pair.agv.offer_leased("tilt()", LEASE);
+    pair.agv.offer_sharing("lift()", LEASE, free_lift);
+    let free_drive = pair.agv.functions.find("free_drive").unwrap();
+    pair.agv.offer_sharing("go()", LEASE, free_drive);
     pair.publish();
-    assert_eq!(call(&mut pair, "go"), stopped(1));
-    assert_eq!((call(&mut pair, "free"), call(&mut pair, "go")), (Ok(()), Ok(())));
+    assert_eq!(["tilt", "lift", "go"].map(|function| call(&mut pair, function)), [stopped(1), stopped(1), Ok(())]);
+}
+
+#[test]
+fn what_is_removed_and_added_beside_its_reset_is_stopped_and_only_that() {
+    let (mut pair, go) = vehicle();
+    pair.agv.offer_sharing("dock()", LEASE, go);
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    for function in ["go", "dock"] {
+        pair.agv.functions.remove(function).unwrap();
+    }
+    pair.agv.offer_leased("lift()", LEASE);
+    let reset = pair.agv.functions.find("free_drive").unwrap();
+    for function in ["go()", "dock()"] {
+        pair.agv.offer_sharing(function, LEASE, reset);
+    }
+    pair.publish();
+    assert_eq!(["lift", "go", "dock"].map(|function| call(&mut pair, function)), [Ok(()), stopped(0), stopped(0)]);
+    assert_eq!(["free_drive", "go", "dock"].map(|function| call(&mut pair, function)), [Ok(()), Ok(()), Ok(())]);
+}
+
+#[test]
+fn what_moves_in_place_of_a_stop_is_stopped_where_that_was_of_something_stopped() {
+    let (mut pair, go) = vehicle();
+    pair.agv.offer_control("halt_drive()", STOP, Some(go));
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    let (handler, drive) = fresh();
+    pair.agv.functions.replace(&Definition::parse("halt_drive()").unwrap(), MOVES, handler).unwrap();
+    pair.publish();
+    assert_eq!(call(&mut pair, "halt_drive"), stopped(0));
+    assert_eq!((call(&mut pair, "free_drive"), drive.is_inhibited()), (Ok(()), true));
+    assert_eq!((call(&mut pair, "free"), call(&mut pair, "halt_drive")), (Ok(()), Ok(())));
+}
+
+/// As without the change: what takes the place of a drive that was reset is no news.
+#[test]
+fn what_takes_the_place_of_what_was_reset_is_not_stopped_and_a_stop_in_its_place_is() {
+    let (mut pair, _) = vehicle();
+    pair.agv.offer_leased("lift()", LEASE);
+    pair.publish();
+    assert_eq!((call(&mut pair, "halt"), call(&mut pair, "free_drive")), (Ok(()), Ok(())));
+    let go = Definition::parse("go()").unwrap();
+    for (attributes, is_stopped) in [(MOVES, false), (STOP, true)] {
+        let (handler, drive) = fresh();
+        pair.agv.functions.replace(&go, attributes, handler).unwrap();
+        assert_eq!(drive.is_inhibited(), is_stopped, "{attributes:?}");
+    }
+}
+
+#[test]
+fn a_stop_in_place_of_what_moves_leaves_the_unit_stopped() {
+    let (mut pair, go) = vehicle();
+    pair.agv.functions.remove("free_drive").unwrap();
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    let (handler, other) = fresh();
+    pair.agv.functions.replace(&Definition::parse("go()").unwrap(), STOP, handler).unwrap();
+    pair.agv.offer_leased("lift()", LEASE);
+    pair.publish();
+    assert_eq!((other.is_inhibited(), call(&mut pair, "lift")), (false, stopped(0)));
+    assert_eq!((call(&mut pair, "free"), call(&mut pair, "lift")), (Ok(()), Ok(())));
 }
 
 #[test]
