@@ -41,7 +41,7 @@ const SOAK_KILLS_PART: std::ops::Range<f64> = 0.06..0.2;
 /// And where vehicles start again and again: the memory of a process fills up over the first 30 starts of each of its vehicles.
 const SOAK_STARTS: f64 = 0.03;
 /// The part of a run in which things are broken; the rest is left to finish.
-const PART: std::ops::Range<f64> = 0.06..0.86;
+pub(crate) const PART: std::ops::Range<f64> = 0.06..0.86;
 
 /// The faults of a run that takes so long, in the order of their times.
 pub fn schedule(seed: u64, span: Duration, is_soak: bool) -> Vec<(Duration, Fault)> {

@@ -63,6 +63,8 @@ pub(super) struct Known {
     pub(super) reset: Option<bool>,
     /// When the mechanic was called.
     pub(super) mechanic: Option<Instant>,
+    /// Its thread asks it where it is, or is going to.
+    is_asked: bool,
     commands: Sender<Command>,
     pose: Option<Subscription<Desk>>,
     charge: Option<Subscription<Desk>>,
@@ -88,6 +90,7 @@ impl Known {
             since: now,
             reset: None,
             mechanic: None,
+            is_asked: false,
             commands,
             pose: None,
             charge: None,
@@ -122,7 +125,8 @@ impl Known {
             return;
         }
         match self.state {
-            State::Lost(again) if again <= now => self.ask(),
+            // One question at a time: the answer to an earlier one may be older than the last command to drive.
+            State::Lost(again) if again <= now && !self.is_asked => self.ask(),
             State::Moves(moves, began) => self.look_at_pose(moves, began),
             _ => {}
         }
@@ -135,9 +139,15 @@ impl Known {
         }
         // Without its list it cannot be asked yet.
         if self.pose.is_some() {
-            self.state = State::Asked;
+            (self.state, self.is_asked) = (State::Asked, true);
             self.command(Command::Place);
         }
+    }
+
+    /// The question where it is has ended. Returns whether the answer counts: nothing else has been heard of it or begun since.
+    pub(super) fn was_asked(&mut self) -> bool {
+        self.is_asked = false;
+        self.state == State::Asked
     }
 
     fn look_at_pose(&mut self, moves: i64, began: Instant) {

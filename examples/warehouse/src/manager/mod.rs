@@ -318,6 +318,7 @@ impl<'p> Manager<'p> {
             Err(error) => println!("failed {} {}: {error}", command.word(), vehicle.name),
         }
         match (*command, answer) {
+            (Command::Place, _) if !vehicle.was_asked() => {}
             (Command::Place, Ok(Answer::Place(place))) => {
                 let delivered = self.jobs.reconcile(vehicle, place);
                 let on = vehicle.is_at(*place);

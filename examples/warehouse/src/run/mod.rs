@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 
-use crate::faults::{Fault, schedule};
+use crate::faults::{Fault, PART, schedule};
 use crate::files::{MapFiles, read};
 use crate::map::Map;
 use crate::network::{MOST_VEHICLES, vehicle_name};
@@ -47,7 +47,8 @@ const BACK: Duration = Duration::from_secs(12);
 const REPORTED_AGAIN: Duration = Duration::from_secs(3);
 /// A fault that cannot happen now is tried again.
 const AGAIN: Duration = Duration::from_millis(300);
-/// Drawn orders come within this part of a run, so that the last ones are done at about its end.
+/// Drawn orders come within this part of a run, so that the last ones are done at about its end. In a soak they come as long as
+/// faults do, which need vehicles that move.
 const RELEASED: f64 = 0.75;
 /// How often the orders are counted.
 const PROGRESS: Duration = Duration::from_secs(10);
@@ -177,9 +178,9 @@ fn take_orders(options: &Options, files: &MapFiles, map: &Map, span: Duration) -
     }
     // Two legs, each of a third of the sides on average, a second a cell.
     let seconds_each = 2.0 * f64::from(map.width() + map.height()) / 3.0;
-    let share = if options.soak.is_some() { 0.25 } else { 0.5 };
+    let (share, part) = if options.soak.is_some() { (0.28, PART.end) } else { (0.5, RELEASED) };
     let count = span.as_secs_f64() / seconds_each * f64::from(options.vehicles) * share;
-    let released = span.mul_f64(RELEASED);
+    let released = span.mul_f64(part);
     Ok(orders::draw(map, (count as usize).max(1), released, &mut fastrand::Rng::with_seed(options.seed)))
 }
 
@@ -270,7 +271,11 @@ impl Run<'_> {
         }
         for heard in self.stage.hear(Duration::from_millis(50)) {
             match heard {
-                Heard::Vehicle(line) => self.truth.hear(&line),
+                Heard::Vehicle(line) => {
+                    let known = self.truth.wrong.len();
+                    self.truth.hear(&line);
+                    self.truth.wrong[known..].iter().for_each(|wrong| self.stage.show(&format!("WRONG: {wrong}")));
+                }
                 Heard::Manager(number, line) => self.manager_says(number, &line)?,
                 Heard::Ended(name) => self.tally.wrong.push(format!("the process of {name} has ended")),
             }
@@ -406,7 +411,10 @@ impl Run<'_> {
                 // What switches vehicles off, and breaks their wheels, cannot reach into the board.
                 let within_reach = |name: &String| matches!(fault, Fault::Stop) || !self.stage.is_board(name);
                 let moving = self.truth.moving().into_iter().filter(within_reach).collect::<Vec<_>>();
-                let Some(name) = self.rng.choice(moving) else { return Ok(Some((AGAIN, Due::Break(fault)))) };
+                let Some(name) = self.rng.choice(moving) else {
+                    let moves_again = self.truth.done.len() < self.tally.orders;
+                    return Ok(moves_again.then_some((AGAIN, Due::Break(fault))));
+                };
                 match fault {
                     Fault::Stop => {
                         self.stage.notify_manager(&format!("stop {name}"));

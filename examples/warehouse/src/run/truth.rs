@@ -1,6 +1,6 @@
 //! What really happened, from the logs of the vehicles' bodies: it asks no manager.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::time::Duration;
 
 use crate::map::{Cell, Map};
@@ -8,6 +8,8 @@ use crate::orders::Order;
 
 /// Lines of different processes come in another order than they were written; this is waited for, in nanoseconds.
 const SETTLED: u64 = 3_000_000_000;
+/// So many lines of each vehicle are kept, to be shown where two are in one cell.
+const RECENT: usize = 8;
 
 /// A stop, as the vehicle has measured it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -35,6 +37,8 @@ pub struct Truth<'m> {
     waiting: BTreeMap<(u64, u64), (String, String)>,
     lines: u64,
     newest: u64,
+    /// The last lines of each vehicle that have been looked at.
+    recent: HashMap<String, VecDeque<String>>,
     on: HashMap<Cell, String>,
     cells: HashMap<String, Vec<Cell>>,
     pub(super) stops: Vec<Stop>,
@@ -58,6 +62,7 @@ impl<'m> Truth<'m> {
             waiting: BTreeMap::new(),
             lines: 0,
             newest: 0,
+            recent: HashMap::new(),
             on: HashMap::new(),
             cells: HashMap::new(),
             stops: Vec::new(),
@@ -86,15 +91,16 @@ impl<'m> Truth<'m> {
             if first.key().0 + SETTLED > self.newest {
                 return;
             }
+            let (time, _) = *first.key();
             let (vehicle, what) = first.remove();
-            self.take(&vehicle, &what);
+            self.take(time, &vehicle, &what);
         }
     }
 
     /// Looks at all that has come.
     pub fn finish(&mut self) {
-        for (vehicle, what) in std::mem::take(&mut self.waiting).into_values() {
-            self.take(&vehicle, &what);
+        for ((time, _), (vehicle, what)) in std::mem::take(&mut self.waiting) {
+            self.take(time, &vehicle, &what);
         }
     }
 
@@ -116,7 +122,10 @@ impl<'m> Truth<'m> {
         names
     }
 
-    fn take(&mut self, vehicle: &str, what: &str) {
+    fn take(&mut self, time: u64, vehicle: &str, what: &str) {
+        let recent = self.recent.entry(vehicle.to_owned()).or_default();
+        recent.push_back(format!("{:.3} {what}", Duration::from_nanos(time).as_secs_f64()));
+        recent.drain(..recent.len().saturating_sub(RECENT));
         let words: Vec<&str> = what.split(' ').collect();
         let known = match words[..] {
             ["enter", cell] => cell.parse().map(|cell| self.enter(vehicle, cell)).ok(),
@@ -148,7 +157,11 @@ impl<'m> Truth<'m> {
         }
         cells.push(cell);
         if let Some(other) = self.on.insert(cell, vehicle.to_owned()) {
-            self.wrong.push(format!("{vehicle} and {other} are both on {cell}"));
+            let [own, others] = [vehicle, &other].map(|name| {
+                let lines = self.recent.get(name).into_iter().flatten().map(String::as_str);
+                format!("{name}: {}", lines.collect::<Vec<_>>().join(", "))
+            });
+            self.wrong.push(format!("{vehicle} and {other} are both on {cell} ({own}; {others})"));
         }
     }
 
@@ -228,7 +241,9 @@ mod tests {
             "2.9 a leave 0,0",
             "2.4 b leave 9,9",
         ];
-        seen(&lines, |truth| assert_eq!(truth.wrong, ["b and a are both on 1,0"]));
+        let [a, b] = ["a: 1.000 enter 0,0, 2.000 enter 1,0", "b: 1.000 enter 2,0, 2.000 leave 9,9, 2.000 enter 1,0"];
+        let wrong = format!("b and a are both on 1,0 ({b}; {a})");
+        seen(&lines, |truth| assert_eq!(truth.wrong, [wrong]));
         // The cell was left before.
         let lines = ["1.0 b enter 1,0", "3.0 a enter 1,0", "2.5 a enter 0,0", "2.0 b leave 1,0"];
         seen(&lines, |truth| assert!(truth.wrong.is_empty(), "{:?}", truth.wrong));

@@ -85,6 +85,8 @@ fn in_own_network(with_board: bool, is_soak: bool, given: &[String]) -> Result<O
     // A board is given its keys by the command beside the program, which has the page as well.
     built("cara")?;
     let warehouse = built("warehouse")?;
+    // A heap for each few threads fills up over hours, which would look like a leak or hide one.
+    let warehouse = if is_soak { warehouse.env("MALLOC_ARENA_MAX", "1") } else { warehouse };
     let words = ["demo", "--warehouse"].into_iter().chain(with_board.then_some("--board"));
     let again = words.chain(given.iter().map(String::as_str));
     let needs: &[&str] = if with_board { &["qemu-system-arm"] } else { &["nft"] };
