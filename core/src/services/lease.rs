@@ -504,7 +504,8 @@ pub(crate) struct Granted {
     pub(crate) end: Instant,
 }
 
-/// The lease that a call of this unit holds at the peer, until it is released.
+/// The lease that a call of this unit holds at the peer, until it is released. Behind that, while the stream has no capacity for the
+/// release, only its call, slot and class count: also of a call that was never renewed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Held {
     pub(crate) call: CallId,
