@@ -250,15 +250,17 @@ fn what_moves_in_place_of_a_stop_is_stopped_where_that_was_of_something_stopped(
 /// As without the change: what takes the place of a drive that was reset is no news.
 #[test]
 fn what_takes_the_place_of_what_was_reset_is_not_stopped_and_a_stop_in_its_place_is() {
-    let (mut pair, _) = vehicle();
+    let (mut pair, go) = vehicle();
+    pair.agv.offer_control("halt_drive()", STOP, Some(go));
     pair.agv.offer_leased("lift()", LEASE);
     pair.publish();
     assert_eq!((call(&mut pair, "halt"), call(&mut pair, "free_drive")), (Ok(()), Ok(())));
-    let go = Definition::parse("go()").unwrap();
-    for (attributes, is_stopped) in [(MOVES, false), (STOP, true)] {
+    for (function, attributes, is_stopped) in
+        [("go()", MOVES, false), ("go()", STOP, true), ("halt_drive()", MOVES, true)]
+    {
         let (handler, drive) = fresh();
-        pair.agv.functions.replace(&go, attributes, handler).unwrap();
-        assert_eq!(drive.is_inhibited(), is_stopped, "{attributes:?}");
+        pair.agv.functions.replace(&Definition::parse(function).unwrap(), attributes, handler).unwrap();
+        assert_eq!(drive.is_inhibited(), is_stopped, "{function} {attributes:?}");
     }
 }
 
