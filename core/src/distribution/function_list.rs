@@ -48,7 +48,7 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         Self { table: Table::new(entries, bytes), stopped: LatchWord::new() }
     }
 
-    /// The unit's own latch.
+    /// The unit's own latch: set by a stop of all, and where a latched actuator loses its last function.
     pub const fn stopped(&self) -> &LatchWord {
         &self.stopped
     }

@@ -121,11 +121,12 @@ impl LatchWord {
 
 /// Whether something was made later than a stop at this [`odd_millis`] time.
 fn is_behind(now: Instant, made: Instant, stop: u32) -> bool {
-    // Valid within the 49 days after which the word wraps; then a request may have to be repeated once. Its age is seconds.
+    // Valid within the 49 days after which the word wraps; then a request may have to be repeated a minute later. Its age is
+    // seconds. What is made by `now` is not later than a stop that has come since, as of an interrupt.
     let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(stop);
     let age = now.since(made).as_millis();
     // `odd_millis` rounds down by up to 2 ms, but up at the start of the clock.
-    stop != 0 && since != u32::MAX && age.saturating_add(2) < u64::from(since)
+    stop != 0 && since < u32::MAX - 60_000 && age.saturating_add(2) < u64::from(since)
 }
 
 /// A time in milliseconds, rounded down to an odd number, so that it is never 0, which means "none".
@@ -171,6 +172,17 @@ mod tests {
                     assert!(!latch.is_behind_stop(at(later), at(stop)), "a stop counts when it was reset, too");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_stop_that_comes_while_a_reset_is_under_way_stays() {
+        for later in [3_000, 5_000, 2_000_000] {
+            let latch = stopped(1_000_000 + later);
+            latch.reset(at(1_000_000), at(999_000));
+            assert!(latch.is_inhibited() && !latch.is_behind_stop(at(1_000_000), at(999_000)), "{later}");
+            latch.reset(at(9_000_000), at(8_000_000));
+            assert!(!latch.is_inhibited());
         }
     }
 

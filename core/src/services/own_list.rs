@@ -34,7 +34,8 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
 
     /// Replaces the function of this name; [`Error::UnknownFunction`] or [`Error::Full`] leave the list unchanged. If it moves an
     /// actuator, that is latched if the previous function's was. If it moves none, and the previous one's actuator was latched and
-    /// has no other function in the list, functions added later are latched, until a reset of all.
+    /// has no other function in the list, the unit is latched: functions of actuators that come into the list later are latched,
+    /// until a reset of all.
     pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
         self.replace_signature(definition.signature(), attributes, handler)
     }
@@ -47,24 +48,26 @@ impl<S: Storage, H: Service + 'static> FunctionList<S, H> {
         handler: H,
     ) -> Result<Slot, Error> {
         let previous = self.find(signature.name()).and_then(|slot| self.function(slot));
-        let takes_over =
-            attributes.lease.is_some() && previous.is_some_and(|previous| previous.attributes.lease.is_some());
+        let moved = previous.is_some_and(|previous| previous.attributes.lease.and(previous.handler.lease()).is_some());
+        // What moves in place of what moved is latched as that was. The unit's latch, of before its reset, is no news to it.
+        let takes_over = moved && attributes.lease.is_some();
         let is_known = handler.lease().is_some_and(|lease| self.lists(lease));
         let (slot, replaced) = self.swap(signature, attributes, handler)?;
         let lease = self.function(slot).and_then(|function| function.handler.lease());
-        if let Some(lease) = lease.filter(|_| !is_known && !takes_over) {
-            lease.inherit(self.stopped());
-        }
         match (lease.filter(|_| attributes.lease.is_some()), replaced.lease()) {
             (Some(lease), Some(replaced)) => lease.inherit(replaced.latch_word()),
             (None, Some(replaced)) if !self.lists(replaced) => self.stopped().inherit_removed(replaced.latch_word()),
             _ => {}
         }
+        // Behind that: the unit may just have been latched.
+        if let Some(lease) = lease.filter(|_| !is_known && !takes_over) {
+            lease.inherit(self.stopped());
+        }
         Ok(slot)
     }
 
     /// Removes a function and returns its slot and handler; [`Error::UnknownFunction`]. If its actuator is latched and no other
-    /// function in the list is of it, functions added later are latched, until a reset of all.
+    /// function in the list is of it, functions of actuators that come into the list later are latched, until a reset of all.
     pub fn remove(&mut self, name: &str) -> Result<(Slot, H), Error> {
         let (slot, handler) = self.take(name)?;
         if let Some(lease) = handler.lease().filter(|lease| !self.lists(lease)) {

@@ -266,6 +266,8 @@ impl<P: Port> Calling<P> {
         id: CallId,
         pending: Option<Pending>,
     ) {
+        // It may wait already, of a call whose answer was still wanted.
+        self.held.retain(|held| held.call != id || held.is_renewed());
         let answered = self.take_answered(id).map(|known| (known.slot, known.class));
         let held = self.stop_renewing(id).map(|held| (held.slot, held.class));
         let waited = pending.and_then(|pending| Some((pending.slot, pending.leased?)));

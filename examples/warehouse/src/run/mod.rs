@@ -251,7 +251,8 @@ impl Run<'_> {
             let is_stuck = options.standby && self.killed.is_some_and(|killed| killed.elapsed() > FINISHING);
             ensure!(!is_stuck, "no vehicle drives for the standby {FINISHING:?} after its manager was killed");
             let late = span + FINISHING;
-            ensure!(start.elapsed() < late, "{} orders are not done", self.tally.orders - self.truth.done.len());
+            let undone = self.tally.orders.saturating_sub(self.truth.done.len());
+            ensure!(start.elapsed() < late, "{undone} orders are not done, {} things are due", self.due.len());
         }
         Ok(())
     }

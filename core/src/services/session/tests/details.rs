@@ -20,7 +20,7 @@ use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
 use crate::services::Context;
 use crate::services::heart::Renew;
-use crate::services::lease::LeaseEnd;
+use crate::services::lease::{Held, LeaseEnd};
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
@@ -300,6 +300,20 @@ fn a_release_without_room_is_sent_later_though_the_table_of_leases_is_full() {
     pair.manager.without_room(|manager| calls.iter().for_each(|(call, _)| manager.cancel_but_wait(*call)));
     pair.run(Duration::from_millis(20));
     assert!(calls.iter().all(|(_, slot)| !pair.agv.is_live(*slot)));
+}
+
+#[test]
+fn a_release_without_room_waits_once_though_the_call_is_cancelled_again() {
+    let (mut pair, calls) = unrenewed(["lift", "tilt", "turn", "dock"]);
+    let (call, slot) = calls[0];
+    pair.manager.without_room(|manager| {
+        manager.cancel_but_wait(call);
+        assert!(!manager.session.calling.held.iter().all(Held::is_renewed));
+        manager.cancel(call);
+        assert!(manager.session.calling.held.iter().all(Held::is_renewed));
+    });
+    pair.run(Duration::from_millis(20));
+    assert!(!pair.agv.is_live(slot));
 }
 
 /// It is not refused, and no release is lost.

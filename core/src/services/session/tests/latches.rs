@@ -273,9 +273,12 @@ fn a_stop_in_place_of_what_moves_leaves_the_unit_stopped() {
     let (handler, other) = fresh();
     pair.agv.functions.replace(&Definition::parse("go()").unwrap(), STOP, handler).unwrap();
     pair.agv.offer_leased("lift()", LEASE);
+    // It is of an actuator that has come into the list later.
+    pair.agv.offer_sharing("tilt()", LEASE, go);
     pair.publish();
-    assert_eq!((other.is_inhibited(), call(&mut pair, "lift")), (false, stopped(0)));
-    assert_eq!((call(&mut pair, "free"), call(&mut pair, "lift")), (Ok(()), Ok(())));
+    assert!(other.is_inhibited());
+    assert_eq!((call(&mut pair, "lift"), call(&mut pair, "tilt")), (stopped(0), stopped(0)));
+    assert_eq!(["free", "lift", "tilt"].map(|function| call(&mut pair, function)), [Ok(()); 3]);
 }
 
 #[test]
