@@ -425,20 +425,21 @@ fn a_record_is_open_once_and_a_damaged_one_not_at_all() {
     drop(places);
     // A process that another test starts has the lock as well until it is another program.
     let open = || {
-        until("nobody has it", || {
-            (!matches!(Places::open(folder.path(), &names), Err(OpenError::InUse(_)))).then_some(())
+        until("nobody has it", || match Places::open(folder.path(), &names) {
+            Err(OpenError::InUse(_)) => None,
+            opened => Some(opened),
         })
     };
-    open();
+    drop(open().unwrap());
     let file = folder.path().join("places");
     assert_eq!(std::fs::read_to_string(&file).unwrap(), "gate 0 unknown\n");
     std::fs::write(&file, "gate 7 agv 1/101\nlift 2 nobody\n").unwrap();
-    let places = Places::open(folder.path(), &names).unwrap();
+    let places = open().unwrap();
     assert_eq!(places.shown(GATE).unwrap().occupant, "agv 1/101");
     drop(places);
     for damaged in ["gate 7 agv-1/1", "gate", "gate 7 agv", "gate x nobody\n"] {
         std::fs::write(&file, damaged).unwrap();
-        assert!(matches!(Places::open(folder.path(), &names), Err(OpenError::Damaged { .. })), "{damaged}");
+        assert!(matches!(open(), Err(OpenError::Damaged { .. })), "{damaged}");
         assert_eq!(std::fs::read_to_string(&file).unwrap(), damaged);
     }
 }
