@@ -223,6 +223,14 @@ impl<P: Port> Calling<P> {
         take_at(&mut self.held, index)
     }
 
+    /// Forgets a call, whether it is renewed or its release waits already. Returns its function and class.
+    fn forget(&mut self, call: CallId) -> Option<(Slot, Priority)> {
+        let answered = self.take_answered(call).map(|known| (known.slot, known.class));
+        let index = self.held.iter().position(|held| held.call == call);
+        let held = index.and_then(|index| take_at(&mut self.held, index));
+        held.map(|held| (held.slot, held.class)).or(answered)
+    }
+
     /// Gives a call up for its caller.
     pub(super) fn cancel(&mut self, wire: &mut Wire<P>, cx: &mut Context<'_, P>, id: CallId) {
         let pending = self.requests.close(id);
@@ -241,7 +249,7 @@ impl<P: Port> Calling<P> {
         let Some(&pending) = self.requests.waiting_for(id) else { return };
         Self::send_cancel(wire, cx, &pending);
         let Some(class) = pending.leased else { return };
-        self.stop_renewing(id);
+        self.forget(id);
         if !Self::send_release(wire, cx, id, class) {
             self.keep_unsent(wire, cx.now, id, pending.slot, class);
         }
@@ -266,12 +274,9 @@ impl<P: Port> Calling<P> {
         id: CallId,
         pending: Option<Pending>,
     ) {
-        // It may wait already, of a call whose answer was still wanted.
-        self.held.retain(|held| held.call != id || held.is_renewed());
-        let answered = self.take_answered(id).map(|known| (known.slot, known.class));
-        let held = self.stop_renewing(id).map(|held| (held.slot, held.class));
+        let known = self.forget(id);
         let waited = pending.and_then(|pending| Some((pending.slot, pending.leased?)));
-        let Some((slot, class)) = held.or(waited).or(answered) else { return };
+        let Some((slot, class)) = waited.or(known) else { return };
         // If the link is not live, no release is needed: the callee ends all leases of a link that it loses.
         if wire.phase != Phase::Live || Self::send_release(wire, cx, id, class) {
             return;
@@ -304,7 +309,6 @@ impl<P: Port> Calling<P> {
     /// Keeps the release of one call for a retry. In a full table, its function's earlier calls are released with it.
     fn keep_unsent(&mut self, wire: &mut Wire<P>, now: Instant, call: CallId, slot: Slot, class: Priority) {
         let (operator, lease, renew, next) = (false, 0, Renew::Never, Instant::FAR_FUTURE);
-        self.held.retain(|held| held.call != call);
         let held = Held { call, slot, operator, class, lease, renew, next, answered: now };
         if self.held.push(held).is_err() && self.keep_release(slot, call).is_err() {
             wire.link.counters.count(LinkCounter::FramesWithheld);

@@ -44,6 +44,12 @@ fn call(pair: &mut Pair, function: &str) -> Result<(), Error> {
     pair.manager.outcome(id).unwrap().map(drop)
 }
 
+/// The vehicle stops what this function moves.
+fn stop_itself(pair: &Pair, function: Slot) {
+    let word = pair.agv.functions.function(function).unwrap().handler.lease.as_ref().unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+}
+
 /// A handler with its own drive.
 fn fresh() -> (Handler, Rc<Lease>) {
     let lease = Rc::<Lease>::default();
@@ -97,8 +103,7 @@ fn what_takes_the_place_of_a_stopped_service_is_stopped_and_only_that() {
         if stops_all {
             assert_eq!(call(&mut pair, "halt"), Ok(()));
         } else {
-            let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-            word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+            stop_itself(&pair, go);
         }
         let (handler, drive) = fresh();
         pair.agv.functions.replace(&Definition::parse("go()").unwrap(), MOVES, handler).unwrap();
@@ -115,9 +120,8 @@ fn what_takes_the_place_of_a_stopped_service_is_stopped_and_only_that() {
 #[test]
 fn a_stopped_service_that_is_removed_and_added_again_is_stopped() {
     let (mut pair, go) = vehicle();
-    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
     pair.agv.functions.remove("free_drive").unwrap();
-    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    stop_itself(&pair, go);
     pair.agv.functions.remove("go").unwrap();
     pair.agv.offer_leased("go()", LEASE);
     pair.publish();
@@ -130,8 +134,7 @@ fn a_reset_of_another_actuator_leaves_what_was_removed_stopped() {
     for is_replaced in [false, true] {
         let (mut pair, _) = vehicle();
         let lift = pair.agv.offer_leased("lift()", LEASE);
-        let word = pair.agv.functions.function(lift).unwrap().handler.lease.clone().unwrap();
-        word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+        stop_itself(&pair, lift);
         if is_replaced {
             let without = Handler::new(Run::Now(|_| Ok(())), None);
             let lift = Definition::parse("lift()").unwrap();
@@ -161,8 +164,7 @@ fn a_reset_of_another_actuator_leaves_what_was_removed_stopped() {
 fn a_function_that_stops_moving_leaves_its_actuator_to_the_others() {
     let (mut pair, go) = vehicle();
     pair.agv.offer_sharing("dock()", LEASE, go);
-    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    stop_itself(&pair, go);
     let without = || Handler::new(Run::Now(|_| Ok(())), None);
     let go = Definition::parse("go()").unwrap();
     pair.agv.functions.replace(&go, Attributes::NORMAL, without()).unwrap();
@@ -218,8 +220,7 @@ fn a_reset_of_one_actuator_leaves_the_others_stopped_though_nothing_moves_yet() 
 fn what_is_removed_and_added_beside_its_reset_is_stopped_and_only_that() {
     let (mut pair, go) = vehicle();
     pair.agv.offer_sharing("dock()", LEASE, go);
-    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    stop_itself(&pair, go);
     for function in ["go", "dock"] {
         pair.agv.functions.remove(function).unwrap();
     }
@@ -237,8 +238,7 @@ fn what_is_removed_and_added_beside_its_reset_is_stopped_and_only_that() {
 fn what_moves_in_place_of_a_stop_is_stopped_where_that_was_of_something_stopped() {
     let (mut pair, go) = vehicle();
     pair.agv.offer_control("halt_drive()", STOP, Some(go));
-    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    stop_itself(&pair, go);
     let (handler, drive) = fresh();
     pair.agv.functions.replace(&Definition::parse("halt_drive()").unwrap(), MOVES, handler).unwrap();
     pair.publish();
@@ -268,8 +268,7 @@ fn what_takes_the_place_of_what_was_reset_is_not_stopped_and_a_stop_in_its_place
 fn a_stop_in_place_of_what_moves_leaves_the_unit_stopped() {
     let (mut pair, go) = vehicle();
     pair.agv.functions.remove("free_drive").unwrap();
-    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    word.inhibit(pair.agv.now, Latch { by: 0, reason: 0 });
+    stop_itself(&pair, go);
     let (handler, other) = fresh();
     pair.agv.functions.replace(&Definition::parse("go()").unwrap(), STOP, handler).unwrap();
     pair.agv.offer_leased("lift()", LEASE);
